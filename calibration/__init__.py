@@ -1,0 +1,1 @@
+"""Where the image is relative to the sensor."""

@@ -1,0 +1,1 @@
+"""Ground floor: geometry, streams, sweeps, least squares, errors."""

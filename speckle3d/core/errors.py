@@ -1,0 +1,23 @@
+"""What the package raises on purpose. Each error is one line: what was expected, what came, and where."""
+
+from __future__ import annotations
+
+
+class Speckle3DError(Exception):
+    """Root of every error the package raises on purpose."""
+
+
+class InvalidInputError(Speckle3DError, ValueError):
+    """A value, array or file content is not what it must be."""
+
+
+class MismatchError(InvalidInputError):
+    """Two inputs are each valid but do not belong together."""
+
+
+class InsufficientDataError(Speckle3DError, ValueError):
+    """The data are valid but cannot determine the answer."""
+
+
+class FileError(Speckle3DError, OSError):
+    """A file cannot be opened, read or written."""

@@ -1,0 +1,117 @@
+"""Frames of reference and angle conventions, on SciPy's ``Rotation`` and ``RigidTransform``.
+
+The image frame P has its origin at the image's top left, x lateral, y axial (depth grows) and
+z = x cross y, elevational. Tilt, yaw and roll are rotations about the image's x, y and z. A transform is
+named by both of its ends, ``world_from_image``, so that neighbouring names match in every product.
+Lengths are millimetres, angles radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+
+FloatArray = npt.NDArray[np.float64]
+
+RIGID_TOLERANCE = 1e-4
+"""How far R^T R may be from the identity, and |q| from one, in data read from files (float32 safe)."""
+
+
+def rotation_from_fixed_angles(alpha: npt.ArrayLike, beta: npt.ArrayLike, gamma: npt.ArrayLike) -> Rotation:
+    """Rotation by x-y-z fixed angles, R = Rz(alpha) Ry(beta) Rx(gamma).
+
+    Parameters
+    ----------
+    alpha, beta, gamma : array_like, shape (...,)
+        Roll, yaw and tilt in radians.
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 2.
+    """
+    angles = np.stack(np.broadcast_arrays(alpha, beta, gamma), axis=-1).astype(float)
+    return Rotation.from_euler("ZYX", angles)
+
+
+def roll_yaw_tilt(rotation: Rotation) -> FloatArray:
+    """Angles about the image's z, y and x axes, the inverse of `rotation_from_fixed_angles`.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Roll, yaw, tilt in radians.
+    """
+    return np.asarray(rotation.as_euler("ZYX"))
+
+
+def relative_poses(world_from_image: RigidTransform) -> RigidTransform:
+    """Pose of every frame seen from the frame before it: ``previous_from_image``, one fewer than given."""
+    return world_from_image[:-1].inv() * world_from_image[1:]
+
+
+def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
+    """Validate scalar-first unit quaternions, shape (m, 4), read from `where`.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming `where` and the first bad index.
+    """
+    q = np.asarray(wxyz, dtype=float)
+    if q.ndim != 2 or q.shape[1] != 4:
+        raise InvalidInputError(f"{where}: expected shape (m, 4), got {q.shape}")
+    require_finite(q, where)
+    bad = np.flatnonzero(np.abs(np.linalg.norm(q, axis=1) - 1.0) > RIGID_TOLERANCE)
+    if bad.size:
+        norm = np.linalg.norm(q[bad[0]])
+        raise InvalidInputError(f"{where}[{bad[0]}]: expected a unit quaternion, got norm {norm:.6g}")
+    return Rotation.from_quat(q, scalar_first=True)
+
+
+def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransform:
+    """Validate rigid 4x4 matrices, shape (m, 4, 4), read from `where`.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming `where` and the first index that is not a proper rotation with translation.
+    """
+    m = np.asarray(matrices, dtype=float)
+    if m.ndim != 3 or m.shape[1:] != (4, 4):
+        raise InvalidInputError(f"{where}: expected shape (m, 4, 4), got {m.shape}")
+    require_finite(m, where)
+    r = m[:, :3, :3]
+    skewed = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) > RIGID_TOLERANCE
+    mirrored = np.linalg.det(r) < 0
+    affine = np.abs(m[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > RIGID_TOLERANCE
+    bad = np.flatnonzero(skewed | mirrored | affine)
+    if bad.size:
+        raise InvalidInputError(f"{where}[{bad[0]}]: expected a rigid 4x4 matrix, got one that is not")
+    return RigidTransform.from_matrix(m)
+
+
+def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
+    """Raise `InvalidInputError` naming the first entry of `values` that is NaN or infinite."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        first = tuple(int(i) for i in np.argwhere(~finite)[0])
+        index = first[0] if len(first) == 1 else first
+        raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {values[first]}")
+
+
+def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
+    """Return `times_s`, shape (m,), if finite and strictly increasing; else raise `InvalidInputError`."""
+    t = np.asarray(times_s, dtype=float)
+    if t.ndim != 1:
+        raise InvalidInputError(f"{where}: expected shape (m,), got {t.shape}")
+    require_finite(t, where)
+    bad = np.flatnonzero(np.diff(t) <= 0)
+    if bad.size:
+        i = int(bad[0]) + 1
+        raise InvalidInputError(
+            f"{where}[{i}]: expected strictly increasing times, got {t[i]:.6f} s after {t[i - 1]:.6f} s"
+        )
+    return t

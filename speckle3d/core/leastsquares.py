@@ -1,0 +1,154 @@
+"""Levenberg-Marquardt with the diagnosis a published number needs.
+
+One solver for the whole package: SciPy's `least_squares`, the columns of the Jacobian scaled to unit
+norm at the start (Prager et al. 1997, section 4), and a `Fit` that says how well the data determine
+the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray
+
+Residuals = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The answer of a least-squares problem and how far it can be trusted.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (n,)
+    names : tuple of str, length n
+    residuals : ndarray, shape (m,)
+        At the solution, as given by the caller (weighted if the caller weighted).
+    covariance : ndarray, shape (n, n)
+        Of the parameters, from the Jacobian at the solution and the residual variance; directions the
+        data do not determine have infinite variance on every parameter they touch.
+    singular_values : ndarray, shape (n,)
+        Of the Jacobian with columns scaled to unit norm, descending.
+    weakest_direction : ndarray, shape (n,)
+        Right singular vector of the least singular value, in scaled parameters.
+    """
+
+    parameters: FloatArray
+    names: tuple[str, ...]
+    residuals: FloatArray
+    covariance: FloatArray
+    singular_values: FloatArray
+    weakest_direction: FloatArray
+    evaluations: int
+    converged: bool
+    message: str
+
+    @property
+    def condition_number(self) -> float:
+        """Ratio of the largest and the least singular value of the scaled Jacobian; inf if singular."""
+        least = self.singular_values[-1]
+        return float(self.singular_values[0] / least) if least > 0 else float("inf")
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Square roots of the covariance's diagonal, shape (n,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def weakest_parameters(self, share: float = 0.3) -> tuple[str, ...]:
+        """Names of the parameters that make up the least determined direction, strongest first."""
+        order = np.argsort(-np.abs(self.weakest_direction))
+        return tuple(self.names[i] for i in order if abs(self.weakest_direction[i]) >= share)
+
+
+def levenberg_marquardt(
+    residuals: Residuals,
+    start: FloatArray,
+    jacobian: Residuals | None = None,
+    names: Sequence[str] = (),
+    tolerance: float = 1e-10,
+    max_evaluations: int = 200,
+) -> Fit:
+    """Minimise the sum of squared residuals.
+
+    Parameters
+    ----------
+    residuals : callable, (n,) -> (m,)
+    start : ndarray, shape (n,)
+    jacobian : callable, (n,) -> (m, n), optional
+        Without it, finite differences.
+    names : sequence of str, length n, optional
+    tolerance : float
+        Relative change of cost and of scaled parameters at which to stop.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are fewer residuals than parameters, or the residuals at `start` are not finite.
+
+    References
+    ----------
+    .. [1] J. J. More, "The Levenberg-Marquardt algorithm: implementation and theory", 1977.
+    .. [2] Prager et al., CUED/F-INFENG/TR 303, 1997, section 4 (column scaling, condition number).
+    """
+    x0 = np.asarray(start, dtype=float)
+    r0 = residuals(x0)
+    if r0.size < x0.size:
+        raise InvalidInputError(f"expected at least {x0.size} residuals, got {r0.size}")
+    if not np.isfinite(r0).all():
+        raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
+    labels = tuple(names) if names else tuple(f"p{i}" for i in range(x0.size))
+    found = least_squares(
+        residuals,
+        x0,
+        jac=jacobian if jacobian is not None else "2-point",
+        method="lm",
+        x_scale="jac",
+        xtol=tolerance,
+        ftol=tolerance,
+        gtol=tolerance,
+        max_nfev=max_evaluations,
+    )
+    return _diagnose(
+        found.x, found.fun, np.asarray(found.jac), labels, found.nfev, found.success, found.message
+    )
+
+
+def _diagnose(
+    x: FloatArray,
+    r: FloatArray,
+    j: FloatArray,
+    names: tuple[str, ...],
+    evaluations: int,
+    converged: bool,
+    message: str,
+) -> Fit:
+    norms = np.linalg.norm(j, axis=0)
+    scale = np.where(norms > 0, norms, 1.0)
+    _, singular, vt = np.linalg.svd(j / scale, full_matrices=False)
+    known = singular > singular[0] * max(j.shape) * np.finfo(float).eps
+    variance = float(r @ r) / max(r.size - x.size, 1)
+    inverse = (vt[known].T / singular[known] ** 2) @ vt[known]
+    covariance = variance * inverse / np.outer(scale, scale)
+    blind = (np.abs(vt[~known]) > 1e-6).any(axis=0)
+    covariance[np.ix_(blind, blind)] = np.inf
+    return Fit(
+        parameters=x,
+        names=names,
+        residuals=r,
+        covariance=covariance,
+        singular_values=singular,
+        weakest_direction=vt[-1],
+        evaluations=int(evaluations),
+        converged=bool(converged),
+        message=str(message),
+    )

@@ -1,0 +1,92 @@
+"""What a reconstruction is: poses of every frame by mode, and the frame pairs they were made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import BoolArray
+from speckle3d.core.sweep import ImageGrid
+
+IntArray = npt.NDArray[np.int64]
+
+MODES = ("image", "orientation", "pose", "crossed")
+"""Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
+
+
+@dataclass(frozen=True)
+class FramePairs:
+    """Relative poses measured between frame pairs, with the distances they were fitted to.
+
+    Attributes
+    ----------
+    first, second : ndarray, shape (e,)
+        Frame indices, first < second.
+    first_from_second : ndarray, shape (e, 4, 4)
+        Pose of the second frame in the first, mm.
+    covariance : ndarray, shape (e, 6, 6)
+        Of (x, y, z, tilt, yaw, roll) of that pose at the image centre, mm and rad.
+    distance_mm, sigma_mm : ndarray, shape (e, p)
+        Unsigned elevational distance of each patch and its standard deviation; NaN where there is none.
+    used : ndarray of bool, shape (e, p)
+        Whether the patch took part in the plane fit.
+    patch_centre_mm : ndarray, shape (p, 2)
+        Lateral and axial position of each patch.
+    """
+
+    first: IntArray
+    second: IntArray
+    first_from_second: FloatArray
+    covariance: FloatArray
+    distance_mm: npt.NDArray[np.float32]
+    sigma_mm: npt.NDArray[np.float32]
+    used: BoolArray
+    patch_centre_mm: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.first.size)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a reconstruction came from."""
+
+    input_path: str
+    input_sha256: str
+    package_version: str
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Poses of the frames of one sweep.
+
+    Attributes
+    ----------
+    poses : dict of str to RigidTransform, each of length n
+        ``world_from_image`` by mode. In `image` the first frame is the identity.
+    config_toml : str
+        The effective configuration.
+    """
+
+    frame_time_s: FloatArray
+    grid: ImageGrid
+    poses: dict[str, RigidTransform]
+    provenance: Provenance
+    config_toml: str = ""
+    pairs: FramePairs | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if "image" not in self.poses:
+            raise InvalidInputError("expected the poses of mode 'image' in a reconstruction, got none")
+        for mode, poses in self.poses.items():
+            if mode not in MODES:
+                raise InvalidInputError(f"expected a mode among {', '.join(MODES)}, got {mode!r}")
+            if len(poses) != self.frame_time_s.size:
+                raise InvalidInputError(
+                    f"mode {mode}: expected {self.frame_time_s.size} poses, got {len(poses)}"
+                )

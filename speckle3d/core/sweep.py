@@ -1,0 +1,216 @@
+"""A sweep: frames read lazily, where their samples lie, their clock, and the sensors that rode along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray, require_increasing
+from speckle3d.core.streams import BoolArray, TimedPoses, TimedRotations
+
+
+class Frames(Protocol):
+    """Frames on disk or in memory; indexing reads one."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (frame, vector, sample)."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Sample type: int16, float32, or complex64 for analytic (I/Q) data."""
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        """Read one frame, shape (vector, sample)."""
+
+
+@dataclass(frozen=True)
+class RFSettings:
+    """How radio-frequency vectors were sampled."""
+
+    sampling_rate_hz: float
+    speed_of_sound_m_s: float
+    centre_frequency_hz: float
+    bandwidth_hz: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        _require_positive(self, ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz"))
+        low, high = self.bandwidth_hz
+        if not 0 < low < high <= self.sampling_rate_hz / 2:
+            raise InvalidInputError(
+                f"bandwidth_hz: expected 0 < low < high <= half the sampling rate, got ({low:g}, {high:g})"
+            )
+
+    @property
+    def sample_spacing_mm(self) -> float:
+        """Depth between neighbouring samples, mm."""
+        return 1e3 * self.speed_of_sound_m_s / (2.0 * self.sampling_rate_hz)
+
+
+@dataclass(frozen=True)
+class BModeSettings:
+    """How log-compressed grey levels were made: full scale is 0 dB, zero is `-dynamic_range_db`."""
+
+    dynamic_range_db: float
+    full_scale: float = 255.0
+
+    def __post_init__(self) -> None:
+        _require_positive(self, ("dynamic_range_db", "full_scale"))
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Where the samples of a frame lie in the image plane P, mm."""
+
+    vectors: int
+    samples: int
+    vector_pitch_mm: float
+    sample_spacing_mm: float
+    first_sample_depth_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
+        if not np.isfinite(self.first_sample_depth_mm):
+            raise InvalidInputError(
+                f"first_sample_depth_mm: expected a finite value, got {self.first_sample_depth_mm}"
+            )
+
+    @property
+    def width_mm(self) -> float:
+        """Distance between the first and the last vector, mm."""
+        return (self.vectors - 1) * self.vector_pitch_mm
+
+    @property
+    def depth_mm(self) -> float:
+        """Depth of the last sample, mm."""
+        return self.first_sample_depth_mm + (self.samples - 1) * self.sample_spacing_mm
+
+    @property
+    def centre_mm(self) -> FloatArray:
+        """The image's centre in P, shape (3,), mm."""
+        return np.array([self.width_mm / 2, (self.first_sample_depth_mm + self.depth_mm) / 2, 0.0])
+
+    @property
+    def corners_mm(self) -> FloatArray:
+        """The image's corners in P, clockwise from the top left, shape (4, 3), mm."""
+        x, top, bottom = self.width_mm, self.first_sample_depth_mm, self.depth_mm
+        return np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
+
+
+@dataclass(frozen=True)
+class OrientationSensor:
+    """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
+
+    readings: TimedRotations
+    sensor_from_image: Rotation | None = None
+    time_offset_s: float = 0.0
+    accelerometer_m_s2: FloatArray | None = None
+    gyroscope_rad_s: FloatArray | None = None
+    magnetometer_au: FloatArray | None = None
+
+    def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
+        """Which frames have an orientation."""
+        return self.readings.covers(np.asarray(frame_time_s) - self.time_offset_s)
+
+    def world_from_image(self, frame_time_s: npt.ArrayLike) -> Rotation:
+        """Orientation of the image at each frame time.
+
+        Raises
+        ------
+        InsufficientDataError
+            If the sensor is not calibrated to the image, or does not cover a time.
+        """
+        if self.sensor_from_image is None:
+            raise InsufficientDataError(
+                "the orientation sensor is not calibrated to the image: /orientation lacks the attribute "
+                "sensor_from_image_wxyz"
+            )
+        world_from_sensor = self.readings.at(np.asarray(frame_time_s) - self.time_offset_s)
+        return world_from_sensor * self.sensor_from_image
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
+
+    readings: TimedPoses
+    sensor_from_image: RigidTransform | None = None
+    time_offset_s: float = 0.0
+
+    def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
+        """Which frames have a pose."""
+        return self.readings.covers(np.asarray(frame_time_s) - self.time_offset_s)
+
+    def world_from_image(self, frame_time_s: npt.ArrayLike) -> RigidTransform:
+        """Pose of the image at each frame time.
+
+        Raises
+        ------
+        InsufficientDataError
+            If the sensor is not calibrated to the image, or does not cover a time.
+        """
+        if self.sensor_from_image is None:
+            raise InsufficientDataError(
+                "the tracker is not calibrated to the image: /tracker lacks the attribute sensor_from_image"
+            )
+        world_from_sensor = self.readings.at(np.asarray(frame_time_s) - self.time_offset_s)
+        return world_from_sensor * self.sensor_from_image
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Frames of one freehand sweep with everything recorded beside them.
+
+    Parameters
+    ----------
+    frames : Frames, shape (n, grid.vectors, grid.samples)
+    grid : ImageGrid
+    signal : RFSettings or BModeSettings
+        What the samples are.
+    frame_time_s : ndarray, shape (n,)
+        The image clock, strictly increasing.
+    truth : RigidTransform, length n, optional
+        ``world_from_image`` of every frame; simulations only.
+    """
+
+    frames: Frames
+    grid: ImageGrid
+    signal: RFSettings | BModeSettings
+    frame_time_s: FloatArray
+    orientation: OrientationSensor | None = None
+    tracker: Tracker | None = None
+    truth: RigidTransform | None = None
+    name: str = "sweep"
+
+    def __post_init__(self) -> None:
+        times = require_increasing(self.frame_time_s, f"{self.name}: frame_time_s")
+        object.__setattr__(self, "frame_time_s", times)
+        n, vectors, samples = self.frames.shape
+        if (vectors, samples) != (self.grid.vectors, self.grid.samples):
+            raise InvalidInputError(
+                f"{self.name}: expected frames of shape ({self.grid.vectors}, {self.grid.samples}), "
+                f"got ({vectors}, {samples})"
+            )
+        if times.size != n:
+            raise InvalidInputError(f"{self.name}: expected {n} frame times, got {times.size}")
+        if self.truth is not None and len(self.truth) != n:
+            raise InvalidInputError(f"{self.name}: expected {n} true poses, got {len(self.truth)}")
+
+    def __len__(self) -> int:
+        return int(self.frames.shape[0])
+
+    def with_orientation(self, sensor: OrientationSensor | None) -> Sweep:
+        """Return the same sweep with another orientation sensor."""
+        return replace(self, orientation=sensor)
+
+
+def _require_positive(settings: object, names: tuple[str, ...]) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        if not (np.isfinite(value) and value > 0):
+            raise InvalidInputError(f"{name}: expected a value above zero, got {value}")

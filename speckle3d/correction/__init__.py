@@ -1,0 +1,1 @@
+"""Drift correction of a trajectory by a sensor."""

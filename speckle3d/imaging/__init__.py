@@ -1,0 +1,1 @@
+"""Voxels and reslices from frames with poses."""

@@ -1,0 +1,1 @@
+"""Files: sweeps, curves, reconstructions, volumes."""

@@ -1,0 +1,1 @@
+"""From RF frames to a trajectory, one module per stage."""

@@ -1,0 +1,1 @@
+"""Simulated sweeps with truth."""

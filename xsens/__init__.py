@@ -1,0 +1,1 @@
+"""The orientation sensor: usable without speckle3d's upper floors."""
