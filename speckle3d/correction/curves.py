@@ -1,0 +1,185 @@
+"""A chain of poses bent by smooth per-frame corrections, and its derivatives.
+
+Housden et al. correct every step of a sensorless reconstruction by a small transform C_f whose six
+parameters are cubic curves, with a free offset at the first frame. In pose form
+
+    M_0 = S_0 C_0,    M_f = M_{f-1} (S_{f-1}^-1 S_f) C_f
+
+so a change of C_g moves every later frame rigidly. Each column of the Jacobian is therefore a running sum
+of twists along the chain, and all of them cost one pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.geometry import FloatArray, relative_poses, rotation_from_fixed_angles
+
+Curves = Literal["time", "distance"]
+
+AXES = ("x", "y", "z", "tilt", "yaw", "roll")
+"""Order of the six parameters of a correction."""
+
+ELEVATIONAL = ("z", "tilt", "yaw")
+"""Parameters that speckle decorrelation biases, in proportion to the distance travelled."""
+
+COEFFICIENTS = 5
+"""Per parameter: the first frame's offset and the four coefficients of a cubic."""
+
+
+def cumulative_product(matrices: FloatArray) -> FloatArray:
+    """Products ``matrices[0] @ ... @ matrices[f]`` for every f, shape (n, 4, 4)."""
+    # Doubling takes log2(n) array operations; a loop over the frames is ten times slower.
+    product, step = matrices.copy(), 1
+    while step < len(product):
+        product[step:] = product[:-step] @ product[step:]
+        step *= 2
+    return product
+
+
+def elevational_steps(world_from_image: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Signed travel of the image centre along the previous frame's z, shape (n - 1,), mm."""
+    steps = relative_poses(world_from_image).apply(centre_mm) - centre_mm
+    return np.asarray(steps[:, 2])
+
+
+def curve_basis(axes: tuple[str, ...], steps_mm: FloatArray, curves: Curves) -> FloatArray:
+    """Weight of every coefficient in every frame's correction, shape (n, len(axes), 5).
+
+    The first coefficient acts on frame 0 alone, the other four on the frames after it. The cubics are
+    written in Legendre polynomials of t = f / F, the same curves as the published powers of t but far
+    better conditioned, and divided so that coefficients are of the size of the drift over the whole sweep.
+
+    Parameters
+    ----------
+    steps_mm : ndarray, shape (n - 1,)
+        Estimated signed elevational step into each frame after the first.
+    curves : {"time", "distance"}
+        With "distance" the curves of z, tilt and yaw multiply the step (as a share of the distance
+        travelled), because those drifts accumulate with distance and change sign when the probe turns back.
+    """
+    n = steps_mm.size + 1
+    cubic = legendre.legvander(2.0 * np.arange(1, n) / (n - 1) - 1.0, COEFFICIENTS - 2)
+    basis = np.zeros((n, len(axes), COEFFICIENTS))
+    basis[0, :, 0] = 1.0
+    for a, axis in enumerate(axes):
+        if curves == "distance" and axis in ELEVATIONAL:
+            share = steps_mm / np.abs(steps_mm).sum()
+        else:
+            share = np.full(n - 1, 1.0 / (n - 1))
+        basis[1:, a, 1:] = cubic * share[:, None]
+    return basis
+
+
+@dataclass(frozen=True)
+class CorrectedChain:
+    """Poses as a function of the coefficients of their corrections.
+
+    Parameters
+    ----------
+    steps : ndarray, shape (n, 4, 4)
+        The first pose, then every frame's pose in the frame before it.
+    axes : tuple of str
+        Which of `AXES` are corrected.
+    basis : ndarray, shape (n, len(axes), 5)
+        From `curve_basis`.
+
+    References
+    ----------
+    .. [1] R. J. Housden et al., "Calibration of an orientation sensor for freehand 3D ultrasound and its
+       use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008, equations 1 to 3.
+    """
+
+    steps: FloatArray
+    axes: tuple[str, ...]
+    basis: FloatArray
+
+    @classmethod
+    def of(cls, poses: RigidTransform, axes: tuple[str, ...], basis: FloatArray) -> CorrectedChain:
+        """Build the chain of the given uncorrected poses."""
+        matrices = poses.as_matrix()
+        steps = np.concatenate([matrices[:1], relative_poses(poses).as_matrix()])
+        return cls(steps, axes, basis)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of every coefficient, in order."""
+        parts = ("offset", *(f"legendre{k}" for k in range(COEFFICIENTS - 1)))
+        return tuple(f"{axis}_{part}" for axis in self.axes for part in parts)
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Every frame's correction in the order of `AXES`, shape (n, 6), mm and rad."""
+        values = np.zeros((len(self.steps), len(AXES)))
+        columns = [AXES.index(axis) for axis in self.axes]
+        per_axis = coefficients.reshape(len(self.axes), COEFFICIENTS)
+        values[:, columns] = np.einsum("faj,aj->fa", self.basis, per_axis)
+        return values
+
+    def poses(self, coefficients: FloatArray) -> FloatArray:
+        """Corrected poses, shape (n, 4, 4)."""
+        return cumulative_product(self.steps @ correction_matrices(self.values(coefficients)))
+
+    def twists(self, coefficients: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How every frame moves with every coefficient.
+
+        Parameters
+        ----------
+        poses : ndarray, shape (n, 4, 4)
+            As returned by `poses` for the same coefficients.
+
+        Returns
+        -------
+        turn, shift : ndarray, shape (n, 3, n_coefficients)
+            A point at world position X of frame f moves by ``turn x X + shift`` per unit coefficient.
+        """
+        columns = [AXES.index(axis) for axis in self.axes]
+        turning, moving = _world_axes(poses, self.values(coefficients))
+        return self._accumulate(turning[:, :, columns]), self._accumulate(moving[:, :, columns])
+
+    def _accumulate(self, per_frame: FloatArray) -> FloatArray:
+        weighted = per_frame[:, :, :, None] * self.basis[:, None, :, :]
+        return np.asarray(np.cumsum(weighted, axis=0).reshape(len(per_frame), 3, -1))
+
+
+def correction_matrices(values: FloatArray) -> FloatArray:
+    """Equation (2): matrices of corrections (x, y, z, tilt, yaw, roll), shape (n, 6) to (n, 4, 4)."""
+    matrices = np.zeros((len(values), 4, 4))
+    matrices[:, :3, :3] = rotation_from_fixed_angles(values[:, 5], values[:, 4], values[:, 3]).as_matrix()
+    matrices[:, :3, 3] = values[:, :3]
+    matrices[:, 3, 3] = 1.0
+    return matrices
+
+
+def angle_axes(roll: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Axes about which tilt, yaw and roll turn Rz(roll) Ry(yaw) Rx(tilt), as columns, shape (n, 3, 3)."""
+    axes = np.zeros((roll.size, 3, 3))
+    axes[:, 0, 0], axes[:, 1, 0] = np.cos(yaw) * np.cos(roll), np.cos(yaw) * np.sin(roll)
+    axes[:, 2, 0] = -np.sin(yaw)
+    axes[:, 0, 1], axes[:, 1, 1] = -np.sin(roll), np.cos(roll)
+    axes[:, 2, 2] = 1.0
+    return axes
+
+
+def skew(vectors: FloatArray) -> FloatArray:
+    """Matrices of the cross product ``v x``, shape (..., 3) to (..., 3, 3)."""
+    matrices = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
+    return matrices - np.swapaxes(matrices, -1, -2)
+
+
+def _world_axes(poses: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Twist in the world of each of a frame's six corrections, as columns: turn and shift, (n, 3, 6)."""
+    rotation = correction_matrices(values)[:, :3, :3]
+    before = poses[:, :3, :3] @ rotation.transpose(0, 2, 1)
+    turn, shift = np.zeros((len(poses), 3, 6)), np.zeros((len(poses), 3, 6))
+    shift[:, :, :3] = before
+    turn[:, :, 3:] = before @ angle_axes(values[:, 5], values[:, 4])
+    # The turn is about the frame's own origin p: w x (X - p) = w x X + p x w.
+    shift[:, :, 3:] = skew(poses[:, :3, 3]) @ turn[:, :, 3:]
+    return turn, shift

@@ -1,0 +1,339 @@
+"""Drift correction of a sensorless reconstruction by a position or an orientation sensor.
+
+The image-based poses have good fine detail and slow drift; the sensor has no drift and coarse jitter.
+Smooth curves, too stiff to follow the jitter, bend the one onto the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, roll_yaw_tilt
+from speckle3d.core.leastsquares import Fit, levenberg_marquardt
+from speckle3d.core.streams import BoolArray
+from speckle3d.correction.curves import (
+    AXES,
+    COEFFICIENTS,
+    CorrectedChain,
+    Curves,
+    angle_axes,
+    curve_basis,
+    elevational_steps,
+    skew,
+)
+
+
+@dataclass(frozen=True)
+class DriftSettings:
+    """How drift is corrected.
+
+    Attributes
+    ----------
+    curves : {"time", "distance"}
+        "time": the published cubics in t = f / F. "distance": the cubics of z, tilt and yaw multiply the
+        signed estimated step, so that a correction turns round with the probe.
+    loss_epsilon_mm : float
+        Distance below which the unsquared corner distance is rounded off to be differentiable.
+    minimum_frames : int
+        Shortest sweep that is corrected.
+    minimum_coverage : float
+        Least share of the frames that need a sensor reading.
+    maximum_end_gap : float
+        Largest share of the frames that may lack a reading at either end, where curves would extrapolate.
+    minimum_travel_mm : float
+        Least sum of |step| for which "distance" curves are defined.
+    tolerance : float
+        Relative change of cost and coefficients at which the optimisation stops.
+    """
+
+    curves: Curves = "time"
+    loss_epsilon_mm: float = 0.01
+    minimum_frames: int = 10
+    minimum_coverage: float = 0.8
+    maximum_end_gap: float = 0.1
+    minimum_travel_mm: float = 0.1
+    tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if self.curves not in ("time", "distance"):
+            raise InvalidInputError(f"curves: expected 'time' or 'distance', got {self.curves!r}")
+        for name in ("loss_epsilon_mm", "minimum_travel_mm", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"{name}: expected a value above zero, got {getattr(self, name)}")
+        for name in ("minimum_coverage", "maximum_end_gap"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InvalidInputError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
+        if self.minimum_frames < COEFFICIENTS:
+            raise InvalidInputError(
+                f"minimum_frames: expected at least {COEFFICIENTS}, got {self.minimum_frames}"
+            )
+
+
+@dataclass(frozen=True)
+class DriftCorrection:
+    """A corrected reconstruction and how it was corrected.
+
+    Attributes
+    ----------
+    poses : RigidTransform, length n
+        ``world_from_image`` in the sensor's world.
+    fit : Fit
+        Of the curves' coefficients. The covariance takes the robust residuals of `correct_pose` for
+        Gaussian ones, so there it compares parameters rather than predicting errors.
+    curves : ndarray, shape (n, 6)
+        Every frame's correction (x, y, z, tilt, yaw, roll) of the step into it, mm and rad; row 0 is the
+        offset at the first frame, after a rigid registration. In `correct_orientation` it acts at the
+        image centre.
+    coverage : float
+        Share of the frames that had a sensor reading and so took part in the cost.
+    """
+
+    poses: RigidTransform
+    fit: Fit
+    curves: FloatArray
+    coverage: float
+    settings: DriftSettings
+
+
+def correct_pose(
+    world_from_image: RigidTransform,
+    reference: RigidTransform,
+    covered: npt.ArrayLike,
+    corners_mm: npt.ArrayLike,
+    settings: DriftSettings | None = None,
+) -> DriftCorrection:
+    """Correct all six degrees of freedom by a position sensor (Housden et al. 2008, equations 1 to 4).
+
+    The sweep is first registered rigidly to the sensor's world, so that the six first-frame offsets start
+    near zero, far from the singularity of their angles; they remain free, so the corrected sequences that
+    can be reached are the published ones. The cost is the sum of unsquared distances between
+    corresponding image corners, given to Levenberg-Marquardt as vectors e / (|e|^2 + epsilon^2)^(1/4).
+
+    Parameters
+    ----------
+    world_from_image : RigidTransform, length n
+        Image-based poses, in any world, mm.
+    reference : RigidTransform, length n or the number of covered frames
+        The sensor's ``world_from_image``; where not covered its values are ignored.
+    covered : array_like of bool, shape (n,)
+        Which frames have a reading. The others are corrected by the same smooth curves and add no cost.
+    corners_mm : array_like, shape (4, 3)
+        Image corners in the image frame.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the sweep is too short, its coverage too small, or "distance" curves lack travel.
+    MismatchError
+        If the lengths do not belong together.
+
+    References
+    ----------
+    .. [1] R. J. Housden et al., "Calibration of an orientation sensor for freehand 3D ultrasound and its
+       use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008.
+    """
+    settings = settings or DriftSettings()
+    corners = np.asarray(corners_mm, dtype=float)
+    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
+        raise InvalidInputError(f"corners_mm: expected shape (4, 3), got {corners.shape}")
+    used = _require_coverage(covered, len(world_from_image), settings)
+    measured = reference[_reading_index(len(reference), used)]
+    sensor_from_start = _register(_points(world_from_image[used], corners), _points(measured, corners))
+    target = _points(sensor_from_start.inv() * measured, corners)
+    chain = _chain(world_from_image, corners.mean(axis=0), AXES, settings)
+    problem = _CornerProblem(chain, used, corners, target, settings.loss_epsilon_mm)
+    fit = _solve(problem, chain, settings)
+    poses = sensor_from_start * RigidTransform.from_matrix(chain.poses(fit.parameters))
+    return DriftCorrection(poses, fit, chain.values(fit.parameters), float(used.mean()), settings)
+
+
+def correct_orientation(
+    world_from_image: RigidTransform,
+    reference: Rotation,
+    covered: npt.ArrayLike,
+    centre_mm: npt.ArrayLike,
+    settings: DriftSettings | None = None,
+) -> DriftCorrection:
+    """Correct orientation by an orientation sensor (Housden et al. 2008, equation 5).
+
+    Every correction turns a frame about its image centre, which therefore keeps its place relative to the
+    frame before: elevational length is unchanged by construction. The result is in the orientation
+    sensor's world; its origin, which such a sensor does not know, is put at the first frame's image origin.
+
+    Parameters
+    ----------
+    world_from_image : RigidTransform, length n
+        Image-based poses, in any world, mm.
+    reference : Rotation, length n or the number of covered frames
+        The sensor's ``world_from_image``; where not covered its values are ignored.
+    covered : array_like of bool, shape (n,)
+    centre_mm : array_like, shape (3,)
+        Image centre in the image frame.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the sweep is too short, its coverage too small, or "distance" curves lack travel.
+    MismatchError
+        If the lengths do not belong together.
+
+    References
+    ----------
+    .. [1] R. J. Housden et al., "Calibration of an orientation sensor for freehand 3D ultrasound and its
+       use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008.
+    """
+    settings = settings or DriftSettings()
+    centre = np.asarray(centre_mm, dtype=float)
+    if centre.shape != (3,):
+        raise InvalidInputError(f"centre_mm: expected shape (3,), got {centre.shape}")
+    used = _require_coverage(covered, len(world_from_image), settings)
+    measured = reference[_reading_index(len(reference), used)]
+    sensor_from_start = (measured * world_from_image[used].rotation.inv()).mean()
+    target = (sensor_from_start.inv() * measured).as_matrix()
+    # With the frame's origin moved to the centre, a turn about the centre is a turn and nothing else.
+    image_from_centred = RigidTransform.from_translation(centre)
+    chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
+    fit = _solve(_OrientationProblem(chain, used, target), chain, settings)
+    centred = RigidTransform.from_matrix(chain.poses(fit.parameters))
+    turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
+    poses = RigidTransform.from_translation(-turned[0].translation) * turned
+    return DriftCorrection(poses, fit, chain.values(fit.parameters), float(used.mean()), settings)
+
+
+@dataclass(frozen=True)
+class _CornerProblem:
+    """Equation (4): distances between corrected and measured corners of the covered frames."""
+
+    chain: CorrectedChain
+    covered: BoolArray
+    corners: FloatArray
+    target: FloatArray
+    epsilon_mm: float
+
+    def residuals(self, coefficients: FloatArray) -> FloatArray:
+        error = self._corners(self.chain.poses(coefficients)) - self.target
+        return np.asarray((error * self._softened(error)[..., None] ** -0.25).ravel())
+
+    def jacobian(self, coefficients: FloatArray) -> FloatArray:
+        poses = self.chain.poses(coefficients)
+        points = self._corners(poses)
+        turn, shift = self.chain.twists(coefficients, poses)
+        motion = np.concatenate([turn, shift], axis=1)[self.covered]
+        gain = self._gain(points - self.target)
+        per_motion = np.concatenate([-gain @ skew(points), gain], axis=-1)
+        rows = per_motion.reshape(len(points), -1, 6) @ motion
+        return np.asarray(rows.reshape(-1, coefficients.size))
+
+    def _corners(self, poses: FloatArray) -> FloatArray:
+        rotation, origin = poses[self.covered, :3, :3], poses[self.covered, :3, 3]
+        return np.asarray(self.corners @ rotation.transpose(0, 2, 1) + origin[:, None, :])
+
+    def _softened(self, error: FloatArray) -> FloatArray:
+        return np.asarray((error**2).sum(axis=-1) + self.epsilon_mm**2)
+
+    def _gain(self, error: FloatArray) -> FloatArray:
+        """Differentiate the robust residual by the error, shape (f, c, 3, 3)."""
+        softened = self._softened(error)[..., None, None]
+        outer = error[..., :, None] * error[..., None, :]
+        return np.asarray(softened**-0.25 * (np.eye(3) - 0.5 * outer / softened))
+
+
+@dataclass(frozen=True)
+class _OrientationProblem:
+    """Equation (5): roll, yaw and tilt of the measured orientation seen from the corrected frame."""
+
+    chain: CorrectedChain
+    covered: BoolArray
+    target: FloatArray
+
+    def residuals(self, coefficients: FloatArray) -> FloatArray:
+        return self._angles(self.chain.poses(coefficients)).ravel()
+
+    def jacobian(self, coefficients: FloatArray) -> FloatArray:
+        poses = self.chain.poses(coefficients)
+        turn, _ = self.chain.twists(coefficients, poses)
+        angles = self._angles(poses)
+        image_from_world = poses[self.covered, :3, :3].transpose(0, 2, 1)
+        seen = -image_from_world @ turn[self.covered]
+        tilt_yaw_roll = np.linalg.solve(angle_axes(angles[:, 0], angles[:, 1]), seen)
+        return np.asarray(tilt_yaw_roll[:, ::-1].reshape(-1, coefficients.size))
+
+    def _angles(self, poses: FloatArray) -> FloatArray:
+        image_from_world = poses[self.covered, :3, :3].transpose(0, 2, 1)
+        return roll_yaw_tilt(Rotation.from_matrix(image_from_world @ self.target))
+
+
+def _solve(
+    problem: _CornerProblem | _OrientationProblem, chain: CorrectedChain, settings: DriftSettings
+) -> Fit:
+    start = np.zeros(len(chain.names))
+    return levenberg_marquardt(
+        problem.residuals, start, problem.jacobian, names=chain.names, tolerance=settings.tolerance
+    )
+
+
+def _chain(
+    poses: RigidTransform, centre: FloatArray, axes: tuple[str, ...], settings: DriftSettings
+) -> CorrectedChain:
+    steps_mm = elevational_steps(poses, centre)
+    travel_mm = float(np.abs(steps_mm).sum())
+    if settings.curves == "distance" and travel_mm < settings.minimum_travel_mm:
+        raise InsufficientDataError(
+            f"expected at least {settings.minimum_travel_mm:g} mm of elevational travel for curves of "
+            f"'distance', got {travel_mm:.3g} mm; curves of 'time' need none"
+        )
+    return CorrectedChain.of(poses, axes, curve_basis(axes, steps_mm, settings.curves))
+
+
+def _points(poses: RigidTransform, corners: FloatArray) -> FloatArray:
+    """Corners in the world, shape (f, c, 3)."""
+    translation, rotation = poses.as_components()
+    return np.asarray(corners @ rotation.as_matrix().transpose(0, 2, 1) + translation[:, None, :])
+
+
+def _register(moving: FloatArray, fixed: FloatArray) -> RigidTransform:
+    """Least-squares rigid transform ``fixed_from_moving`` of corresponding points, shape (f, c, 3)."""
+    a, b = moving.reshape(-1, 3), fixed.reshape(-1, 3)
+    a_mean, b_mean = a.mean(axis=0), b.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(b - b_mean, a - a_mean)
+    return RigidTransform.from_components(b_mean - rotation.apply(a_mean), rotation)
+
+
+def _reading_index(readings: int, used: BoolArray) -> BoolArray:
+    """Which of the readings belong to covered frames, in order."""
+    if readings == used.size:
+        return used
+    if readings == int(used.sum()):
+        return np.ones(readings, dtype=bool)
+    raise MismatchError(
+        f"reference: expected {used.size} poses, or {int(used.sum())} for the covered frames, got {readings}"
+    )
+
+
+def _require_coverage(covered: npt.ArrayLike, frames: int, settings: DriftSettings) -> BoolArray:
+    used = np.asarray(covered, dtype=bool)
+    if used.shape != (frames,):
+        raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
+    if frames < settings.minimum_frames:
+        raise InsufficientDataError(
+            f"drift correction: expected at least {settings.minimum_frames} frames, got {frames}"
+        )
+    if used.mean() < settings.minimum_coverage or used.sum() < settings.minimum_frames:
+        least = max(settings.minimum_coverage * frames, settings.minimum_frames)
+        raise InsufficientDataError(
+            f"drift correction: expected sensor readings for at least {least:.0f} of {frames} frames, "
+            f"got {int(used.sum())}"
+        )
+    at = np.flatnonzero(used)
+    before, after = int(at[0]), frames - 1 - int(at[-1])
+    if max(before, after) > settings.maximum_end_gap * frames:
+        raise InsufficientDataError(
+            f"drift correction: expected at most {settings.maximum_end_gap:.0%} of {frames} frames without "
+            f"sensor readings at either end, got {before} at the start and {after} at the end"
+        )
+    return used
