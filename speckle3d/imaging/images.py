@@ -1,0 +1,102 @@
+"""Grey images of a sweep with their poses, read one at a time so that memory does not grow with the sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import ImageGrid
+
+GreyArray = npt.NDArray[np.float32]
+
+
+class IndexedImages(Protocol):
+    """Anything indexed by frame: an array, a list, a lazy reader."""
+
+    def __getitem__(self, index: int, /) -> npt.NDArray[Any]:
+        """Read one image, shape (vector, sample)."""
+
+
+Images = IndexedImages | Callable[[int], npt.NDArray[Any]]
+"""Where images come from: indexed or called with the frame's number, giving shape (vector, sample)."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Images on one grid with the pose of each.
+
+    Parameters
+    ----------
+    images : indexable or callable
+        Grey images, shape (vector, sample), any real type; NaN marks samples without a value.
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+        Translation in mm.
+
+    Raises
+    ------
+    MismatchError
+        If the number of images is known and differs from the number of poses.
+    InvalidInputError
+        If there are no poses.
+    """
+
+    images: Images
+    grid: ImageGrid
+    world_from_image: RigidTransform
+
+    def __post_init__(self) -> None:
+        require_poses(self.world_from_image)
+        shape = getattr(self.images, "shape", None)
+        known = shape[0] if shape else len(self) if callable(self.images) else _length(self.images)
+        if known is not None and known != len(self):
+            raise MismatchError(
+                f"world_from_image: expected {known} poses for {known} images, got {len(self)}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.world_from_image)
+
+    def read(self, index: int) -> GreyArray:
+        """Image number `index`, shape (vector, sample), contiguous.
+
+        Raises
+        ------
+        MismatchError
+            If the image does not lie on the grid.
+        InvalidInputError
+            If it is complex.
+        """
+        image = self.images(index) if callable(self.images) else self.images[index]
+        expected = (self.grid.vectors, self.grid.samples)
+        if image.shape != expected:
+            raise MismatchError(f"images[{index}]: expected shape {expected}, got {image.shape}")
+        if np.iscomplexobj(image):
+            raise InvalidInputError(f"images[{index}]: expected grey levels, got type {image.dtype}")
+        # Writeable, so that read-only sources do not compile the kernels a second time.
+        return np.require(image, np.float32, ["C", "W"])
+
+    def index_from_image(self) -> FloatArray:
+        """Affine map from image coordinates (x, y, z, 1) in mm to (vector, sample, z in mm), shape (3, 4)."""
+        pitch, spacing = self.grid.vector_pitch_mm, self.grid.sample_spacing_mm
+        scaled = np.diag([1.0 / pitch, 1.0 / spacing, 1.0, 1.0])[:3]
+        scaled[1, 3] = -self.grid.first_sample_depth_mm / spacing
+        return scaled
+
+
+def require_poses(world_from_image: RigidTransform) -> None:
+    """Raise `InvalidInputError` unless there is a row of at least one pose."""
+    if world_from_image.single or len(world_from_image) == 0:
+        got = "a single one outside a row" if world_from_image.single else "none"
+        raise InvalidInputError(f"world_from_image: expected a row of poses, one per image, got {got}")
+
+
+def _length(images: object) -> int | None:
+    return len(images) if hasattr(images, "__len__") else None
