@@ -1,0 +1,53 @@
+"""A volume: voxels on a regular grid, and where that grid lies in the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Voxels indexed ``[i, j, k]`` along the grid's own x, y and z axes.
+
+    Parameters
+    ----------
+    voxels : ndarray of uint8 or float32, shape (n_i, n_j, n_k)
+    spacing_mm : tuple of float
+        Distance between neighbouring voxel centres along i, j and k.
+    world_from_grid : RigidTransform
+        Pose of the grid, mm; its origin is the centre of voxel ``[0, 0, 0]``.
+    """
+
+    voxels: npt.NDArray[Any]
+    spacing_mm: tuple[float, float, float]
+    world_from_grid: RigidTransform
+
+    def __post_init__(self) -> None:
+        if self.voxels.ndim != 3 or 0 in self.voxels.shape:
+            raise InvalidInputError(f"voxels: expected shape (n_i, n_j, n_k), got {self.voxels.shape}")
+        if self.voxels.dtype not in (np.dtype(np.uint8), np.dtype(np.float32)):
+            raise InvalidInputError(f"voxels: expected uint8 or float32, got {self.voxels.dtype}")
+        spacing = tuple(float(step) for step in self.spacing_mm)
+        if len(spacing) != 3 or not all(np.isfinite(step) and step > 0 for step in spacing):
+            raise InvalidInputError(f"spacing_mm: expected three values above zero, got {spacing}")
+        object.__setattr__(self, "spacing_mm", spacing)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of voxels along i, j and k."""
+        n_i, n_j, n_k = self.voxels.shape
+        return n_i, n_j, n_k
+
+    @property
+    def world_from_index(self) -> FloatArray:
+        """Affine matrix from voxel indices to world mm, shape (4, 4)."""
+        scale = np.diag([*self.spacing_mm, 1.0])
+        return np.asarray(self.world_from_grid.as_matrix() @ scale)

@@ -1,0 +1,251 @@
+"""What every file of the family shares: whole-or-not-at-all writing, and reading that names what is wrong."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+
+PathLike = str | os.PathLike[str]
+
+_CHUNK_CACHE_BYTES = 32 * 2**20
+"""Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
+
+_READ_FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
+"""What h5py raises, by place, when the bytes of a file do not make sense."""
+
+_ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
+"""Stored kinds that may become the kind asked for."""
+
+
+@contextmanager
+def atomic_path(path: PathLike) -> Iterator[Path]:
+    """Yield a temporary sibling that becomes `path` when the block succeeds and vanishes when it does not.
+
+    The sibling keeps the suffix, by which some writers choose their format.
+
+    Raises
+    ------
+    FileError
+        If the folder does not exist, `path` is not an ordinary file, or the system refuses to write.
+    """
+    target = Path(path).resolve()
+    if target.exists() and not target.is_file():
+        raise FileError(f"{path}: expected an ordinary file to write, got a folder or device")
+    if not target.parent.is_dir():
+        raise FileError(f"{path}: expected an existing folder, got {target.parent}")
+    part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
+    try:
+        yield part
+        os.replace(part, target)
+    except OSError as error:
+        if isinstance(error, Speckle3DError):
+            raise
+        raise FileError(f"{path}: cannot be written: {one_line(error)}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
+    """Open an HDF5 file of the family for writing; `path` appears whole or not at all (`atomic_path`)."""
+    with atomic_path(path) as part, h5py.File(part, "w") as file:
+        file.attrs["format"] = format_name
+        file.attrs["version"] = version
+        yield file
+
+
+def open_hdf5(path: PathLike) -> h5py.File:
+    """Open an HDF5 file for reading.
+
+    Raises
+    ------
+    FileError
+        If it is missing, truncated or not HDF5.
+    """
+    if not Path(path).exists():
+        raise FileError(f"{path}: expected a file, got none")
+    if not Path(path).is_file():
+        raise FileError(f"{path}: expected a file, got a folder or device")
+    try:
+        if not h5py.is_hdf5(path):
+            raise FileError(f"{path}: expected an HDF5 file, got something else")
+        return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
+    except _READ_FAILURES as error:
+        if isinstance(error, Speckle3DError):
+            raise
+        raise FileError(f"{path}: cannot be opened: {one_line(error)}") from error
+
+
+@contextmanager
+def opened(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
+    """Open an HDF5 file of the family for reading and require its format and version."""
+    with open_hdf5(path) as file:
+        found = file_format(file)
+        if found != format_name:
+            raise InvalidInputError(f"{path}: expected format {format_name!r}, got {found!r}")
+        got = read_attribute(file, "version")
+        if got != version:
+            raise InvalidInputError(f"{path}: expected {format_name} version {version}, got {got:g}")
+        yield file
+
+
+def file_format(file: h5py.File) -> str:
+    """Return the attribute ``format`` of an open file."""
+    return read_text(file, "format")
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """Put `where` before the message of an `InvalidInputError` raised in the block, unless it is there."""
+    try:
+        yield
+    except InvalidInputError as error:
+        if str(error).startswith(where):
+            raise
+        raise type(error)(f"{where}: {error}") from error
+
+
+def locate(node: h5py.Group | h5py.Dataset, name: str = "") -> str:
+    """Name a place in a file for a message: ``file: /group/name``."""
+    inside = f"{node.name.rstrip('/')}/{name}".rstrip("/") or "/"
+    return f"{node.file.filename}: {inside}"
+
+
+def read_checked(
+    group: h5py.Group, name: str, shape: tuple[int | str, ...], dtype: npt.DTypeLike = np.float64
+) -> npt.NDArray[Any]:
+    """Read a data set whose shape and kind are known.
+
+    Parameters
+    ----------
+    shape : tuple of int or str
+        Lengths; a word stands for a length that is free, and shows in the message.
+    dtype : dtype
+        What to return. Integers are accepted where floats are asked for, not the other way round.
+
+    Raises
+    ------
+    InvalidInputError
+        If the data set is missing or of another shape or kind.
+    FileError
+        If its bytes cannot be read.
+    """
+    node = require_dataset(group, name)
+    where, wanted = locate(group, name), np.dtype(dtype)
+    if node.dtype.kind not in _ACCEPTED_KINDS[wanted.kind]:
+        raise InvalidInputError(f"{where}: expected numbers of type {wanted}, got {node.dtype}")
+    if not _fits(node.shape, shape):
+        expected = ", ".join(str(n) for n in shape) + ("," if len(shape) == 1 else "")
+        raise InvalidInputError(f"{where}: expected shape ({expected}), got {node.shape}")
+    try:
+        return np.asarray(node[()], dtype=wanted)
+    except _READ_FAILURES as error:
+        raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
+
+
+def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
+    """Return a data set of `group`, or raise `InvalidInputError` naming what is there instead."""
+    node = _member(group, name)
+    if not isinstance(node, h5py.Dataset):
+        raise InvalidInputError(f"{locate(group, name)}: expected a data set, got {_kind_of(node)}")
+    return node
+
+
+def find_group(group: h5py.Group, name: str) -> h5py.Group | None:
+    """Return a group inside `group`, None if there is none of that name."""
+    node = _member(group, name)
+    if node is not None and not isinstance(node, h5py.Group):
+        raise InvalidInputError(f"{locate(group, name)}: expected a group, got {_kind_of(node)}")
+    return node
+
+
+def read_attribute(node: h5py.Group | h5py.Dataset, name: str, default: float | None = None) -> float:
+    """Read a finite number; `default` stands in for a missing one unless it is None."""
+    value = read_vector_attribute(node, name, 1)
+    if value is None:
+        if default is None:
+            raise InvalidInputError(f"{locate(node)}: expected attribute {name}, got none")
+        return default
+    return float(value[0])
+
+
+def read_vector_attribute(
+    node: h5py.Group | h5py.Dataset, name: str, size: int
+) -> npt.NDArray[np.float64] | None:
+    """Read an attribute of `size` finite numbers as a flat array; None if it is missing."""
+    where = f"{locate(node)} attribute {name}"
+    raw = _raw_attribute(node, name)
+    if raw is None:
+        return None
+    value = np.asarray(raw)
+    if value.dtype.kind not in "fiu" or value.size != size:
+        raise InvalidInputError(f"{where}: expected {size} number(s), got {_shown(raw)}")
+    if not np.isfinite(value).all():
+        raise InvalidInputError(f"{where}: expected finite number(s), got {_shown(raw)}")
+    return value.astype(np.float64).ravel()
+
+
+def read_text(node: h5py.Group | h5py.Dataset, name: str) -> str:
+    """Read a text attribute."""
+    raw = _raw_attribute(node, name)
+    if isinstance(raw, bytes):
+        raw = raw.decode("utf-8", errors="replace")
+    if not isinstance(raw, str):
+        got = "none" if raw is None else _shown(raw)
+        raise InvalidInputError(f"{locate(node)}: expected text attribute {name}, got {got}")
+    return str(raw)
+
+
+def sha256_of(path: PathLike) -> str:
+    """SHA-256 of a file's bytes, read in pieces, as 64 hexadecimal digits."""
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+
+
+def one_line(error: BaseException) -> str:
+    """Return the first line of an error's own words."""
+    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return (text.strip() or type(error).__name__).splitlines()[0]
+
+
+def _member(group: h5py.Group, name: str) -> Any:
+    try:
+        return group.get(name)
+    except _READ_FAILURES as error:
+        raise FileError(f"{locate(group, name)}: cannot be read: {one_line(error)}") from error
+
+
+def _raw_attribute(node: h5py.Group | h5py.Dataset, name: str) -> Any:
+    try:
+        return node.attrs.get(name)
+    except _READ_FAILURES as error:
+        raise FileError(f"{locate(node)} attribute {name}: cannot be read: {one_line(error)}") from error
+
+
+def _fits(shape: tuple[int, ...] | None, expected: tuple[int | str, ...]) -> bool:
+    if shape is None or len(shape) != len(expected):
+        return False
+    return all(isinstance(want, str) or got == want for got, want in zip(shape, expected, strict=True))
+
+
+def _kind_of(node: object) -> str:
+    return "none" if node is None else type(node).__name__.lower()
+
+
+def _shown(raw: object) -> str:
+    text = " ".join(repr(raw).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,217 @@
+"""The sweep file, version 1: writing, frame by frame."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import require_finite, require_increasing
+from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.io.hdf5 import PathLike, atomic_hdf5, naming, open_hdf5
+from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames
+
+Compression = Literal["gzip", "lzf"] | None
+Progress = Callable[[int, int], None]
+
+_GZIP_LEVEL = 1
+"""Speckle hardly compresses further at higher levels, which cost several times the time."""
+
+
+class SweepWriter:
+    """Write a sweep file frame by frame; it appears whole when the block ends, or not at all.
+
+    Parameters
+    ----------
+    path : path
+    grid : ImageGrid
+    signal : RFSettings or BModeSettings
+        Decides whether frames become ``/rf`` or ``/bmode``.
+    dtype : dtype
+        int16 or float32 for RF, uint8 for B-mode; by default int16 or uint8.
+    compression : {"gzip", "lzf", None}
+        HDF5 filter, with byte shuffling; lzf is faster and larger.
+    """
+
+    def __init__(
+        self,
+        path: PathLike,
+        grid: ImageGrid,
+        signal: RFSettings | BModeSettings,
+        dtype: npt.DTypeLike | None = None,
+        compression: Compression = "gzip",
+    ) -> None:
+        self._path, self._grid, self._signal = path, grid, signal
+        self._name = "rf" if isinstance(signal, RFSettings) else "bmode"
+        self._dtype = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
+        if self._dtype not in SAMPLE_TYPES[self._name]:
+            expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[self._name])
+            raise InvalidInputError(
+                f"{path}: expected {self._name} samples of type {expected}, got {self._dtype}"
+            )
+        self._compression = compression
+        self._time_s: list[float] = []
+        self._stack = ExitStack()
+
+    def __enter__(self) -> SweepWriter:
+        with ExitStack() as stack:
+            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, FORMAT, VERSION))
+            self._frames: h5py.Dataset = self._create_frames()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self._stack.__exit__(kind, error, trace)
+            return
+        with self._stack:
+            self._finish()
+
+    def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
+        """Write the next frame, shape (vector, sample), taken at image time `time_s`.
+
+        Raises
+        ------
+        InvalidInputError
+            If its shape or type is another, it holds NaN, or its time is not after the one before.
+        """
+        i = len(self._time_s)
+        where = f"{self._path}: /{self._name}[{i}]"
+        if frame.shape != (self._grid.vectors, self._grid.samples):
+            expected = (self._grid.vectors, self._grid.samples)
+            raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
+        if not np.can_cast(frame.dtype, self._dtype, "same_kind"):
+            raise InvalidInputError(f"{where}: expected samples of type {self._dtype}, got {frame.dtype}")
+        if frame.dtype.kind == "f":
+            require_finite(frame, where)
+        self._frames.resize(i + 1, axis=0)
+        self._frames[i] = frame
+        self._time_s.append(float(time_s))
+
+    def write_orientation(self, sensor: OrientationSensor) -> None:
+        """Write the orientation sensor's stream."""
+        group = self._file.create_group("orientation")
+        group["time_s"] = sensor.readings.time_s
+        group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
+        for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+            if (values := getattr(sensor, name)) is not None:
+                group[name] = np.asarray(values, dtype=np.float64)
+        if sensor.sensor_from_image is not None:
+            group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
+        group.attrs["time_offset_s"] = sensor.time_offset_s
+
+    def write_tracker(self, tracker: Tracker) -> None:
+        """Write the 6-DOF sensor's stream."""
+        group = self._file.create_group("tracker")
+        group["time_s"] = tracker.readings.time_s
+        group["world_from_sensor"] = tracker.readings.world_from_sensor.as_matrix()
+        group["valid"] = np.ones(len(tracker.readings), dtype=bool)
+        if tracker.sensor_from_image is not None:
+            group.attrs["sensor_from_image"] = tracker.sensor_from_image.as_matrix()
+        group.attrs["time_offset_s"] = tracker.time_offset_s
+
+    def write_truth(self, world_from_image: RigidTransform) -> None:
+        """Write the true pose of every frame."""
+        self._file["truth/world_from_image"] = world_from_image.as_matrix()
+
+    def write_simulation(self, values: Mapping[str, Any]) -> None:
+        """Write how a sweep was simulated as attributes of ``/simulation``; nested values become JSON."""
+        group = self._file.require_group("simulation")
+        for name, value in values.items():
+            plain = isinstance(value, str | int | float)
+            group.attrs[name] = value if plain else json.dumps(value, sort_keys=True)
+
+    def copy_unknown(self, source: PathLike) -> None:
+        """Copy what another sweep file holds beyond this version of the format."""
+        with open_hdf5(source) as other:
+            for name in other:
+                if name not in KNOWN and name not in self._file:
+                    other.copy(other[name], self._file, name)
+            for name, value in other.attrs.items():
+                if name not in self._file.attrs:
+                    self._file.attrs[name] = value
+
+    def _create_frames(self) -> h5py.Dataset:
+        shape = (self._grid.vectors, self._grid.samples)
+        node = self._file.create_dataset(
+            self._name,
+            shape=(0, *shape),
+            maxshape=(None, *shape),
+            chunks=(1, *shape),
+            dtype=self._dtype,
+            compression=self._compression,
+            compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
+            shuffle=self._compression is not None,
+        )
+        for name, value in _attributes(self._grid, self._signal).items():
+            node.attrs[name] = value
+        return node
+
+    def _finish(self) -> None:
+        with naming(str(self._path)):
+            times = require_increasing(np.asarray(self._time_s, dtype=float), "/frame_time_s")
+            if times.size == 0:
+                raise InvalidInputError(f"/{self._name}: expected at least one frame, got none")
+            truth = self._file.get("truth/world_from_image")
+            if truth is not None and len(truth) != times.size:
+                raise InvalidInputError(f"/truth: expected {times.size} poses, got {len(truth)}")
+        self._file["frame_time_s"] = times
+
+
+def write_sweep(
+    path: PathLike, sweep: Sweep, progress: Progress | None = None, compression: Compression = "gzip"
+) -> None:
+    """Write a sweep; what its own file holds beyond the format is copied along.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the number of frames written and their total.
+
+    Raises
+    ------
+    InvalidInputError
+        If the samples are of a type the format does not hold, as analytic (complex) ones.
+    """
+    with SweepWriter(path, sweep.grid, sweep.signal, sweep.frames.dtype, compression) as writer:
+        for i, time_s in enumerate(sweep.frame_time_s):
+            writer.append(sweep.frames[i], time_s)
+            if progress is not None:
+                progress(i + 1, len(sweep))
+        if sweep.orientation is not None:
+            writer.write_orientation(sweep.orientation)
+        if sweep.tracker is not None:
+            writer.write_tracker(sweep.tracker)
+        if sweep.truth is not None:
+            writer.write_truth(sweep.truth)
+        if isinstance(sweep.frames, HDF5Frames):
+            writer.copy_unknown(sweep.frames.path)
+
+
+def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
+    if isinstance(signal, RFSettings):
+        return {
+            "sampling_rate_hz": signal.sampling_rate_hz,
+            "vector_pitch_mm": grid.vector_pitch_mm,
+            "speed_of_sound_m_s": signal.speed_of_sound_m_s,
+            "first_sample_depth_mm": grid.first_sample_depth_mm,
+            "centre_frequency_hz": signal.centre_frequency_hz,
+            "bandwidth_hz": np.asarray(signal.bandwidth_hz, dtype=float),
+        }
+    return {
+        "column_pitch_mm": grid.vector_pitch_mm,
+        "row_spacing_mm": grid.sample_spacing_mm,
+        "first_sample_depth_mm": grid.first_sample_depth_mm,
+        "dynamic_range_db": signal.dynamic_range_db,
+        "full_scale": signal.full_scale,
+    }

@@ -1,0 +1,257 @@
+"""The sweep file, version 1: reading, frames left on disk."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.geometry import (
+    FloatArray,
+    require_finite,
+    require_increasing,
+    rotations_from_quaternions,
+    transforms_from_matrices,
+)
+from speckle3d.core.streams import BoolArray, TimedPoses, TimedRotations
+from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.io.hdf5 import (
+    PathLike,
+    find_group,
+    locate,
+    naming,
+    one_line,
+    open_hdf5,
+    opened,
+    read_attribute,
+    read_checked,
+    read_vector_attribute,
+    require_dataset,
+)
+
+FORMAT = "speckle3d.sweep"
+VERSION = 1
+KNOWN = frozenset({"rf", "bmode", "frame_time_s", "orientation", "tracker", "truth"})
+"""Members of the root that this version of the format gives a meaning to."""
+
+SAMPLE_TYPES = {"rf": (np.dtype(np.int16), np.dtype(np.float32)), "bmode": (np.dtype(np.uint8),)}
+
+_OPTIONAL_VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+
+
+class HDF5Frames:
+    """Frames of a sweep file, read one at a time.
+
+    The file is opened at the first frame asked for and stays open until `close`, which may be called at any
+    time: the next frame opens it again. A copy sent to another process opens the file there.
+    """
+
+    def __init__(self, path: PathLike, name: str, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
+        self.path = Path(path).absolute()
+        self.name = name
+        self._shape = shape
+        self._dtype = dtype
+        self._file: h5py.File | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (frame, vector, sample)."""
+        return self._shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Sample type."""
+        return self._dtype
+
+    def __len__(self) -> int:
+        return self._shape[0]
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        i = operator.index(index)
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"frame {i} of {len(self)}")
+        i %= len(self)
+        frame = self._read(i)
+        if frame.dtype.kind == "f":
+            require_finite(frame, f"{self.path}: /{self.name}[{i}]")
+        return frame
+
+    def close(self) -> None:
+        """Close the file if it is open."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None}
+
+    def _read(self, i: int) -> npt.NDArray[Any]:
+        if self._file is None:
+            self._file = open_hdf5(self.path)
+        frame = np.empty(self._shape[1:], self._dtype)
+        try:
+            self._file[self.name].read_direct(frame, np.s_[i])
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise FileError(f"{self.path}: /{self.name}[{i}]: cannot be read: {one_line(error)}") from error
+        return frame
+
+
+def read_sweep(path: PathLike) -> Sweep:
+    """Read a sweep file; its frames stay on disk until they are asked for.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, truncated or not HDF5.
+    InvalidInputError
+        Naming the file, the data set and the first bad index.
+    """
+    with opened(path, FORMAT, VERSION) as file:
+        frames, grid, signal = _read_image(file)
+        n = frames.shape[0]
+        times = read_checked(file, "frame_time_s", (n,))
+        return Sweep(
+            frames=frames,
+            grid=grid,
+            signal=signal,
+            frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
+            orientation=_read_orientation(file),
+            tracker=_read_tracker(file),
+            truth=_read_truth(file, n),
+            name=Path(path).stem,
+        )
+
+
+@contextmanager
+def open_sweep(path: PathLike) -> Iterator[Sweep]:
+    """Read a sweep file for the length of a block, then close it."""
+    sweep = read_sweep(path)
+    try:
+        yield sweep
+    finally:
+        if isinstance(sweep.frames, HDF5Frames):
+            sweep.frames.close()
+
+
+def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
+    name = "rf" if "rf" in file else "bmode"
+    if name not in file:
+        raise InvalidInputError(f"{locate(file)}: expected a data set rf or bmode, got neither")
+    node = require_dataset(file, name)
+    where = locate(file, name)
+    if node.dtype.newbyteorder("=") not in SAMPLE_TYPES[name]:
+        expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
+        raise InvalidInputError(f"{where}: expected samples of type {expected}, got {node.dtype}")
+    if node.ndim != 3 or 0 in node.shape:
+        raise InvalidInputError(f"{where}: expected shape (frame, vector, sample), got {node.shape}")
+    frames = HDF5Frames(file.filename, name, node.shape, node.dtype.newbyteorder("="))
+    with naming(where):
+        grid, signal = (_rf_settings if name == "rf" else _bmode_settings)(node)
+    return frames, grid, signal
+
+
+def _rf_settings(node: h5py.Dataset) -> tuple[ImageGrid, RFSettings]:
+    band = read_vector_attribute(node, "bandwidth_hz", 2)
+    if band is None:
+        raise InvalidInputError("expected attribute bandwidth_hz, got none")
+    signal = RFSettings(
+        sampling_rate_hz=read_attribute(node, "sampling_rate_hz"),
+        speed_of_sound_m_s=read_attribute(node, "speed_of_sound_m_s"),
+        centre_frequency_hz=read_attribute(node, "centre_frequency_hz"),
+        bandwidth_hz=(float(band[0]), float(band[1])),
+    )
+    return _grid(node, read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm), signal
+
+
+def _bmode_settings(node: h5py.Dataset) -> tuple[ImageGrid, BModeSettings]:
+    signal = BModeSettings(
+        dynamic_range_db=read_attribute(node, "dynamic_range_db"),
+        full_scale=read_attribute(node, "full_scale", default=255.0),
+    )
+    pitch, spacing = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
+    return _grid(node, pitch, spacing), signal
+
+
+def _grid(node: h5py.Dataset, pitch_mm: float, spacing_mm: float) -> ImageGrid:
+    _, vectors, samples = node.shape
+    return ImageGrid(vectors, samples, pitch_mm, spacing_mm, read_attribute(node, "first_sample_depth_mm"))
+
+
+def _read_orientation(file: h5py.File) -> OrientationSensor | None:
+    group = find_group(file, "orientation")
+    if group is None:
+        return None
+    time_s = _read_clock(group)
+    quaternions = read_checked(group, "quaternion_wxyz", (time_s.size, 4))
+    rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
+    wxyz = read_vector_attribute(group, "sensor_from_image_wxyz", 4)
+    vectors = {name: _read_vectors(group, name, time_s.size) for name in _OPTIONAL_VECTORS if name in group}
+    with naming(locate(group)):
+        return OrientationSensor(
+            readings=TimedRotations(time_s, rotations),
+            sensor_from_image=None if wxyz is None else _calibrated_rotation(wxyz),
+            time_offset_s=read_attribute(group, "time_offset_s", default=0.0),
+            **vectors,
+        )
+
+
+def _read_tracker(file: h5py.File) -> Tracker | None:
+    group = find_group(file, "tracker")
+    if group is None:
+        return None
+    time_s = _read_clock(group)
+    valid = _read_valid(group, time_s.size)
+    matrices = read_checked(group, "world_from_sensor", (time_s.size, 4, 4))
+    # An invalid sample may hold anything; the identity keeps the indices of the others for messages.
+    matrices[~valid] = np.eye(4)
+    poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
+    matrix = read_vector_attribute(group, "sensor_from_image", 16)
+    with naming(locate(group)):
+        return Tracker(
+            readings=TimedPoses(time_s[valid], poses[valid]),
+            sensor_from_image=None if matrix is None else _calibrated_pose(matrix),
+            time_offset_s=read_attribute(group, "time_offset_s", default=0.0),
+        )
+
+
+def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:
+    group = find_group(file, "truth")
+    if group is None:
+        return None
+    matrices = read_checked(group, "world_from_image", (frames, 4, 4))
+    return transforms_from_matrices(matrices, locate(group, "world_from_image"))
+
+
+def _read_clock(group: h5py.Group) -> FloatArray:
+    return require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
+
+
+def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
+    values = read_checked(group, name, (samples, 3))
+    require_finite(values, locate(group, name))
+    return values
+
+
+def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
+    if "valid" not in group:
+        return np.ones(samples, dtype=bool)
+    valid = read_checked(group, "valid", (samples,), np.bool_)
+    if samples and not valid.any():
+        raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
+    return valid
+
+
+def _calibrated_rotation(wxyz: FloatArray) -> Rotation:
+    return rotations_from_quaternions(wxyz[None], "attribute sensor_from_image_wxyz")[0]
+
+
+def _calibrated_pose(flat: FloatArray) -> RigidTransform:
+    return transforms_from_matrices(flat.reshape(1, 4, 4), "attribute sensor_from_image")[0]
