@@ -38,3 +38,29 @@ def reslice_nearest(
             weights = [1.0] if one_sided else [abs(z[k]) / apart for k in nearest[::-1]]
             result[point] = sum(w * level[k] for w, k in zip(weights, nearest, strict=False))
     return result
+
+
+def bin_mean(images, image_points_world, world_from_grid, spacing_mm, shape):
+    """Twin of `speckle3d.kernels.compounding.add_samples`: mean of the samples nearest each voxel centre.
+
+    images: (n, vector, sample); image_points_world: (n, vector, sample, 3). NaN where a voxel has none.
+    """
+    index = np.rint(world_from_grid.inv().apply(image_points_world.reshape(-1, 3)) / spacing_mm).astype(int)
+    levels = images.astype(float).ravel()
+    kept = ((index >= 0) & (index < shape)).all(axis=1) & ~np.isnan(levels)
+    total, count = np.zeros((2, *shape))
+    np.add.at(total, tuple(index[kept].T), levels[kept])
+    np.add.at(count, tuple(index[kept].T), 1)
+    return np.divide(total, count, out=np.full(shape, np.nan), where=count > 0)
+
+
+def fill_holes(voxels, cap):
+    """Twin of `speckle3d.kernels.compounding.fill_from_shell`: grow a cube until it holds a value."""
+    filled = voxels.copy()
+    for at in np.argwhere(np.isnan(voxels)):
+        for radius in range(1, cap + 1):
+            cube = voxels[tuple(slice(max(c - radius, 0), c + radius + 1) for c in at)]
+            if not np.isnan(cube).all():
+                filled[tuple(at)] = np.nanmean(cube)
+                break
+    return filled

@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses
 
 MAX_PIXELS = 100_000_000
@@ -123,6 +125,27 @@ def reslice_frames(
     for index in np.flatnonzero(_touches(maps, grid, plane, max_distance_mm)):
         keep_nearest(source.read(int(index)), maps[index], max_distance_mm, distance_mm, grey)
     return _blend(distance_mm, grey)
+
+
+def reslice_volume(volume: Volume, plane: ReslicePlane) -> GreyArray:
+    """Cut a plane through voxels, linear between them.
+
+    Parameters
+    ----------
+    volume : Volume
+    plane : ReslicePlane
+
+    Returns
+    -------
+    ndarray of float32, shape (rows, columns)
+        NaN outside the volume and beside NaN voxels.
+    """
+    index_from_pixel = np.linalg.solve(volume.world_from_index, plane.world_from_pixel())[:3]
+    rows, columns = np.indices(plane.shape, dtype=np.float64, sparse=True)
+    # NumPy adds the sparse row and column terms: no array of homogeneous pixels is made.
+    index = np.stack([a * columns + b * rows + c for a, b, c in index_from_pixel])
+    cut = map_coordinates(volume.voxels, index, output=np.float32, order=1, cval=np.nan)
+    return np.asarray(cut, dtype=np.float32)
 
 
 def along_sweep_plane(

@@ -84,7 +84,7 @@ def test_tilted_bright_plane_appears_where_it_is(seed):
     weight = np.nan_to_num(cut[:, full]) ** 4
     crest_mm = (weight * miss_mm[:, full]).sum(axis=0) / weight.sum(axis=0)
     assert full.sum() > 80
-    # Half the closest sampling step, the 0.1 mm pixel: blending bracketing frames must not move the crest more.
+    # Half the closest sampling step, the 0.1 mm pixel: blending frames must not move it more.
     assert np.abs(crest_mm).max() < 0.05
 
 

@@ -1,0 +1,244 @@
+"""Voxels from a sweep's images: every sample averaged into its voxel, then the holes filled.
+
+Voxels are indexed ``[i, j, k]`` along the grid's x, y and z, which are the world's axes unless asked
+otherwise: in the mode `image` lateral, axial and elevational of the first frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_cdt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses
+
+DEFAULT_FILL_RADIUS = 3
+"""Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
+
+MAX_MEMORY_GB = 4.0
+"""What compounding may take: more is a wrong unit more often than a large sweep."""
+
+BYTES_PER_VOXEL = 16
+"""Sum, count and hole distance at four bytes each, and as much again of passing masks and copies."""
+
+VoxelType = Literal["float32", "uint8"]
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Where voxels lie.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Number of voxels along i, j and k.
+    spacing_mm : tuple of float
+        Distance between neighbouring voxel centres along i, j and k.
+    world_from_grid : RigidTransform
+        Its origin is the centre of voxel ``[0, 0, 0]``; mm.
+    """
+
+    shape: tuple[int, int, int]
+    spacing_mm: tuple[float, float, float]
+    world_from_grid: RigidTransform
+
+    @property
+    def memory_gb(self) -> float:
+        """What compounding on this grid takes."""
+        return float(np.prod(np.asarray(self.shape, dtype=float)) * BYTES_PER_VOXEL / 1e9)
+
+
+def grid_around(
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    voxel_mm: float,
+    world_from_axes: Rotation | None = None,
+) -> VoxelGrid:
+    """Smallest grid of cubic voxels that holds the corners of every image.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    voxel_mm : float
+    world_from_axes : Rotation, optional
+        Directions of the voxel axes; without it, the world's.
+
+    Raises
+    ------
+    InvalidInputError
+        If `voxel_mm` is not positive, or there are no poses.
+    """
+    if not (np.isfinite(voxel_mm) and voxel_mm > 0):
+        raise InvalidInputError(f"voxel_mm: expected a value above zero, got {voxel_mm}")
+    require_poses(world_from_image)
+    axes = Rotation.identity() if world_from_axes is None else world_from_axes
+    corners = np.concatenate([world_from_image.apply(corner) for corner in grid.corners_mm])
+    along = axes.inv().apply(corners)
+    low, high = along.min(axis=0), along.max(axis=0)
+    # A corner half a voxel past the last centre would round up, and so may one a rounding error short of it.
+    n_i, n_j, n_k = (int(n) + 1 for n in np.floor((high - low) / voxel_mm + 0.5 + 1e-6))
+    placed = RigidTransform.from_components(axes.apply(low), axes)
+    return VoxelGrid((n_i, n_j, n_k), (voxel_mm, voxel_mm, voxel_mm), placed)
+
+
+def compound(
+    images: Images,
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    voxel_mm: float,
+    *,
+    fill_radius: int = DEFAULT_FILL_RADIUS,
+    voxel_type: VoxelType = "float32",
+    world_from_axes: Rotation | None = None,
+    max_memory_gb: float = MAX_MEMORY_GB,
+) -> Volume:
+    """Compound a sweep's images into cubic voxels that hold all of it.
+
+    Parameters
+    ----------
+    images : indexable or callable
+        Grey images by frame number, shape (vector, sample), read one at a time.
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    voxel_mm : float
+    fill_radius, voxel_type, max_memory_gb
+        As for `compound_on`.
+    world_from_axes : Rotation, optional
+        Directions of the voxel axes; without it, the world's.
+
+    Returns
+    -------
+    Volume
+
+    Raises
+    ------
+    InvalidInputError
+        If the volume would take more than `max_memory_gb`, or an input is not what it must be.
+    InsufficientDataError
+        If no sample has a value.
+    """
+    voxel_grid = grid_around(grid, world_from_image, voxel_mm, world_from_axes)
+    return compound_on(
+        voxel_grid,
+        images,
+        grid,
+        world_from_image,
+        fill_radius=fill_radius,
+        voxel_type=voxel_type,
+        max_memory_gb=max_memory_gb,
+    )
+
+
+def compound_on(
+    voxel_grid: VoxelGrid,
+    images: Images,
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    *,
+    fill_radius: int = DEFAULT_FILL_RADIUS,
+    voxel_type: VoxelType = "float32",
+    max_memory_gb: float = MAX_MEMORY_GB,
+) -> Volume:
+    """Compound a sweep's images on a given grid; samples outside it are left out.
+
+    Each voxel is the mean of all samples in it. An empty voxel is then the mean of those that are not in
+    the smallest cube around it that holds any; filled voxels stay as they are.
+
+    Parameters
+    ----------
+    voxel_grid : VoxelGrid
+    images : indexable or callable
+        Grey images by frame number, shape (vector, sample), read one at a time.
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    fill_radius : int
+        Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
+        stay empty. The volume also grows by so many voxels beyond the first and the last frame.
+    voxel_type : {"float32", "uint8"}
+        With "float32" empty voxels are NaN. With "uint8" levels are rounded and clipped to 0-255, and empty
+        voxels are 0.
+    max_memory_gb : float
+
+    Returns
+    -------
+    Volume
+
+    Raises
+    ------
+    InvalidInputError
+        If the volume would take more than `max_memory_gb`, or an input is not what it must be.
+    InsufficientDataError
+        If no sample with a value lies in the grid.
+
+    References
+    ----------
+    .. [1] R. Rohling, A. Gee and L. Berman, "A comparison of freehand three-dimensional ultrasound
+       reconstruction techniques", Medical Image Analysis, 1999.
+    """
+    _require_options(voxel_grid, fill_radius, voxel_type, max_memory_gb)
+    mean = _bin_mean(voxel_grid, PosedImages(images, grid, world_from_image))
+    _fill_holes(mean, fill_radius)
+    voxels = _as_uint8(mean) if voxel_type == "uint8" else mean
+    return Volume(voxels, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
+
+
+def _require_options(voxel_grid: VoxelGrid, fill_radius: int, voxel_type: str, max_memory_gb: float) -> None:
+    if fill_radius < 0:
+        raise InvalidInputError(f"fill_radius: expected zero or more voxels, got {fill_radius}")
+    if voxel_type not in ("float32", "uint8"):
+        raise InvalidInputError(f"voxel_type: expected 'float32' or 'uint8', got {voxel_type!r}")
+    if voxel_grid.memory_gb > max_memory_gb:
+        voxels = " x ".join(str(n) for n in voxel_grid.shape)
+        spacing = " x ".join(f"{step:g}" for step in voxel_grid.spacing_mm)
+        raise InvalidInputError(
+            f"volume: expected at most {max_memory_gb:g} GB of memory, got {voxel_grid.memory_gb:.3g} GB for "
+            f"{voxels} voxels of {spacing} mm: take larger voxels, or check the poses"
+        )
+
+
+def _bin_mean(voxel_grid: VoxelGrid, source: PosedImages) -> GreyArray:
+    """Mean of the samples in each voxel; NaN where there is none."""
+    from speckle3d.kernels.compounding import add_samples
+
+    total = np.zeros(voxel_grid.shape, dtype=np.float32)
+    count = np.zeros(voxel_grid.shape, dtype=np.uint32)
+    for index, index_from_sample in enumerate(_index_from_sample(voxel_grid, source)):
+        add_samples(source.read(index), index_from_sample, total, count)
+    if not count.any():
+        raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
+    with np.errstate(invalid="ignore"):  # 0 / 0 is the NaN that marks an empty voxel
+        return np.divide(total, count, out=total, casting="same_kind")
+
+
+def _index_from_sample(voxel_grid: VoxelGrid, source: PosedImages) -> FloatArray:
+    """Per image, the map from (vector, sample, 1) to fractional (i, j, k), shape (n, 3, 3)."""
+    grid_from_image = (voxel_grid.world_from_grid.inv() * source.world_from_image).as_matrix()
+    image_from_sample = np.zeros((4, 3))
+    image_from_sample[0, 0] = source.grid.vector_pitch_mm
+    image_from_sample[1, 1:] = source.grid.sample_spacing_mm, source.grid.first_sample_depth_mm
+    image_from_sample[3, 2] = 1.0
+    maps = (grid_from_image @ image_from_sample)[:, :3] / np.asarray(voxel_grid.spacing_mm)[:, None]
+    return np.ascontiguousarray(maps)
+
+
+def _fill_holes(voxels: GreyArray, fill_radius: int) -> None:
+    from speckle3d.kernels.compounding import fill_from_shell
+
+    empty = np.isnan(voxels)
+    if fill_radius > 0 and empty.any():
+        distance = distance_transform_cdt(empty, metric="chessboard")
+        fill_from_shell(voxels, np.asarray(distance, dtype=np.int32), fill_radius)
+
+
+def _as_uint8(voxels: GreyArray) -> npt.NDArray[np.uint8]:
+    rounded = np.nan_to_num(np.rint(voxels), nan=0.0)
+    return np.clip(rounded, 0.0, 255.0, out=rounded).astype(np.uint8)
