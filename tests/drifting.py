@@ -19,7 +19,7 @@ def wobble(rng, frames, amplitude, slowest=1.0, fastest=6.0):
 
 
 def hand_sweep(rng, frames=200, length_mm=20.0, turns=0):
-    """True ``world_from_image``: uneven speed, wobble of 0.3 mm and 0.5 degrees, back and forth `turns` times."""
+    """True ``world_from_image``: uneven speed, 0.3 mm and 0.5 degrees of wobble, `turns` reversals."""
     speed = np.clip(1.0 + wobble(rng, frames, 0.25), 0.1, None)
     travelled = np.concatenate([[0.0], np.cumsum(speed[1:])])
     travelled *= (turns + 1) / travelled[-1]

@@ -1,0 +1,268 @@
+"""How far a reconstruction is from a reference: length, tilt, yaw and roll.
+
+*Length* is the accumulated elevational travel of the image centre: every frame's centre, seen from the frame
+before it, moves by a signed z; length is the running sum. Tilt, yaw and roll are the running sums of the
+same relative poses' angles. They need no common world, so a reconstruction without any sensor can be
+compared, and they are the axes of figure 6 and of tables 3 and 4 of Housden et al. 2008.
+
+Because the steps are signed, a sensor's jitter does not add up: it telescopes, and only that of the first
+and the last frame remains. What remains is averaged away (see `compare_modes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, relative_poses, require_finite, roll_yaw_tilt
+
+JITTER_FRAMES = 9
+"""Frames over which a sensor's jitter is averaged to find turning points: a third of a second."""
+
+END_FRAMES = 25
+"""Frames of the line that reads a jittery reference at the ends of a part. On simulated hand sweeps of 20 mm
+with a tracker's 0.15 mm and 0.1 degrees per axis, 1, 9, 25 and 51 frames leave 0.29, 0.16, 0.10 and 0.08 mm
+of scoring error; against an exact reference the same lines cost 0, 0.006, 0.03 and 0.05 mm."""
+
+
+@dataclass(frozen=True)
+class Accumulated:
+    """Motion summed from the first frame, all of shape (n,), zero at frame 0."""
+
+    length_mm: FloatArray
+    tilt_rad: FloatArray
+    yaw_rad: FloatArray
+    roll_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a sweep in which the probe moves one way; neighbours share their turning frame."""
+
+    name: str
+    first: int
+    last: int
+
+    @property
+    def frames(self) -> slice:
+        """Index of the part's frames, both ends included."""
+        return slice(self.first, self.last + 1)
+
+
+@dataclass(frozen=True)
+class ModeError:
+    """Error of one drift-correction mode in one part of a sweep.
+
+    Errors are estimate minus reference; that of length is positive where the estimate is too long,
+    whichever way the probe moved, and its percentage is of the reference's length in that part.
+    """
+
+    part: str
+    mode: str
+    frames: int
+    reference_mm: float
+    estimate_mm: float
+    length_error_mm: float
+    length_error_percent: float
+    tilt_error_deg: float
+    yaw_error_deg: float
+    roll_error_deg: float
+
+
+def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> Accumulated:
+    """Sum the elevational travel of the image centre and the angles from frame to frame.
+
+    Parameters
+    ----------
+    world_from_image : RigidTransform, length n
+    centre_mm : array_like, shape (3,)
+        Image centre in the image frame.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
+    """
+    if len(world_from_image) < 2:
+        raise InsufficientDataError(f"expected at least 2 poses, got {len(world_from_image)}")
+    centre = np.asarray(centre_mm, dtype=float)
+    steps = relative_poses(world_from_image)
+    roll, yaw, tilt = roll_yaw_tilt(steps.rotation).T
+    along_z = (steps.apply(centre) - centre)[:, 2]
+    length, tilts, yaws, rolls = (np.concatenate([[0.0], np.cumsum(a)]) for a in (along_z, tilt, yaw, roll))
+    return Accumulated(length, tilts, yaws, rolls)
+
+
+def monotone_parts(
+    length_mm: npt.ArrayLike, hysteresis_mm: float = 0.5, jitter_frames: int = JITTER_FRAMES
+) -> list[Part]:
+    """Split a sweep where the probe truly turns back.
+
+    Parameters
+    ----------
+    length_mm : array_like, shape (n,)
+        Accumulated length of the reference.
+    hysteresis_mm : float
+        A turn counts once the probe has come back by more than this.
+    jitter_frames : int
+        Width of the median and of the mean that remove a sensor's spikes and jitter first; 1 for none.
+
+    Returns
+    -------
+    list of Part
+        Named "f", "r", then "f2", "r2" and so on; "f" is the first, whatever its sign.
+    """
+    length = np.asarray(length_mm, dtype=float)
+    require_finite(length, "length_mm")
+    if length.ndim != 1 or length.size < 2:
+        raise InvalidInputError(f"length_mm: expected shape (n,) with n > 1, got {length.shape}")
+    width = min(jitter_frames, length.size)
+    smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
+    edges = [0, *_turning_frames(smooth, hysteresis_mm), length.size - 1]
+    names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
+    return [Part(name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)]
+
+
+def align_sign(
+    world_from_image: RigidTransform, reference: RigidTransform, centre_mm: npt.ArrayLike
+) -> RigidTransform:
+    """Mirror a sensorless reconstruction if it moves the other way than the reference.
+
+    Decorrelation measures distances without sign: images alone cannot tell a sweep from its mirror image in
+    the first frame's plane, (z, tilt, yaw) -> (-z, -tilt, -yaw). A comparison would then score the
+    convention and not the method, so it may choose the better of the two. For scoring only: a
+    reconstruction's own sign must come from a sensor or the user.
+    """
+    found, true = accumulated(world_from_image, centre_mm), accumulated(reference, centre_mm)
+    agreement = (found.length_mm - found.length_mm.mean()) @ (true.length_mm - true.length_mm.mean())
+    if agreement >= 0.0:
+        return world_from_image
+    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
+    first_from_image = (world_from_image[0].inv() * world_from_image).as_matrix()
+    return world_from_image[0] * RigidTransform.from_matrix(mirror @ first_from_image @ mirror)
+
+
+def compare_modes(
+    poses: Mapping[str, RigidTransform],
+    reference: RigidTransform,
+    centre_mm: npt.ArrayLike,
+    covered: npt.ArrayLike | None = None,
+    parts: list[Part] | None = None,
+    end_frames: int = END_FRAMES,
+) -> list[ModeError]:
+    """Errors of length, tilt, yaw and roll of every mode in every monotone part.
+
+    The error of a part is the change of (estimate - reference) between its ends. Estimates are smooth from
+    frame to frame and so is their drift; a tracker is not. The difference at each end is therefore read off
+    a line through its last `end_frames` frames inside the part, by the median of pairwise slopes so that
+    single bad readings do no harm. The reference's length is the first mode's minus its error. For an
+    exact reference pass ``end_frames=1``: the end frames as they are.
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform, length n
+        ``world_from_image`` by mode, in any world; put a jitter-free one (`image`) first.
+    reference : RigidTransform, length n or the number of covered frames
+    covered : array_like of bool, shape (n,), optional
+        Which frames have a reference; the others are left out of every sum.
+    parts : list of Part, optional
+        In covered frames; by default the reference's own.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, tables 3 and 4.
+    """
+    estimates, true = _accumulated_together(poses, reference, centre_mm, covered)
+    rows: list[ModeError] = []
+    for part in parts if parts is not None else monotone_parts(true.length_mm):
+        carrier = next(iter(estimates.values())).length_mm
+        reference_mm = _change(carrier, part, 1) + _change(true.length_mm - carrier, part, end_frames)
+        rows += [
+            _mode_error(part, mode, found, true, reference_mm, end_frames)
+            for mode, found in estimates.items()
+        ]
+    return rows
+
+
+def _turning_frames(length: FloatArray, hysteresis: float) -> list[int]:
+    """Frames of the extremes after which `length` comes back by more than `hysteresis`."""
+    turns: list[int] = []
+    highest = lowest = 0
+    direction = 0
+    for i, value in enumerate(length):
+        highest = i if value > length[highest] else highest
+        lowest = i if value < length[lowest] else lowest
+        if direction >= 0 and length[highest] - value > hysteresis:
+            turns += [highest] if direction else []
+            direction, lowest = -1, i
+        elif direction <= 0 and value - length[lowest] > hysteresis:
+            turns += [lowest] if direction else []
+            direction, highest = 1, i
+    return turns
+
+
+def _accumulated_together(
+    poses: Mapping[str, RigidTransform],
+    reference: RigidTransform,
+    centre_mm: npt.ArrayLike,
+    covered: npt.ArrayLike | None,
+) -> tuple[dict[str, Accumulated], Accumulated]:
+    if not poses:
+        raise InvalidInputError("poses: expected at least one mode, got none")
+    frames = len(next(iter(poses.values())))
+    used = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
+    if used.shape != (frames,):
+        raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
+    if len(reference) == frames:
+        reference = reference[used]
+    for mode, each in poses.items():
+        if len(each) != frames:
+            raise MismatchError(f"mode {mode}: expected {frames} poses, got {len(each)}")
+    if len(reference) != int(used.sum()):
+        raise MismatchError(f"reference: expected {int(used.sum())} poses, got {len(reference)}")
+    return {m: accumulated(p[used], centre_mm) for m, p in poses.items()}, accumulated(reference, centre_mm)
+
+
+def _mode_error(
+    part: Part, mode: str, found: Accumulated, true: Accumulated, reference_mm: float, end_frames: int
+) -> ModeError:
+    direction = -1.0 if reference_mm < 0 else 1.0
+    error_mm = direction * _change(found.length_mm - true.length_mm, part, end_frames)
+    tilt, yaw, roll = (
+        float(np.rad2deg(_change(getattr(found, name) - getattr(true, name), part, end_frames)))
+        for name in ("tilt_rad", "yaw_rad", "roll_rad")
+    )
+    return ModeError(
+        part=part.name,
+        mode=mode,
+        frames=part.last - part.first + 1,
+        reference_mm=abs(reference_mm),
+        estimate_mm=abs(reference_mm) + error_mm,
+        length_error_mm=error_mm,
+        length_error_percent=100.0 * error_mm / abs(reference_mm) if reference_mm else float("nan"),
+        tilt_error_deg=tilt,
+        yaw_error_deg=yaw,
+        roll_error_deg=roll,
+    )
+
+
+def _change(values: FloatArray, part: Part, end_frames: int) -> float:
+    """Change of `values` from the first to the last frame of a part, each read off a robust line."""
+    inside = values[part.frames]
+    width = max(1, min(end_frames, inside.size // 2))
+    return _line_end(inside[-width:]) - _line_end(inside[:width][::-1])
+
+
+def _line_end(values: FloatArray) -> float:
+    """Value at the last sample of a Theil-Sen line through `values`."""
+    if values.size < 3:
+        return float(values[-1])
+    i, j = np.triu_indices(values.size, 1)
+    slope = np.median((values[j] - values[i]) / (j - i))
+    back = np.arange(values.size) - (values.size - 1)
+    return float(np.median(values - slope * back))

@@ -1,0 +1,133 @@
+"""A comparison's numbers on file: for programs (JSON, CSV) and for people (an aligned table)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.study.metrics import ModeError
+
+_COLUMNS = (
+    ("sweep", "sweep", "{}"),
+    ("part", "part", "{}"),
+    ("mode", "mode", "{}"),
+    ("reference_mm", "reference mm", "{:.2f}"),
+    ("estimate_mm", "estimate mm", "{:.2f}"),
+    ("length_error_mm", "error mm", "{:+.2f}"),
+    ("length_error_percent", "error %", "{:+.1f}"),
+    ("tilt_error_deg", "tilt deg", "{:+.2f}"),
+    ("yaw_error_deg", "yaw deg", "{:+.2f}"),
+    ("roll_error_deg", "roll deg", "{:+.2f}"),
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What one sweep's comparison found.
+
+    Attributes
+    ----------
+    reference : str
+        What the modes were compared with: "truth" or "tracker".
+    coverage : float
+        Share of the frames that have a reference.
+    rows : sequence of ModeError
+    details : dict
+        Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
+    """
+
+    sweep: str
+    reference: str
+    frames: int
+    coverage: float
+    rows: Sequence[ModeError]
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+def write_summary(directory: Path, summaries: Sequence[Summary]) -> list[Path]:
+    """Write ``summary.json``, ``table.txt`` and ``table.csv``; each appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the directory cannot be written.
+    """
+    contents = {
+        "summary.json": json_text(summaries),
+        "table.txt": table_text(summaries),
+        "table.csv": csv_text(summaries),
+    }
+    return [_write_whole(directory / name, text) for name, text in contents.items()]
+
+
+def json_text(summaries: Sequence[Summary]) -> str:
+    """Summaries as strict JSON: a value that is not finite becomes null."""
+    return json.dumps({"sweeps": [plain(summary) for summary in summaries]}, indent=2, allow_nan=False) + "\n"
+
+
+def csv_text(summaries: Sequence[Summary]) -> str:
+    """One line per sweep, part and mode, with full precision, under the names of `ModeError`."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["sweep", "reference", *(f.name for f in fields(ModeError))])
+    for summary in summaries:
+        for row in summary.rows:
+            writer.writerow([summary.sweep, summary.reference, *asdict(row).values()])
+    return text.getvalue()
+
+
+def table_text(summaries: Sequence[Summary]) -> str:
+    """Aligned table for reading; angles and lengths are estimate minus reference."""
+    lines = [[heading for _, heading, _ in _COLUMNS]]
+    for summary in summaries:
+        for row in summary.rows:
+            values = {"sweep": summary.sweep, **asdict(row)}
+            lines.append([form.format(values[key]) for key, _, form in _COLUMNS])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(_COLUMNS))]
+    lines.insert(1, ["-" * width for width in widths])
+    return "\n".join(_aligned(line, widths) for line in lines) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """Turn dataclasses, arrays and NumPy scalars into what JSON knows."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    raise InvalidInputError(f"summary: expected dataclasses, numbers, strings or arrays, got {type(value)}")
+
+
+def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
+    words = [
+        cell.ljust(width) if key in ("sweep", "part", "mode") else cell.rjust(width)
+        for cell, width, (key, _, _) in zip(cells, widths, _COLUMNS, strict=True)
+    ]
+    return "  ".join(words).rstrip()
+
+
+def _write_whole(path: Path, text: str) -> Path:
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
+    return path
