@@ -1,1 +1,1 @@
-"""Files: sweeps, curves, reconstructions, volumes."""
+"""Files: sweeps, image sequences, reconstructions, volumes. Readers are chosen by what a file holds."""

@@ -1,0 +1,210 @@
+"""Text headers of MetaImage and NRRD files, with the per-frame fields that PLUS writes into them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.hdf5 import PathLike, one_line
+
+_FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
+_HEADER_LIMIT_BYTES = 2**28
+"""A header of a thousand bytes for each of a quarter million frames; beyond it the file is no header."""
+
+_NRRD_NAMES = {
+    "ultrasound image orientation": "UltrasoundImageOrientation",
+    "ultrasound image type": "UltrasoundImageType",
+}
+
+_ELEMENT_BYTES = {
+    "MET_CHAR": 1,
+    "MET_UCHAR": 1,
+    "MET_SHORT": 2,
+    "MET_USHORT": 2,
+    "MET_INT": 4,
+    "MET_UINT": 4,
+    "MET_FLOAT": 4,
+    "MET_DOUBLE": 8,
+}
+
+
+@dataclass(frozen=True)
+class SequenceHeader:
+    """What the header of an image file says.
+
+    Attributes
+    ----------
+    size : tuple of int
+        Length of the first axes, fastest first, frames left out.
+    spacing_mm : tuple of float, or None
+        Of the first two axes; None where the header holds the pixel unit 1 that stands for "unknown".
+    fields : dict
+        Fields of the whole file.
+    frames : tuple of dict
+        Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
+    """
+
+    path: str
+    size: tuple[int, ...]
+    spacing_mm: tuple[float, float] | None
+    fields: dict[str, str]
+    frames: tuple[dict[str, str], ...]
+
+    @property
+    def frame_count(self) -> int:
+        """Frames, from the third axis; a plane image is one frame."""
+        return self.size[2] if len(self.size) > 2 else 1
+
+
+def is_metaimage(start: bytes) -> bool:
+    """Whether a file's first bytes are those of a MetaImage header."""
+    first = start.split(b"\n", 1)[0].split(b"=")[0].strip()
+    return first in (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType") and b"=" in start
+
+
+def is_nrrd(start: bytes) -> bool:
+    """Whether a file's first bytes are those of an NRRD header."""
+    return start.startswith(b"NRRD000")
+
+
+def read_header(path: PathLike) -> SequenceHeader:
+    """Read the text header of a MetaImage or NRRD file.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, or a MetaImage holds fewer bytes than its header announces.
+    InvalidInputError
+        If it is neither, or the header does not make sense.
+    """
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(512)
+            stream.seek(0)
+            if is_nrrd(start):
+                return _nrrd_header(path, dict(_nrrd_lines(stream)))
+            if is_metaimage(start):
+                header = _meta_header(path, dict(_meta_lines(path, stream)))
+                _require_pixels(path, stream, header)
+                return header
+    except OSError as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
+
+
+def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
+    """Read finite numbers separated by blanks; `count` of them unless it is None."""
+    try:
+        values = tuple(float(word) for word in text.split())
+    except ValueError:
+        values = ()
+    if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
+        shown = text if len(text) <= 40 else f"{text[:37]}..."
+        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
+    return values
+
+
+def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
+    for line in _lines(stream):
+        name, equals, value = line.partition("=")
+        if not equals:
+            break
+        yield name.strip(), value.strip()
+        if name.strip() == "ElementDataFile":
+            return
+    raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
+
+
+def _nrrd_lines(stream: BinaryIO) -> Iterator[tuple[str, str]]:
+    for line in _lines(stream):
+        if not line.strip():
+            return
+        if line.startswith(("#", "NRRD")):
+            continue
+        name, _, value = line.partition(":=") if ":=" in line else line.partition(":")
+        yield _NRRD_NAMES.get(name.strip(), name.strip()), value.strip()
+
+
+def _lines(stream: BinaryIO) -> Iterator[str]:
+    while stream.tell() < _HEADER_LIMIT_BYTES and (line := stream.readline(2**16)):
+        yield line.decode("latin-1").rstrip("\r\n")
+
+
+def _meta_header(path: PathLike, lines: dict[str, str]) -> SequenceHeader:
+    size = _sizes(path, lines, "DimSize")
+    spacing = lines.get("ElementSpacing") or lines.get("ElementSize")
+    known = numbers(spacing, len(size), f"{path}: ElementSpacing") if spacing else None
+    return _header(path, size, known, lines)
+
+
+def _nrrd_header(path: PathLike, lines: dict[str, str]) -> SequenceHeader:
+    size = _sizes(path, lines, "sizes")
+    known: tuple[float, ...] | None
+    if "spacings" in lines:
+        known = _first_two(lines["spacings"].lower().replace("nan", "1"), path, "spacings")
+    else:
+        known = _direction_lengths(path, lines.get("space directions", ""))
+    return _header(path, size, known, lines)
+
+
+def _header(
+    path: PathLike, size: tuple[int, ...], spacing: tuple[float, ...] | None, lines: dict[str, str]
+) -> SequenceHeader:
+    frames: dict[int, dict[str, str]] = {}
+    fields = {}
+    for name, value in lines.items():
+        if match := _FRAME_FIELD.fullmatch(name):
+            frames.setdefault(int(match[1]), {})[match[2]] = value
+        else:
+            fields[name] = value
+    if frames and sorted(frames) != list(range(len(frames))):
+        gap = next(i for i in range(len(frames)) if i not in frames)
+        raise InvalidInputError(f"{path}: expected fields Seq_Frame{gap:04d}_..., got none for frame {gap}")
+    # PLUS and ITK write 1 where nobody told them; no ultrasound image has millimetre samples.
+    known = None if spacing is None or spacing[:2] == (1.0, 1.0) else (spacing[0], spacing[1])
+    return SequenceHeader(str(path), size, known, fields, tuple(frames[i] for i in range(len(frames))))
+
+
+def _sizes(path: PathLike, lines: dict[str, str], name: str) -> tuple[int, ...]:
+    sizes = tuple(int(n) for n in numbers(lines.get(name, ""), None, f"{path}: {name}"))
+    if len(sizes) not in (2, 3) or min(sizes) < 0:
+        raise InvalidInputError(f"{path}: {name}: expected two or three lengths, got {lines[name]}")
+    return sizes
+
+
+def _first_two(text: str, path: PathLike, name: str) -> tuple[float, ...]:
+    return numbers(" ".join(text.split()[:2]), 2, f"{path}: {name}")
+
+
+def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
+    vectors = re.findall(r"\(([^)]*)\)", text)[:2]
+    if len(vectors) < 2:
+        return None
+    where = f"{path}: space directions"
+    return tuple(float(np.linalg.norm(numbers(v.replace(",", " "), None, where))) for v in vectors)
+
+
+def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) -> None:
+    """Refuse a truncated file before the image library does so in its own words."""
+    if header.fields["ElementDataFile"].upper() != "LOCAL":
+        data = Path(path).with_name(header.fields["ElementDataFile"])
+        found = data.stat().st_size
+    else:
+        found = Path(path).stat().st_size - stream.tell()
+    if header.fields.get("CompressedData", "False").lower() == "true":
+        announced = header.fields.get("CompressedDataSize", "0")
+        expected = int(numbers(announced, 1, f"{path}: CompressedDataSize")[0])
+    else:
+        element = _ELEMENT_BYTES.get(header.fields.get("ElementType", ""), 1)
+        channels = int(numbers(header.fields.get("ElementNumberOfChannels", "1"), 1, f"{path}: channels")[0])
+        expected = int(np.prod(header.size, dtype=object)) * element * channels
+    if found < expected:
+        raise FileError(f"{path}: expected {expected} bytes of pixels, got {found}: the file is truncated")

@@ -1,0 +1,236 @@
+"""One door to every file: the reader is chosen by what the file holds, not by its name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.io import reconstructions, sweeps
+from speckle3d.io.hdf5 import PathLike, file_format, one_line, open_hdf5
+from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
+from speckle3d.io.metaimage import ImportSettings, read_metaimage
+from speckle3d.io.pixels import image_orientation, image_type
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.sweeps import open_sweep, read_sweep
+
+Row = tuple[str, str, str]
+"""Description, value, unit."""
+
+_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_SNIFFED_BYTES = 512
+_UNITS = ("mm", "s", "hz", "db", "rad", "m_s2", "m_s", "rad_s", "au")
+_UNIT_NAMES = {"hz": "Hz", "db": "dB", "m_s": "m/s", "m_s2": "m/s^2", "rad_s": "rad/s", "au": "a.u."}
+
+
+def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
+    """Read a sweep from a sweep file, a MetaImage or an NRRD sequence.
+
+    Parameters
+    ----------
+    settings : ImportSettings, optional
+        What the header of an image sequence lacks; a sweep file needs none.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is of no known kind, or what it holds is not valid.
+    """
+    kind = sniff(path)
+    return read_sweep(path) if kind == "hdf5" else read_metaimage(path, settings)
+
+
+def describe(path: PathLike) -> list[Row]:
+    """Tell what a file holds as rows of description, value and unit.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is of no known kind, or what it holds is not valid.
+    """
+    if sniff(path) == "image":
+        return _describe_header(read_header(path))
+    with open_hdf5(path) as file:
+        found = file_format(file)
+        if found not in _DESCRIBERS:
+            known = ", ".join(sorted(_DESCRIBERS))
+            raise InvalidInputError(f"{path}: expected a format among {known}, got {found!r}")
+    return [("format", found, ""), *_DESCRIBERS[found](path)]
+
+
+def sniff(path: PathLike) -> str:
+    """Tell the kind of a file from its first bytes: ``"hdf5"`` or ``"image"``."""
+    if not Path(path).is_file():
+        raise FileError(f"{path}: expected a file, got {'a folder' if Path(path).is_dir() else 'none'}")
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(_SNIFFED_BYTES)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    if start.startswith(_HDF5_SIGNATURE):
+        return "hdf5"
+    if is_metaimage(start) or is_nrrd(start):
+        return "image"
+    got = "an empty file" if not start else "something else"
+    raise InvalidInputError(f"{path}: expected a sweep file, MetaImage or NRRD sequence, got {got}")
+
+
+def _describe_sweep(path: PathLike) -> list[Row]:
+    with open_sweep(path) as sweep:
+        return [*_clock_rows(sweep), *_image_rows(sweep), *_signal_rows(sweep), *_sensor_rows(sweep)]
+
+
+def _clock_rows(sweep: Sweep) -> list[Row]:
+    return [("frames", str(len(sweep)), ""), *_rate_rows("", sweep.frame_time_s, "frames/s")]
+
+
+def _rate_rows(name: str, times: np.ndarray[tuple[int], np.dtype[np.float64]], unit: str) -> list[Row]:
+    span = float(times[-1] - times[0])
+    rows = [(f"{name} duration".strip(), f"{span:.3f}", "s")]
+    if times.size > 1:
+        rows.append((f"{name} rate".strip(), f"{(times.size - 1) / span:.2f}", unit))
+    return rows
+
+
+def _image_rows(sweep: Sweep) -> list[Row]:
+    grid = sweep.grid
+    return [
+        ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
+        ("sample type", str(sweep.frames.dtype), ""),
+        ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
+        ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
+        ("width", f"{grid.width_mm:.2f}", "mm"),
+        ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
+    ]
+
+
+def _signal_rows(sweep: Sweep) -> list[Row]:
+    signal = sweep.signal
+    if not isinstance(signal, RFSettings):
+        return [("signal", "B-mode", ""), ("dynamic range", f"{signal.dynamic_range_db:g}", "dB")]
+    low, high = (f"{edge / 1e6:g}" for edge in signal.bandwidth_hz)
+    return [
+        ("signal", "RF", ""),
+        ("sampling rate", f"{signal.sampling_rate_hz / 1e6:g}", "MHz"),
+        ("centre frequency", f"{signal.centre_frequency_hz / 1e6:g}", "MHz"),
+        ("band", f"{low} to {high}", "MHz"),
+        ("speed of sound", f"{signal.speed_of_sound_m_s:g}", "m/s"),
+    ]
+
+
+def _sensor_rows(sweep: Sweep) -> list[Row]:
+    rows: list[Row] = []
+    for name, sensor in (("orientation sensor", sweep.orientation), ("tracker", sweep.tracker)):
+        if sensor is None:
+            rows.append((name, "none", ""))
+            continue
+        covered = int(np.count_nonzero(sensor.covers(sweep.frame_time_s)))
+        rows += [
+            (name, str(len(sensor.readings)), "samples"),
+            *_rate_rows(name, sensor.readings.time_s, "samples/s"),
+            (f"{name} covers", str(covered), "frames"),
+            (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
+            (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
+        ]
+    return [*rows, ("truth", "no" if sweep.truth is None else "yes", "")]
+
+
+def _describe_reconstruction(path: PathLike) -> list[Row]:
+    result = read_reconstruction(path)
+    rows = [("frames", str(result.frame_time_s.size), "")]
+    rows += _rate_rows("", result.frame_time_s, "frames/s") if result.frame_time_s.size else []
+    rows += [(f"length, mode {mode}", f"{_length_mm(result, mode):.2f}", "mm") for mode in result.poses]
+    pairs = result.pairs
+    return [
+        *rows,
+        ("frame pairs", str(len(pairs) if pairs is not None else 0), ""),
+        ("patches", str(len(pairs.patch_centre_mm) if pairs is not None else 0), ""),
+        ("input", result.provenance.input_path, ""),
+        ("input SHA-256", result.provenance.input_sha256, ""),
+        ("package version", result.provenance.package_version, ""),
+    ]
+
+
+def _length_mm(result: Reconstruction, mode: str) -> float:
+    """Distance from the first image's centre to the last one's."""
+    centres = result.poses[mode].apply(result.grid.centre_mm)
+    return float(np.linalg.norm(centres[-1] - centres[0])) if len(centres) else 0.0
+
+
+def _describe_members(path: PathLike) -> list[Row]:
+    """Attributes and data sets as they are, for the smaller files of the family."""
+    rows: list[Row] = []
+
+    def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
+        rows.extend(_attribute_rows(name, node))
+        if isinstance(node, h5py.Dataset):
+            rows.append(_dataset_row(name, node))
+
+    try:
+        with open_hdf5(path) as file:
+            rows += [row for row in _attribute_rows("", file) if row[0] != "format"]
+            file.visititems(visit)
+    except (RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    return rows
+
+
+def _attribute_rows(name: str, node: h5py.Group | h5py.Dataset) -> list[Row]:
+    return [_row(f"{name} {key}".strip(), value) for key, value in node.attrs.items()]
+
+
+def _dataset_row(name: str, node: h5py.Dataset) -> Row:
+    if node.shape == () and h5py.check_string_dtype(node.dtype) is None:
+        return _row(name, node[()])
+    shape = " x ".join(str(n) for n in node.shape or ()) or "text"
+    return (_spoken(name), shape, _unit(name))
+
+
+def _row(name: str, value: object) -> Row:
+    text = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    return (_spoken(name), " ".join(text.split()), _unit(name))
+
+
+def _spoken(name: str) -> str:
+    return re.sub(rf"_({'|'.join(_UNITS)})$", "", name).replace("_", " ").replace("/", ", ")
+
+
+def _unit(name: str) -> str:
+    match = re.search(rf"_({'|'.join(_UNITS)})$", name)
+    return "" if match is None else _UNIT_NAMES.get(match[1], match[1])
+
+
+def _describe_header(header: SequenceHeader) -> list[Row]:
+    held = sorted(
+        {key.removesuffix("Transform") for f in header.frames for key in f if key.endswith("Transform")}
+    )
+    spacing = "unknown" if header.spacing_mm is None else " x ".join(f"{s:g}" for s in header.spacing_mm)
+    return [
+        ("format", "NRRD" if "sizes" in header.fields else "MetaImage", ""),
+        ("size", " x ".join(str(n) for n in header.size), ""),
+        ("frames", str(header.frame_count), ""),
+        ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
+        ("image type", image_type(header), ""),
+        ("image orientation", image_orientation(header), ""),
+        ("sample type", header.fields.get("ElementType") or header.fields.get("type", ""), ""),
+        ("transforms", ", ".join(held) or "none", ""),
+        ("time stamps", "yes" if any("Timestamp" in f for f in header.frames) else "no", ""),
+    ]
+
+
+_DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
+    sweeps.FORMAT: _describe_sweep,
+    reconstructions.FORMAT: _describe_reconstruction,
+    "speckle3d.curves": _describe_members,
+    "speckle3d.calibration": _describe_members,
+}

@@ -1,0 +1,251 @@
+"""Image sequences in MetaImage and NRRD files, as PLUS, ITK and ultrasound machines write them.
+
+PLUS's names stay in this module, `headers` and `pixels`: ``ImageToProbe`` in pixels, ``ProbeToTracker``,
+orientations such as ``MF`` (x towards the marked side, y far from the probe).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray, require_increasing, transforms_from_matrices
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
+from speckle3d.io.hdf5 import PathLike, naming
+from speckle3d.io.headers import SequenceHeader, numbers, read_header
+from speckle3d.io.pixels import RF_TYPES, image_orientation, image_type, read_pixels, to_samples
+
+SKEW_TOLERANCE = 0.1
+"""How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
+published calibrations reach 0.05, an error of the calibration and not of the image."""
+
+_DEFAULT_TRANSFORMS = ("ProbeToTracker", "ReferenceToTracker")
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """What an image file's header lacks. A value given here goes before the header's own.
+
+    Attributes
+    ----------
+    sampling_rate_hz, centre_frequency_hz, bandwidth_hz, vector_pitch_mm
+        For RF.
+    column_pitch_mm, row_spacing_mm, dynamic_range_db
+        For B-mode.
+    frame_rate_hz
+        For sequences without time stamps.
+    tracker_transform, reference_transform : str, optional
+        Names of the tracked frames; ``"none"`` for neither. By default PLUS's usual names where they occur.
+    image_to_probe : 4x4 nested tuple, optional
+        PLUS's image calibration, pixels to mm; gives the pitch and spacing of B-mode too.
+    """
+
+    sampling_rate_hz: float | None = None
+    vector_pitch_mm: float | None = None
+    speed_of_sound_m_s: float = 1540.0
+    centre_frequency_hz: float | None = None
+    bandwidth_hz: tuple[float, float] | None = None
+    first_sample_depth_mm: float = 0.0
+    column_pitch_mm: float | None = None
+    row_spacing_mm: float | None = None
+    dynamic_range_db: float | None = None
+    frame_rate_hz: float | None = None
+    tracker_transform: str | None = None
+    reference_transform: str | None = None
+    image_to_probe: tuple[tuple[float, ...], ...] | None = None
+
+
+def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> Sweep:
+    """Read an image sequence with the poses in its header; the frames are held in memory.
+
+    Frames are turned so that vectors run from the unmarked to the marked side and samples away from the
+    probe. Frames whose status is not OK are left out. I and Q become one analytic (complex64) signal.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the field, or the setting to give where the header lacks one.
+    """
+    settings = overrides or ImportSettings()
+    header = read_header(path)
+    if 0 in header.size:
+        raise InvalidInputError(f"{path}: expected pixels, got an image of size {header.size}")
+    kept = _frames_kept(header)
+    frames = to_samples(header, read_pixels(header)[kept])
+    grid, signal = _geometry(header, settings, frames)
+    return Sweep(
+        frames=cast(Frames, frames),
+        grid=grid,
+        signal=signal,
+        frame_time_s=_frame_times(header, settings)[kept],
+        tracker=_tracker(header, settings),
+        name=Path(path).name.split(".")[0],
+    )
+
+
+def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Tracker:
+    """Read the tracked poses in a header, whether or not there are images.
+
+    Raises
+    ------
+    InvalidInputError
+        If the header names no such transform, or no sample of it is valid.
+    """
+    header = read_header(path)
+    tracker = _tracker(header, overrides or ImportSettings())
+    if tracker is None:
+        raise InvalidInputError(f"{path}: expected tracked poses, got none: give tracker_transform")
+    return tracker
+
+
+def _geometry(
+    header: SequenceHeader, settings: ImportSettings, frames: npt.NDArray[Any]
+) -> tuple[ImageGrid, RFSettings | BModeSettings]:
+    _, vectors, samples = frames.shape
+    lateral_mm, axial_mm = _header_spacing(header)
+    with naming(header.path):
+        if image_type(header) in RF_TYPES:
+            rf = _rf_settings(header, settings, axial_mm)
+            pitch = _need(header, "vector_pitch_mm", settings.vector_pitch_mm, lateral_mm)
+            spacing = rf.sample_spacing_mm
+            return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm), rf
+        if settings.image_to_probe is not None:
+            lateral_mm, axial_mm = _pixel_size(header, settings)
+        pitch = _need(header, "column_pitch_mm", settings.column_pitch_mm, lateral_mm)
+        spacing = _need(header, "row_spacing_mm", settings.row_spacing_mm, axial_mm)
+        bmode = BModeSettings(_need(header, "dynamic_range_db", settings.dynamic_range_db, None))
+        return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm), bmode
+
+
+def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: float | None) -> RFSettings:
+    speed = settings.speed_of_sound_m_s
+    implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
+    rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
+    centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
+    if settings.bandwidth_hz is None:
+        raise InvalidInputError(f"{header.path}: the header lacks the band: give bandwidth_hz (low, high)")
+    return RFSettings(rate, speed, centre, settings.bandwidth_hz)
+
+
+def _need(header: SequenceHeader, name: str, given: float | None, read: float | None) -> float:
+    value = read if given is None else given
+    if value is None:
+        raise InvalidInputError(f"{header.path}: the header does not say: give {name}")
+    return float(value)
+
+
+def _header_spacing(header: SequenceHeader) -> tuple[float | None, float | None]:
+    """Lateral and axial spacing, mm."""
+    if header.spacing_mm is None:
+        return None, None
+    x, y = header.spacing_mm
+    return (y, x) if image_orientation(header).startswith(("F", "N")) else (x, y)
+
+
+def _frames_kept(header: SequenceHeader) -> npt.NDArray[np.bool_]:
+    if not header.frames:
+        return np.ones(header.frame_count, dtype=bool)
+    if len(header.frames) != header.frame_count:
+        raise InvalidInputError(
+            f"{header.path}: expected the fields of {header.frame_count} frames, got {len(header.frames)}"
+        )
+    kept = np.array([_status(frame, "ImageStatus", "Status") for frame in header.frames])
+    if not kept.any():
+        raise InvalidInputError(f"{header.path}: ImageStatus: expected a valid frame, got none")
+    return kept
+
+
+def _status(frame: dict[str, str], *names: str) -> bool:
+    return all(frame.get(name, "OK") == "OK" for name in names)
+
+
+def _frame_times(header: SequenceHeader, settings: ImportSettings) -> FloatArray:
+    if settings.frame_rate_hz is not None:
+        if not settings.frame_rate_hz > 0:
+            raise InvalidInputError(f"frame_rate_hz: expected above zero, got {settings.frame_rate_hz}")
+        return np.arange(header.frame_count) / settings.frame_rate_hz
+    if not header.frames:
+        raise InvalidInputError(f"{header.path}: the header holds no time stamps: give frame_rate_hz")
+    return require_increasing(_timestamps(header), f"{header.path}: Timestamp")
+
+
+def _timestamps(header: SequenceHeader) -> FloatArray:
+    where = f"{header.path}: Timestamp"
+    return np.array(
+        [numbers(frame.get("Timestamp", ""), 1, f"{where}[{i}]")[0] for i, frame in enumerate(header.frames)]
+    )
+
+
+def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None:
+    sensor = _transform_name(header, settings.tracker_transform, _DEFAULT_TRANSFORMS[0])
+    if sensor is None:
+        return None
+    reference = _transform_name(header, settings.reference_transform, _DEFAULT_TRANSFORMS[1])
+    names = (sensor,) if reference is None else (sensor, reference)
+    valid = np.array([_status(frame, *(f"{n}TransformStatus" for n in names)) for frame in header.frames])
+    if not valid.any():
+        raise InvalidInputError(f"{header.path}: {sensor}TransformStatus: expected a valid one, got none")
+    poses = _poses(header, sensor, valid)
+    if reference is not None:
+        poses = _poses(header, reference, valid).inv() * poses
+    times = require_increasing(_timestamps(header), f"{header.path}: Timestamp")[valid]
+    calibration = None if settings.image_to_probe is None else _probe_from_image(header, settings)
+    return Tracker(TimedPoses(times, poses[valid]), sensor_from_image=calibration)
+
+
+def _transform_name(header: SequenceHeader, given: str | None, default: str) -> str | None:
+    name = default if given is None else given.removesuffix("Transform")
+    if name == "none":
+        return None
+    if any(f"{name}Transform" in frame for frame in header.frames):
+        return name
+    if given is None:
+        return None
+    held = sorted(
+        {key.removesuffix("Transform") for f in header.frames for key in f if key.endswith("Transform")}
+    )
+    raise InvalidInputError(f"{header.path}: expected a transform {name}, got {', '.join(held) or 'none'}")
+
+
+def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> RigidTransform:
+    where = f"{header.path}: {name}Transform"
+    matrices = np.tile(np.eye(4), (len(header.frames), 1, 1))
+    for i in np.flatnonzero(valid):
+        text = header.frames[i].get(f"{name}Transform", "")
+        matrices[i] = np.reshape(numbers(text, 16, f"{where}[{i}]"), (4, 4))
+    return transforms_from_matrices(matrices, where)
+
+
+def _pixel_size(header: SequenceHeader, settings: ImportSettings) -> tuple[float, float]:
+    lengths = np.linalg.norm(_calibration(header, settings)[:3, :2], axis=0)
+    return float(lengths[0]), float(lengths[1])
+
+
+def _probe_from_image(header: SequenceHeader, settings: ImportSettings) -> RigidTransform:
+    """Nearest rigid transform to PLUS's image calibration, by singular values."""
+    matrix = _calibration(header, settings)
+    x, y = (matrix[:3, k] / np.linalg.norm(matrix[:3, k]) for k in (0, 1))
+    if abs(x @ y) > SKEW_TOLERANCE:
+        raise InvalidInputError(f"image_to_probe: expected square axes, got cosine {x @ y:.3f}")
+    left, _, right = np.linalg.svd(np.column_stack([x, y]), full_matrices=False)
+    u, v = (left @ right).T
+    axes = np.column_stack([u, v, np.cross(u, v)])
+    return RigidTransform.from_components(matrix[:3, 3], Rotation.from_matrix(axes))
+
+
+def _calibration(header: SequenceHeader, settings: ImportSettings) -> FloatArray:
+    matrix = np.asarray(settings.image_to_probe, dtype=float)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InvalidInputError(f"image_to_probe: expected a finite 4x4 matrix, got shape {matrix.shape}")
+    if not (np.linalg.norm(matrix[:3, :2], axis=0) > 0).all():
+        raise InvalidInputError("image_to_probe: expected axes of some length, got zero")
+    return matrix

@@ -1,0 +1,124 @@
+"""Volumes as NRRD, MetaImage or NIfTI files, through SimpleITK."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.volume import Volume
+from speckle3d.io.hdf5 import PathLike, atomic_path, naming, one_line
+from speckle3d.io.headers import is_metaimage, read_header
+
+SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
+
+_PIECE_BYTES = 2**20
+
+
+def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
+    """Write a volume whole or not at all; the suffix chooses the format.
+
+    World axes are written as they are, in mm. NIfTI readers see the first two reversed (RAS against LPS), as
+    in every file that passes through ITK.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is not one of `SUFFIXES`.
+    FileError
+        If the file cannot be written.
+    """
+    if not Path(path).name.lower().endswith(SUFFIXES):
+        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
+    image = _to_image(volume)
+    with atomic_path(path) as part:
+        _write_image(path, image, part, compress)
+
+
+def read_volume(path: PathLike) -> Volume:
+    """Read a volume; other number types than uint8 become float32.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, truncated or of no known format.
+    InvalidInputError
+        If it is not a grey three-dimensional image.
+    """
+    _require_whole(path)
+    image = _read_image(path)
+    if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
+        raise InvalidInputError(
+            f"{path}: expected a grey image of three axes, got {image.GetDimension()} axes and "
+            f"{image.GetNumberOfComponentsPerPixel()} values per pixel"
+        )
+    with naming(str(path)):
+        return _from_image(image)
+
+
+def _to_image(volume: Volume) -> Any:
+    import SimpleITK
+
+    # ITK's arrays run (k, j, i), slowest axis first.
+    image: Any = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.voxels.transpose(2, 1, 0)))
+    image.SetSpacing(volume.spacing_mm)
+    image.SetOrigin(volume.world_from_grid.translation.tolist())
+    image.SetDirection(volume.world_from_grid.rotation.as_matrix().ravel().tolist())
+    return image
+
+
+def _from_image(image: Any) -> Volume:
+    import SimpleITK
+
+    voxels = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.reshape(image.GetDirection(), (3, 3))
+    matrix[:3, 3] = image.GetOrigin()
+    pose: RigidTransform = transforms_from_matrices(matrix[None], "direction")[0]
+    kept = voxels if voxels.dtype == np.uint8 else voxels.astype(np.float32)
+    return Volume(np.ascontiguousarray(kept), image.GetSpacing(), pose)
+
+
+def _write_image(path: PathLike, image: Any, part: Path, compress: bool) -> None:
+    import SimpleITK
+
+    try:
+        SimpleITK.WriteImage(image, str(part), useCompression=compress)
+    except RuntimeError as error:
+        raise FileError(f"{path}: cannot be written: {str(error).strip().splitlines()[-1]}") from error
+
+
+def _read_image(path: PathLike) -> Any:
+    import SimpleITK
+
+    try:
+        return SimpleITK.ReadImage(str(path))
+    except RuntimeError as error:
+        raise FileError(f"{path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error
+
+
+def _require_whole(path: PathLike) -> None:
+    """Refuse what ITK would fill with zeros or complain about in its own words."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(512)
+        if is_metaimage(start):
+            read_header(path)
+        elif start.startswith(b"\x1f\x8b"):
+            with gzip.open(path) as unpacked:
+                while unpacked.read(_PIECE_BYTES):
+                    pass
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise FileError(
+            f"{path}: expected a whole gzip file, got a damaged one: {one_line(error)}"
+        ) from error
+    except OSError as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
