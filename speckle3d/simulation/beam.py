@@ -1,0 +1,298 @@
+"""The two-way beam of a linear array with an elevational lens, by diffraction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import RFSettings
+from speckle3d.kernels.field import line_field, two_way_field
+
+Complex64Array = npt.NDArray[np.complex64]
+
+NEPER_PER_DB = np.log(10.0) / 20.0
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A 5-10 MHz linear array like the papers': 127 vectors at 0.3 mm, focused at 20 mm, 40 mm deep.
+
+    Every vector uses the same full aperture, also at the array's ends. Elements have no kerf.
+
+    Parameters
+    ----------
+    pitch_mm : float
+        Distance of elements, and of vectors.
+    transmit_elements : int
+        Odd, so that a vector starts from an element's centre. 33 elements are F/2 at 20 mm.
+    transmit_focus_mm : float
+    receive_f_number, receive_elements : float
+        The dynamic receive aperture grows with depth at this F-number up to this many elements.
+    edge_weight : float
+        Raised-cosine apodisation's weight at the aperture's ends, both ways.
+    elevation_aperture_mm, elevation_focus_mm : float
+        Height of the elements, and where the lens focuses.
+    """
+
+    pitch_mm: float = 0.3
+    transmit_elements: int = 33
+    transmit_focus_mm: float = 20.0
+    receive_f_number: float = 2.0
+    receive_elements: float = 48.0
+    edge_weight: float = 0.08
+    elevation_aperture_mm: float = 5.0
+    elevation_focus_mm: float = 20.0
+    centre_frequency_hz: float = 7.5e6
+    bandwidth_hz: tuple[float, float] = (5e6, 10e6)
+    sampling_rate_hz: float = 200e6 / 3
+    speed_of_sound_m_s: float = 1540.0
+
+    def __post_init__(self) -> None:
+        if self.transmit_elements < 1 or self.transmit_elements % 2 == 0:
+            raise InvalidInputError(
+                f"transmit_elements: expected an odd number, got {self.transmit_elements}"
+            )
+
+    @property
+    def signal(self) -> RFSettings:
+        """How this probe's vectors are sampled."""
+        return RFSettings(
+            self.sampling_rate_hz, self.speed_of_sound_m_s, self.centre_frequency_hz, self.bandwidth_hz
+        )
+
+    def receive_half_width_mm(self, depth_mm: FloatArray) -> FloatArray:
+        """Half the width of the receive aperture in use at each depth, at least two elements."""
+        widest = self.receive_elements * self.pitch_mm
+        return np.asarray(np.clip(depth_mm / self.receive_f_number, 4 * self.pitch_mm, widest)) / 2.0
+
+    def spectrum(self, frequency_hz: FloatArray) -> FloatArray:
+        """Two-way pulse spectrum: a raised cosine, halved in amplitude (-6 dB) at the band's edges."""
+        low, high = self.bandwidth_hz
+        phase = (np.asarray(frequency_hz) - (low + high) / 2.0) / (high - low)
+        return np.where(np.abs(phase) < 1.0, np.cos(np.pi / 2.0 * phase) ** 2, 0.0)
+
+
+@dataclass(frozen=True)
+class BeamGrid:
+    """Where the beam is tabulated. Lateral positions are `per_pitch` to the element pitch."""
+
+    first_depth_mm: float = 1.0
+    last_depth_mm: float = 45.0
+    depth_step_mm: float = 0.5
+    lateral_reach_mm: float = 2.7
+    per_pitch: int = 4
+    elevation_reach_mm: float = 4.0
+    elevation_step_mm: float = 0.08
+    strips: int = 64
+    node_hz: tuple[float, ...] = (4e6, 5.75e6, 7.5e6, 9.25e6, 11e6)
+    floor_db: float = -40.0
+
+
+@dataclass(frozen=True)
+class BeamTable:
+    """Two-way complex field relative to a delay model, ready for interpolation.
+
+    The field at depth y, lateral x, elevation z and frequency f is
+    ``residual * exp(-4 pi i f (y + kx x^2 + kz z^2) / c)``: the delay carries the fast phase, so that the
+    residual is smooth enough for linear interpolation.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (depth, lateral, elevation, node)
+        For x >= 0 and z >= 0; the beam is symmetric in both.
+    reach : ndarray, shape (depth, lateral)
+        Elevational steps to where the amplitude has fallen to the grid's floor for good.
+    curvature_per_mm : ndarray, shape (depth, 2)
+        kx and kz.
+    """
+
+    probe: Probe
+    grid: BeamGrid
+    depth_mm: FloatArray
+    lateral_mm: FloatArray
+    elevation_mm: FloatArray
+    residual: Complex64Array
+    reach: npt.NDArray[np.int64]
+    curvature_per_mm: FloatArray
+
+    @property
+    def node_hz(self) -> FloatArray:
+        """Frequencies at which the field is tabulated."""
+        return np.asarray(self.grid.node_hz)
+
+    @property
+    def lateral_extent_mm(self) -> float:
+        """How far from a vector the field is anywhere above the floor."""
+        return float(self.lateral_mm[np.flatnonzero(self.reach.any(axis=0))[-1]])
+
+    @property
+    def elevation_extent_mm(self) -> FloatArray:
+        """How far from the image plane the field is above the floor, per depth."""
+        return np.asarray(self.reach.max(axis=1) * self.grid.elevation_step_mm)
+
+    def node_spectra(self, frequency_hz: FloatArray) -> FloatArray:
+        """Pulse spectrum times each node's linear interpolation weight, shape (node, frequency)."""
+        hats = np.stack([np.interp(frequency_hz, self.node_hz, row) for row in np.eye(self.node_hz.size)])
+        return np.asarray(hats * self.probe.spectrum(frequency_hz))
+
+    def echo_power(self, frequency_hz: FloatArray) -> FloatArray:
+        """Mean square of the RF from one scatterer per mm^3 of unit strength at each depth.
+
+        The pulse has the spectrum of `Probe.spectrum` per sample, as `speckle3d.simulation.scan` makes it.
+        """
+        spectra = self.node_spectra(frequency_hz)
+        df = frequency_hz[1] - frequency_hz[0]
+        gram = 2.0 * spectra @ spectra.T * df / self.probe.sampling_rate_hz
+        inside = np.arange(self.elevation_mm.size) < self.reach[:, :, None]
+        field = self.residual * inside[..., None]
+        # Both mirror halves count, the axis once.
+        sides = np.outer(_sides(self.lateral_mm), _sides(self.elevation_mm))
+        cell_mm2 = self.lateral_mm[1] * self.elevation_mm[1]
+        power = np.einsum("yxzk,kl,yxzl,xz->y", field.conj(), gram, field, sides, optimize=True).real
+        return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
+
+
+def tabulate_beam(
+    probe: Probe | None = None, grid: BeamGrid | None = None, attenuation_db_cm_mhz: float = 0.0
+) -> BeamTable:
+    """Compute the two-way field of `probe` by Rayleigh-Sommerfeld sums over elements and lens strips.
+
+    Parameters
+    ----------
+    probe : Probe, optional
+    grid : BeamGrid, optional
+    attenuation_db_cm_mhz : float
+        One-way attenuation of the medium, proportional to frequency.
+
+    References
+    ----------
+    .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
+    """
+    probe, grid = probe or Probe(), grid or BeamGrid()
+    depth = np.arange(grid.first_depth_mm, grid.last_depth_mm + 1e-9, grid.depth_step_mm)
+    step = probe.pitch_mm / grid.per_pitch
+    lateral = np.arange(round(grid.lateral_reach_mm / step) + 1) * step
+    elevation = np.arange(0.0, grid.elevation_reach_mm + 1e-9, grid.elevation_step_mm)
+    field = _sum_sources(probe, grid, depth, lateral, elevation)
+    nodes = np.asarray(grid.node_hz)
+    neper = attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * nodes
+    field *= np.exp(-2.0 * depth[:, None] * neper)[:, None, None, :]
+    field /= np.abs(field[np.argmin(np.abs(depth - probe.transmit_focus_mm)), 0, 0]).max()
+    curvature = _fit_curvature(field, depth, lateral, elevation, _wavenumbers(probe, nodes))
+    echo = depth[:, None, None] + curvature[:, 0, None, None] * lateral[:, None] ** 2
+    echo = echo + curvature[:, 1, None, None] * elevation**2
+    residual = field * np.exp(2j * echo[..., None] * _wavenumbers(probe, nodes))
+    return BeamTable(
+        probe,
+        grid,
+        depth,
+        lateral,
+        elevation,
+        residual.astype(np.complex64),
+        _reach(np.abs(field).max(axis=-1), 10.0 ** (grid.floor_db / 20.0)),
+        curvature,
+    )
+
+
+def _wavenumbers(probe: Probe, frequency_hz: FloatArray) -> FloatArray:
+    """Wavenumbers in rad/mm."""
+    return np.asarray(2e-3 * np.pi * frequency_hz / probe.speed_of_sound_m_s)
+
+
+def _sides(coordinate: FloatArray) -> FloatArray:
+    return np.where(coordinate > 0.0, 2.0, 1.0)
+
+
+def _sum_sources(
+    probe: Probe, grid: BeamGrid, depth: FloatArray, lateral: FloatArray, elevation: FloatArray
+) -> npt.NDArray[np.complex128]:
+    wavenumbers = _wavenumbers(probe, np.asarray(grid.node_hz))
+    step = probe.pitch_mm / grid.per_pitch
+    widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
+    element = (np.arange(widest) - widest // 2) * probe.pitch_mm
+    sub = (np.arange(grid.per_pitch) - (grid.per_pitch - 1) / 2.0) * step
+    source = (element[:, None] + sub).ravel()
+    distance = (np.arange(round((source[-1] + lateral[-1]) / step) + 1) + 0.5) * step
+    line = _line_sources(probe, grid, depth, distance, elevation, wavenumbers)
+    transmit, receive = _apertures(probe, np.repeat(element, grid.per_pitch), depth, wavenumbers)
+    out = np.empty((depth.size, lateral.size, elevation.size, wavenumbers.size), dtype=complex)
+    two_way_field(line, source, step, transmit, receive, out)
+    return out
+
+
+def _line_sources(
+    probe: Probe,
+    grid: BeamGrid,
+    depth: FloatArray,
+    distance: FloatArray,
+    elevation: FloatArray,
+    wavenumbers: FloatArray,
+) -> npt.NDArray[np.complex128]:
+    """Field of elevational line sources: translation along the array makes one table serve all elements."""
+    strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
+    strip = strip - probe.elevation_aperture_mm / 2.0
+    lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
+    line = np.empty((depth.size, distance.size, elevation.size, wavenumbers.size), dtype=complex)
+    line_field(depth, distance, elevation, strip, np.ones_like(strip), lens, wavenumbers, line)
+    return line
+
+
+def _apertures(
+    probe: Probe, element: FloatArray, depth: FloatArray, wavenumbers: FloatArray
+) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
+    """Weights and focusing phases of the sources, shape (depth, source, node), transmit and receive."""
+    half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
+    focus = np.full(depth.size, probe.transmit_focus_mm)
+    transmit = _focused(probe, element, half, focus, wavenumbers)
+    receive = _focused(probe, element, probe.receive_half_width_mm(depth), depth, wavenumbers)
+    return transmit, receive
+
+
+def _focused(
+    probe: Probe, element: FloatArray, half_width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
+) -> npt.NDArray[np.complex128]:
+    across = element / half_width[:, None]
+    raised = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
+    weight = np.where(np.abs(across) <= 1.0, raised, 0.0)
+    path = focus[:, None] - np.hypot(focus[:, None], element)
+    return np.asarray(weight[..., None] * np.exp(-1j * path[..., None] * wavenumbers))
+
+
+def _fit_curvature(
+    field: npt.NDArray[np.complex128],
+    depth: FloatArray,
+    lateral: FloatArray,
+    elevation: FloatArray,
+    wavenumbers: FloatArray,
+) -> FloatArray:
+    """Curvature of the two-way wavefront near the axis, lateral and elevational, shape (depth, 2)."""
+    k = 2.0 * wavenumbers[wavenumbers.size // 2]
+    middle = field[..., wavenumbers.size // 2]
+    lateral_fit = [_parabola(row, lateral, k) for row in middle[:, :, 0]]
+    elevation_fit = [_parabola(row, elevation, k) for row in middle[:, 0, :]]
+    return np.stack([lateral_fit, elevation_fit], axis=1)
+
+
+def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumber: float) -> float:
+    """Least-squares `a` of path = a x^2 over the main lobe (above a third of the axis), by its energy."""
+    fallen = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
+    lobe = slice(0, max(int(fallen[0]) if fallen.size else profile.size, 3))
+    path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
+    weight = np.abs(profile[lobe]) ** 2
+    return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())
+
+
+def _reach(amplitude: FloatArray, floor: float) -> npt.NDArray[np.int64]:
+    """Elevational steps beyond which the field stays below `floor` of that depth's peak."""
+    nz = amplitude.shape[2]
+    above = amplitude > floor * amplitude.max(axis=(1, 2), keepdims=True)
+    last = np.where(above.any(axis=2), nz - np.argmax(above[:, :, ::-1], axis=2), 0)
+    reach = np.minimum(last, nz - 1)
+    # A cell between two tabulated depths or laterals must reach as far as the farther of its corners.
+    reach[:-1] = np.maximum(reach[:-1], reach[1:])
+    reach[:, :-1] = np.maximum(reach[:, :-1], reach[:, 1:])
+    return reach

@@ -1,0 +1,201 @@
+"""How the probe moves: hand-like trajectories that can be asked for a pose at any time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles
+from speckle3d.core.streams import BoolArray
+
+_KNOT_RATE_HZ = 100.0
+"""Knots of the trajectory: eight per period of the fastest tremor."""
+
+_LEAD_S = 0.5
+"""The trajectory starts and ends this much beyond the frames, for sensors on their own clocks."""
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """Parameters of a hand-held sweep. Standard deviations unless said otherwise.
+
+    Parameters
+    ----------
+    speed_variation : float
+        Slow unevenness of the speed, as a fraction of its mean (largest, not standard, deviation).
+    pauses, pause_s : int, float
+        How many times the hand stops, and for how long.
+    drift_mm : float
+        Slow wander of the lateral and axial position over the sweep.
+    wander_rad : float
+        Slow wander of tilt, yaw and roll over the sweep.
+    turn_rad : tuple of float
+        Deliberate tilt, yaw and roll from the first frame to the last.
+    tremor_band_hz, tremor_mm, tremor_rad
+        Physiological tremor, in every axis.
+    reverse : bool
+        Sweep forward, then back over the same tissue.
+    """
+
+    speed_variation: float = 0.3
+    pauses: int = 1
+    pause_s: float = 0.3
+    drift_mm: float = 0.5
+    wander_rad: float = np.deg2rad(0.6)
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tremor_band_hz: tuple[float, float] = (8.0, 12.0)
+    tremor_mm: float = 0.015
+    tremor_rad: float = np.deg2rad(0.012)
+    reverse: bool = False
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A smooth pose of the image in the medium as a function of time.
+
+    Parameters
+    ----------
+    knot_s : ndarray, shape (m,)
+    knots : ndarray, shape (m, 6)
+        Lateral, axial, elevational position of the pivot (mm), then tilt, yaw, roll (rad), all against
+        the start.
+    pivot_mm : ndarray, shape (3,)
+        The point of the image about which the probe turns: the middle of its face, on the skin.
+    medium_from_start : RigidTransform
+        Where and in which direction the sweep starts.
+    world_from_medium : RigidTransform
+    """
+
+    knot_s: FloatArray
+    knots: FloatArray
+    pivot_mm: FloatArray
+    medium_from_start: RigidTransform
+    world_from_medium: RigidTransform
+
+    def medium_from_image(self, time_s: FloatArray) -> RigidTransform:
+        """Pose in the medium at any times within the knots."""
+        t = np.asarray(time_s, dtype=float)
+        if t.min() < self.knot_s[0] or t.max() > self.knot_s[-1]:
+            raise InvalidInputError(
+                f"time_s: expected {self.knot_s[0]:.3f} to {self.knot_s[-1]:.3f} s, "
+                f"got {t.min():.3f} to {t.max():.3f} s"
+            )
+        x, y, z, tilt, yaw, roll = np.moveaxis(self._spline(t), -1, 0)
+        rotation = rotation_from_fixed_angles(roll, yaw, tilt)
+        moved = np.stack([x, y, z], axis=-1)
+        start_from_image = RigidTransform.from_components(moved - rotation.apply(self.pivot_mm), rotation)
+        return self.medium_from_start * start_from_image
+
+    def world_from_image(self, time_s: FloatArray) -> RigidTransform:
+        """Pose in the world at any times within the knots."""
+        return self.world_from_medium * self.medium_from_image(time_s)
+
+    @cached_property
+    def _spline(self) -> BSpline[np.float64]:
+        # Quintic, because an accelerometer feels the second derivative.
+        return make_interp_spline(self.knot_s, self.knots, k=5)
+
+
+def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s: float = 1e-3) -> FloatArray:
+    """Frame clock with uniform jitter of at most `jitter_s` either way."""
+    jitter = min(jitter_s, 0.2 / rate_hz)
+    return np.arange(frames) / rate_hz + rng.uniform(-jitter, jitter, frames)
+
+
+def hand_sweep(
+    length_mm: float,
+    duration_s: float,
+    face_mm: float,
+    motion: HandMotion,
+    medium_from_start: RigidTransform,
+    world_from_medium: RigidTransform,
+    rng: np.random.Generator,
+) -> Trajectory:
+    """Sweep `length_mm` along the starting image's elevation in `duration_s`, as a hand would.
+
+    Parameters
+    ----------
+    face_mm : float
+        Width of the image; the probe turns about the middle of its face.
+    """
+    knots = round((duration_s + 2 * _LEAD_S) * _KNOT_RATE_HZ) + 1
+    time = np.linspace(-_LEAD_S, duration_s + _LEAD_S, knots)
+    inside = (time >= 0.0) & (time <= duration_s)
+    along = _progress(time, inside, motion, rng) * length_mm
+    pivot = np.array([face_mm / 2.0, 0.0, 0.0])
+    columns = np.zeros((knots, 6))
+    columns[:, :3] = pivot
+    columns[:, 2] += along
+    phase = np.clip(time / duration_s, 0.0, 1.0)
+    columns[:, 3:] = _smooth_step(phase)[:, None] * (np.asarray(motion.turn_rad))
+    for axis in range(6):
+        slow = motion.drift_mm if axis < 3 else motion.wander_rad
+        fast = motion.tremor_mm if axis < 3 else motion.tremor_rad
+        if axis != 2:
+            columns[:, axis] += slow * _band_noise(time, (0.0, 1.0 / duration_s), rng)
+        columns[:, axis] += fast * _band_noise(time, motion.tremor_band_hz, rng)
+    return Trajectory(time, columns, pivot, medium_from_start, world_from_medium)
+
+
+def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
+    """Exact elevational steps, in blocks far enough apart to show independent speckle, in the medium."""
+    z = np.arange(steps) * step_mm + np.arange(blocks)[:, None] * ((steps - 1) * step_mm + gap_mm)
+    return RigidTransform.from_translation(np.outer(z.ravel(), [0.0, 0.0, 1.0]))
+
+
+def turned_about(centre_mm: FloatArray, angle_rad: float) -> RigidTransform:
+    """Turn about the beam axis through `centre_mm`: where a crossing sweep starts."""
+    turn = Rotation.from_rotvec([0.0, angle_rad, 0.0])
+    return RigidTransform.from_components(centre_mm - turn.apply(centre_mm), turn)
+
+
+def world_from_medium(heading_rad: float) -> RigidTransform:
+    """World with z up and x north; the medium's depth axis points down, its lateral axis to `heading_rad`."""
+    down = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, heading_rad]) * down)
+
+
+def _progress(
+    time: FloatArray, inside: BoolArray, motion: HandMotion, rng: np.random.Generator
+) -> FloatArray:
+    """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
+    duration = float(time[inside][-1])
+    speed = 1.0 + motion.speed_variation * np.tanh(_band_noise(time, (0.0, 0.8), rng))
+    for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:
+        speed *= 1.0 - _window((time - centre) / motion.pause_s)
+    speed = np.where(inside, speed, 0.0)
+    if motion.reverse:
+        speed *= np.tanh((duration / 2.0 - time) / 0.25)
+        forward, back = speed.clip(0.0).sum(), -speed.clip(None, 0.0).sum()
+        speed = np.where(speed > 0.0, speed / forward, speed / back)
+    else:
+        speed /= speed.sum()
+    return np.cumsum(_smoothed(speed))
+
+
+def _smoothed(speed: FloatArray) -> FloatArray:
+    """Take the corners off starts and stops: a hand accelerates over about a tenth of a second."""
+    kernel = np.hanning(13)[1:-1]
+    return np.convolve(speed, kernel / kernel.sum(), mode="same")
+
+
+def _window(u: FloatArray) -> FloatArray:
+    """One within half a unit of zero, falling to zero over a further quarter."""
+    return np.clip(3.0 - 4.0 * np.abs(u), 0.0, 1.0)
+
+
+def _smooth_step(u: FloatArray) -> FloatArray:
+    return u * u * (3.0 - 2.0 * u)
+
+
+def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:
+    """Random smooth function of unit rms made of a dozen sinusoids in the band."""
+    frequency = rng.uniform(*band_hz, 12)
+    phase = rng.uniform(0.0, 2.0 * np.pi, 12)
+    wave = np.sin(2.0 * np.pi * np.multiply.outer(time, frequency) + phase)
+    return np.asarray(wave.sum(axis=1) / np.sqrt(6.0))

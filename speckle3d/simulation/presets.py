@@ -1,0 +1,186 @@
+"""Named sweeps: settings in, sweeps with truth out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
+from speckle3d.simulation.medium import MEDIA, TiledMedium
+from speckle3d.simulation.movement import (
+    HandMotion,
+    frame_times,
+    hand_sweep,
+    stepped_poses,
+    turned_about,
+    world_from_medium,
+)
+from speckle3d.simulation.scan import Receiver, SimulatedFrames
+from speckle3d.simulation.sensors import (
+    OrientationModel,
+    TrackerModel,
+    simulate_orientation,
+    simulate_tracker,
+)
+
+Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped"]
+
+
+class SimulationSettings(BaseModel):
+    """What to simulate. The same settings give the same sweep.
+
+    Parameters
+    ----------
+    preset : str
+        phantom: speckle with inclusions, one way. tissue: layers, one way. reversal: tissue, forward and
+        back. rotation: phantom with a deliberate turn. crossed: tissue, two sweeps at a right angle.
+        stepped: uniform speckle in exact elevational steps, for decorrelation curves.
+    frames : int, optional
+        Frames of a hand-held sweep; by default eight per mm, twice that when it reverses.
+    steps, step_mm, blocks : int, float, int
+        Of `stepped`: frames per block, their distance, and how many independent blocks.
+    turn_deg : float
+        Of `rotation`: the deliberate turn from first to last frame, about the axis `turn_axis`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: Preset = "phantom"
+    seed: int = Field(0, ge=0)
+    vectors: int = Field(127, ge=1, le=1024)
+    samples: int = Field(3818, ge=256, le=3818)
+    length_mm: float = Field(20.0, gt=0, le=200)
+    frames: int | None = Field(None, ge=2)
+    frame_rate_hz: float = Field(25.0, gt=0, le=1000)
+    steps: int = Field(41, ge=2)
+    step_mm: float = Field(0.05, gt=0)
+    blocks: int = Field(4, ge=1)
+    turn_deg: float = Field(5.0, ge=-30, le=30)
+    turn_axis: Literal["tilt", "yaw"] = "tilt"
+    crossing_deg: float = Field(90.0, gt=0, lt=180)
+
+
+@dataclass(frozen=True)
+class SimulatedSweep:
+    """A sweep whose frames are computed as they are read, and the settings that determine it."""
+
+    sweep: Sweep
+    settings: SimulationSettings
+
+
+def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
+    """Prepare the sweeps of `settings`: two for `crossed`, one otherwise.
+
+    Nothing but the beam table is computed here (about a second); frames are made when indexed.
+    """
+    seeds = np.random.SeedSequence(settings.seed)
+    medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)
+    medium = MEDIA[_MEDIUM[settings.preset]](_entropy(medium_seed))
+    probe = Probe()
+    beam = tabulate_beam(probe, attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
+    heading = np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)
+    world = world_from_medium(float(heading))
+    if settings.preset == "stepped":
+        return (_stepped(settings, beam, medium, world, sweep_seeds[0]),)
+    count = 2 if settings.preset == "crossed" else 1
+    return tuple(
+        _hand_held(settings, beam, medium, world, seed, number)
+        for number, seed in enumerate(sweep_seeds[:count])
+    )
+
+
+_MEDIUM: dict[str, str] = {
+    "phantom": "phantom",
+    "tissue": "tissue",
+    "reversal": "tissue",
+    "rotation": "phantom",
+    "crossed": "tissue",
+    "stepped": "fully_developed",
+}
+
+
+def _image(settings: SimulationSettings, probe: Probe) -> ImageGrid:
+    return ImageGrid(settings.vectors, settings.samples, probe.pitch_mm, probe.signal.sample_spacing_mm)
+
+
+def _motion(settings: SimulationSettings) -> HandMotion:
+    if settings.preset == "reversal":
+        return HandMotion(reverse=True)
+    if settings.preset == "rotation":
+        turn = float(np.deg2rad(settings.turn_deg))
+        return HandMotion(turn_rad=(turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0))
+    return HandMotion()
+
+
+def _hand_held(
+    settings: SimulationSettings,
+    beam: BeamTable,
+    medium: TiledMedium,
+    world: RigidTransform,
+    seed: np.random.SeedSequence,
+    number: int,
+) -> SimulatedSweep:
+    motion_seed, clock_seed, tracker_seed, orientation_seed, noise_seed = seed.spawn(5)
+    frames = settings.frames or round(8 * settings.length_mm * (2 if settings.preset == "reversal" else 1))
+    image = _image(settings, beam.probe)
+    times = frame_times(frames, settings.frame_rate_hz, np.random.default_rng(clock_seed))
+    duration = frames / settings.frame_rate_hz
+    centre = np.array([image.width_mm / 2.0, 0.0, settings.length_mm / 2.0])
+    start = turned_about(centre, float(np.deg2rad(settings.crossing_deg)) * number)
+    trajectory = hand_sweep(
+        settings.length_mm,
+        duration,
+        image.width_mm,
+        _motion(settings),
+        start,
+        world,
+        np.random.default_rng(motion_seed),
+    )
+    span = (-0.3, duration + 0.3)
+    tracker = simulate_tracker(trajectory, span, TrackerModel(), np.random.default_rng(tracker_seed))
+    orientation = simulate_orientation(
+        trajectory, span, OrientationModel(), np.random.default_rng(orientation_seed)
+    )
+    poses = trajectory.medium_from_image(times)
+    sweep = Sweep(
+        SimulatedFrames(beam, medium, poses, image, Receiver(), _entropy(noise_seed)),
+        image,
+        beam.probe.signal,
+        times,
+        orientation,
+        tracker,
+        world * poses,
+        name=f"{settings.preset}-{settings.seed}" + ("-crossing" if number else ""),
+    )
+    return SimulatedSweep(sweep, settings)
+
+
+def _stepped(
+    settings: SimulationSettings,
+    beam: BeamTable,
+    medium: TiledMedium,
+    world: RigidTransform,
+    seed: np.random.SeedSequence,
+) -> SimulatedSweep:
+    image = _image(settings, beam.probe)
+    gap = 2.0 * float(beam.elevation_extent_mm.max())
+    poses = stepped_poses(settings.steps, settings.step_mm, settings.blocks, gap)
+    times = np.arange(len(poses)) / settings.frame_rate_hz
+    sweep = Sweep(
+        SimulatedFrames(beam, medium, poses, image, Receiver(), _entropy(seed)),
+        image,
+        beam.probe.signal,
+        times,
+        truth=world * poses,
+        name=f"stepped-{settings.seed}",
+    )
+    return SimulatedSweep(sweep, settings)
+
+
+def _entropy(seed: np.random.SeedSequence) -> int:
+    return int(seed.generate_state(1, np.uint64)[0])
