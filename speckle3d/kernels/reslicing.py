@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
@@ -43,7 +43,9 @@ def bilinear(image: Float32Array, vector: float, sample: float) -> float:
     return level
 
 
-@njit(cache=True, parallel=True)
+# One thread: an image takes a fraction of a millisecond, and a team of threads gathered anew for each image
+# waits far longer than that as soon as another process wants a core.
+@njit(cache=True, nogil=True)
 def keep_nearest(
     image: Float32Array,
     index_from_pixel: FloatArray,
@@ -64,7 +66,7 @@ def keep_nearest(
     """
     rows, columns = grey.shape[1:]
     du, dv, dq = index_from_pixel[0, 0], index_from_pixel[1, 0], index_from_pixel[2, 0]
-    for row in prange(rows):
+    for row in range(rows):
         u = index_from_pixel[0, 1] * row + index_from_pixel[0, 2]
         v = index_from_pixel[1, 1] * row + index_from_pixel[1, 2]
         q = index_from_pixel[2, 1] * row + index_from_pixel[2, 2]
