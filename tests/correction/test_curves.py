@@ -1,0 +1,128 @@
+import numpy as np
+import pytest
+from drifting import CENTRE_MM, accumulate, drifted, hand_sweep
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.geometry import relative_poses
+from speckle3d.correction.curves import (
+    AXES,
+    CorrectedChain,
+    angle_axes,
+    correction_matrices,
+    cumulative_product,
+    curve_basis,
+    elevational_steps,
+    skew,
+)
+
+
+def chain_of(seed, frames=40, axes=AXES, curves="time", turns=0):
+    rng = np.random.default_rng(seed)
+    poses = drifted(hand_sweep(rng, frames, turns=turns), rng)
+    basis = curve_basis(axes, elevational_steps(poses, CENTRE_MM), curves)
+    return poses, CorrectedChain.of(poses, axes, basis)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 9, 100])
+def test_cumulative_product_is_the_plain_loop(count):
+    rng = np.random.default_rng(count)
+    steps = RigidTransform.from_components(rng.normal(size=(count, 3)), Rotation.random(count, rng=rng))
+    looped = accumulate(steps).as_matrix()[1:]
+    np.testing.assert_allclose(cumulative_product(steps.as_matrix()), looped, atol=1e-12)
+
+
+def test_no_coefficients_leave_every_pose_as_it_is():
+    poses, chain = chain_of(1)
+    np.testing.assert_allclose(chain.poses(np.zeros(30)), poses.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("curves", ["time", "distance"])
+def test_poses_are_equation_1_written_out(curves):
+    poses, chain = chain_of(2, curves=curves)
+    coefficients = np.random.default_rng(2).normal(0.0, 0.3, 30)
+    s, c = poses.as_matrix(), correction_matrices(chain.values(coefficients))
+    t = s[0] @ c[0] @ np.linalg.inv(s[0])
+    expected = [t @ s[0]]
+    for f in range(1, len(s)):
+        t = t @ s[f] @ c[f] @ np.linalg.inv(s[f])
+        expected.append(t @ s[f])
+    np.testing.assert_allclose(chain.poses(coefficients), expected, atol=1e-10)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), curves=st.sampled_from(["time", "distance"]))
+def test_twists_are_the_derivative_of_every_frame(seed, curves):
+    _, chain = chain_of(seed, frames=12, curves=curves)
+    rng = np.random.default_rng(seed)
+    coefficients, point = rng.normal(0.0, 0.5, 30), rng.uniform(0.0, 40.0, 3)
+    poses = chain.poses(coefficients)
+    turn, shift = chain.twists(coefficients, poses)
+    where = poses[:, :3, :3] @ point + poses[:, :3, 3]
+    found = skew(where) @ -turn + shift
+    h = 1e-6
+    for k, unit in enumerate(np.eye(30)):
+        moved = chain.poses(coefficients + h * unit) - chain.poses(coefficients - h * unit)
+        slope = (moved[:, :3, :3] @ point + moved[:, :3, 3]) / (2 * h)
+        # Central differences: h^2 times third derivatives, and rounding 1e-14 / h; 60 mm lever.
+        np.testing.assert_allclose(found[:, :, k], slope, atol=2e-6)
+
+
+def test_the_same_curves_as_the_published_powers_of_t():
+    basis = curve_basis(AXES, np.ones(99), "time")
+    t = np.arange(1, 100) / 99
+    powers = np.stack([np.ones(99), t, t**2, t**3], axis=1)
+    for a in range(6):
+        left = powers - basis[1:, a, 1:] @ np.linalg.lstsq(basis[1:, a, 1:], powers)[0]
+        assert np.abs(left).max() < 1e-12
+
+
+def test_the_first_frame_has_its_own_offset_and_no_curve():
+    _, chain = chain_of(3)
+    offsets = np.zeros((6, 5))
+    offsets[:, 0] = [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
+    values = chain.values(offsets.ravel())
+    np.testing.assert_array_equal(values[0], offsets[:, 0])
+    assert not values[1:].any()
+    assert not chain.basis[0, :, 1:].any()
+
+
+def test_distance_curves_turn_round_with_the_probe_and_leave_in_plane_motion_alone():
+    poses, chain = chain_of(4, frames=100, curves="distance", turns=1)
+    steps = elevational_steps(poses, CENTRE_MM)
+    constant = np.zeros((6, 5))
+    constant[:, 1] = 1.0
+    values = chain.values(constant.ravel())[1:]
+    for axis in ("z", "tilt", "yaw"):
+        np.testing.assert_allclose(values[:, AXES.index(axis)], steps / np.abs(steps).sum())
+    for axis in ("x", "y", "roll"):
+        np.testing.assert_allclose(values[:, AXES.index(axis)], 1 / 99)
+
+
+def test_a_subset_of_axes_leaves_the_others_at_zero():
+    _, chain = chain_of(5, axes=("tilt", "roll"))
+    values = chain.values(np.ones(10))
+    assert not values[:, [0, 1, 2, 4]].any()
+    assert values[:, [3, 5]].any(axis=0).all()
+    assert chain.names[0] == "tilt_offset"
+    assert chain.names[-1] == "roll_legendre3"
+
+
+def test_elevational_steps_are_the_centre_seen_from_the_frame_before():
+    poses = hand_sweep(np.random.default_rng(6), 30)
+    steps = relative_poses(poses)
+    expected = [(steps[i].apply(CENTRE_MM) - CENTRE_MM)[2] for i in range(29)]
+    np.testing.assert_allclose(elevational_steps(poses, CENTRE_MM), expected)
+
+
+def test_angle_axes_are_what_each_angle_turns_about():
+    tilt, yaw, roll = 0.3, -0.4, 0.7
+    axes = angle_axes(np.array([roll]), np.array([yaw]))[0]
+    h = 1e-6
+    for k in range(3):
+        step = np.zeros((1, 6))
+        step[0, 3 + k] = h
+        at = np.array([[0, 0, 0, tilt, yaw, roll]])
+        ends = [Rotation.from_matrix(correction_matrices(at + s * step)[0, :3, :3]) for s in (-1, 1)]
+        np.testing.assert_allclose((ends[1] * ends[0].inv()).as_rotvec() / (2 * h), axes[:, k], atol=1e-8)
