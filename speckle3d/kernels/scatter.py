@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
@@ -11,13 +13,14 @@ Float32Array = npt.NDArray[np.float32]
 Complex64Array = npt.NDArray[np.complex64]
 IntArray = npt.NDArray[np.int64]
 
+_BINS_PER_MM = 16.0
 _TURNS = 8192
 _TWO_PI = 2.0 * np.pi
 _PHASORS = np.exp(-1j * _TWO_PI * np.arange(_TURNS) / _TURNS).astype(np.complex64)
 
 
 @njit(cache=True, inline="always")
-def _unit_phasor(cycles: float) -> complex:
+def _unit_phasor(cycles: float) -> Any:
     """``exp(-2 pi i cycles)`` to 1e-7: the nearest tabulated phasor, turned by the small rest."""
     scaled = (cycles - np.floor(cycles)) * _TURNS
     nearest = int(scaled + 0.5)
@@ -111,3 +114,75 @@ def scatter_echoes(
             for k in range(nodes):
                 out[v, n, k] += (one - late) * value[k]
                 out[v, n + 1, k] += late * value[k]
+
+
+@njit(cache=True)
+def gather_near(
+    position_mm: FloatArray,
+    strength: Float32Array,
+    image_from_medium: FloatArray,
+    lateral_mm: FloatArray,
+    depth_mm: FloatArray,
+    thickness_mm: FloatArray,
+    out_position_mm: FloatArray,
+    out_strength: Float32Array,
+    filled: int,
+) -> int:
+    """Append the scatterers within the beam's reach, moved into the image frame; return how many there are.
+
+    ``lateral_mm`` holds the two lateral limits, ``depth_mm`` first depth and step of ``thickness_mm``.
+    """
+    m = image_from_medium
+    last = thickness_mm.shape[0] - 1
+    for j in range(position_mm.shape[0]):
+        a, b, c = position_mm[j, 0], position_mm[j, 1], position_mm[j, 2]
+        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
+        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
+        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
+        row = int(np.floor((y - depth_mm[0]) / depth_mm[1]))
+        if row < 0 or row >= last or x <= lateral_mm[0] or x >= lateral_mm[1]:
+            continue
+        if abs(z) >= thickness_mm[row]:
+            continue
+        out_position_mm[filled, 0] = x
+        out_position_mm[filled, 1] = y
+        out_position_mm[filled, 2] = z
+        out_strength[filled] = strength[j]
+        filled += 1
+    return filled
+
+
+@njit(cache=True)
+def sort_into_cells(
+    position_mm: FloatArray,
+    strength: Float32Array,
+    left_mm: float,
+    cell_mm: float,
+    deep_mm: float,
+    cell_start: IntArray,
+    out_position_mm: FloatArray,
+    out_strength: Float32Array,
+) -> None:
+    """Sort by lateral cell and, within it, by depth bin, so that table and vector stay in cache.
+
+    Fills ``cell_start``, shape (cells + 1,), with the first scatterer of each lateral cell. All scatterers
+    must lie inside the cells and between zero and ``deep_mm``.
+    """
+    bins = int(deep_mm * _BINS_PER_MM) + 1
+    cells = cell_start.shape[0] - 1
+    count = np.zeros(cells * bins + 1, dtype=np.int64)
+    n = position_mm.shape[0]
+    cell = np.empty(n, dtype=np.int64)
+    for j in range(n):
+        cell[j] = int((position_mm[j, 0] - left_mm) / cell_mm) * bins
+        cell[j] += int(position_mm[j, 1] * _BINS_PER_MM)
+        count[cell[j] + 1] += 1
+    for i in range(1, count.shape[0]):
+        count[i] += count[i - 1]
+    for i in range(cells + 1):
+        cell_start[i] = count[i * bins]
+    for j in range(n):
+        at = count[cell[j]]
+        count[cell[j]] += 1
+        out_position_mm[at] = position_mm[j]
+        out_strength[at] = strength[j]

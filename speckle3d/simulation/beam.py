@@ -173,10 +173,10 @@ def tabulate_beam(
     .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
     """
     probe, grid = probe or Probe(), grid or BeamGrid()
-    depth = np.arange(grid.first_depth_mm, grid.last_depth_mm + 1e-9, grid.depth_step_mm)
+    depth = np.arange(grid.first_depth_mm, grid.last_depth_mm + 1e-9, grid.depth_step_mm, dtype=np.float64)
     step = probe.pitch_mm / grid.per_pitch
-    lateral = np.arange(round(grid.lateral_reach_mm / step) + 1) * step
-    elevation = np.arange(0.0, grid.elevation_reach_mm + 1e-9, grid.elevation_step_mm)
+    lateral = np.arange(round(grid.lateral_reach_mm / step) + 1, dtype=np.float64) * step
+    elevation = np.arange(0.0, grid.elevation_reach_mm + 1e-9, grid.elevation_step_mm, dtype=np.float64)
     field = _sum_sources(probe, grid, depth, lateral, elevation)
     nodes = np.asarray(grid.node_hz)
     neper = attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * nodes
@@ -291,7 +291,7 @@ def _reach(amplitude: FloatArray, floor: float) -> npt.NDArray[np.int64]:
     nz = amplitude.shape[2]
     above = amplitude > floor * amplitude.max(axis=(1, 2), keepdims=True)
     last = np.where(above.any(axis=2), nz - np.argmax(above[:, :, ::-1], axis=2), 0)
-    reach = np.minimum(last, nz - 1)
+    reach = np.asarray(np.minimum(last, nz - 1), dtype=np.int64)
     # A cell between two tabulated depths or laterals must reach as far as the farther of its corners.
     reach[:-1] = np.maximum(reach[:-1], reach[1:])
     reach[:, :-1] = np.maximum(reach[:, :-1], reach[:, 1:])

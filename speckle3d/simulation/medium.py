@@ -16,16 +16,20 @@ import numpy.typing as npt
 
 from speckle3d.core.geometry import FloatArray
 
-Scatterers = tuple[FloatArray, npt.NDArray[np.float32]]
+Float32Array = npt.NDArray[np.float32]
+Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
 
 _KEPT_TILES = 160
+"""A frame of 127 vectors sees about 40 tiles; the rest serve neighbouring frames and turned ones."""
 
 
 class Medium(Protocol):
     """Anything that can list its scatterers in a box."""
 
-    attenuation_db_cm_mhz: float
+    @property
+    def attenuation_db_cm_mhz(self) -> float:
+        """One-way attenuation, proportional to frequency."""
 
     def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
         """Blocks of scatterers that together hold all those between the corners, and perhaps more."""
@@ -33,10 +37,10 @@ class Medium(Protocol):
 
 @dataclass(frozen=True)
 class PointMedium:
-    """Scatterers listed one by one."""
+    """Scatterers listed one by one: positions, shape (n, 3), mm, and strengths, shape (n,)."""
 
     position_mm: FloatArray
-    strength: npt.NDArray[np.float32]
+    strength: Float32Array
     attenuation_db_cm_mhz: float = 0.0
 
     def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
@@ -45,8 +49,31 @@ class PointMedium:
 
 
 @dataclass(frozen=True)
+class Waves:
+    """A smooth function of position: a sum of plane sinusoids.
+
+    ``rows`` holds one sinusoid each: amplitude, wave number along x, y and z (rad/mm), phase (rad).
+    """
+
+    rows: FloatArray
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Value at positions, shape (n, 3)."""
+        return np.asarray(np.sin(position_mm @ self.rows[:, 1:4].T + self.rows[:, 4]) @ self.rows[:, 0])
+
+    @staticmethod
+    def random(rng: np.random.Generator, rms: float, waves_rad_mm: Sequence[float], count: int = 6) -> Waves:
+        """Draw `count` waves of given largest wave numbers, together of `rms`."""
+        rows = np.empty((count, 5))
+        rows[:, 0] = rms * np.sqrt(2.0 / count)
+        rows[:, 1:4] = rng.uniform(-1.0, 1.0, (count, 3)) * waves_rad_mm
+        rows[:, 4] = rng.uniform(0.0, 2.0 * np.pi, count)
+        return Waves(rows)
+
+
+@dataclass(frozen=True)
 class Sphere:
-    """A ball in which the background's echo strength is multiplied by `factor` (0: an anechoic cyst)."""
+    """A ball in which echo strengths are multiplied by `factor` (0: an anechoic cyst)."""
 
     centre_mm: tuple[float, float, float]
     radius_mm: float
@@ -54,22 +81,28 @@ class Sphere:
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """A thin undulating reflector across the whole medium, such as fascia.
+class Layer:
+    """What lies below an undulating boundary, down to the next layer's.
 
-    ``waves`` holds one row per sinusoid: amplitude (mm), wave number along x and z (rad/mm), phase (rad).
+    Parameters
+    ----------
+    top_mm, undulation : float, Waves
+        Mean depth of the boundary and its shape; the waves' amplitudes are in mm.
+    strength, fill : float
+        Of the diffuse background: relative echo strength, and the part of its scatterers that are there.
+    fascia : float
+        Strength per mm^2 of a thin reflecting sheet on the boundary; its scatterers share one sign.
     """
 
-    depth_mm: float
-    waves: FloatArray
+    top_mm: float
+    undulation: Waves
     strength: float
-    per_mm2: float = 60.0
-    thickness_mm: float = 0.015
+    fill: float = 1.0
+    fascia: float = 0.0
 
-    def depth_at(self, x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
-        """Depth of the sheet."""
-        phase = np.multiply.outer(x_mm, self.waves[:, 1]) + np.multiply.outer(z_mm, self.waves[:, 2])
-        return np.asarray(self.depth_mm + np.sin(phase + self.waves[:, 3]) @ self.waves[:, 0])
+    def top_at(self, position_mm: FloatArray) -> FloatArray:
+        """Depth of the boundary above or below positions, shape (n, 3)."""
+        return np.asarray(self.top_mm + self.undulation.at(position_mm * [1.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True)
@@ -80,12 +113,14 @@ class Clusters:
     ----------
     per_mm3, children, strength : float
         Density of parents, children of each, and a child's strength.
+    depth_mm : tuple of float
+        Where parents are.
     length_mm : float
-        Mean length of a fibre, exponentially distributed up to three times this; zero for round clusters.
+        Longest fibre; lengths are uniform from a quarter of it. Zero for round clusters.
     spread_mm : float
         Standard deviation of children across the fibre, or in all directions.
-    direction : tuple of float
-        Fibres' mean direction in the medium; `wander_rad` is their scatter about it.
+    direction, wander_rad : tuple of float, float
+        Fibres' mean direction in the medium, and their scatter about it.
     coherent : bool
         Whether the children of one parent share one sign.
     """
@@ -93,63 +128,70 @@ class Clusters:
     per_mm3: float
     children: int
     strength: float
+    depth_mm: tuple[float, float]
     length_mm: float = 0.0
     spread_mm: float = 0.1
     direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
     wander_rad: float = 0.05
     coherent: bool = True
 
-    @property
-    def reach_mm(self) -> float:
-        """How far a child may lie from its parent."""
-        return 1.5 * self.length_mm + 3.0 * self.spread_mm
-
-
-@dataclass(frozen=True)
-class DepthBand:
-    """Echo strength of the diffuse background between two depths; `fill` is the part of scatterers kept."""
-
-    from_mm: float
-    to_mm: float
-    strength: float
-    fill: float = 1.0
+    def draw(self, rng: np.random.Generator, corner_mm: FloatArray, side_mm: float) -> Scatterers:
+        """Children of the parents in one square column; some lie outside it."""
+        size = np.array([side_mm, self.depth_mm[1] - self.depth_mm[0], side_mm])
+        n = rng.poisson(self.per_mm3 * size.prod())
+        parent = np.array([corner_mm[0], self.depth_mm[0], corner_mm[1]]) + rng.random((n, 3)) * size
+        axis = np.asarray(self.direction) + self.wander_rad * rng.standard_normal((n, 3))
+        axis *= (self.length_mm * rng.uniform(0.25, 1.0, n) / np.linalg.norm(axis, axis=1))[:, None]
+        along = rng.random((n, self.children, 1)) - 0.5
+        across = self.spread_mm * np.clip(rng.standard_normal((n, self.children, 3)), -3.0, 3.0)
+        position = parent[:, None] + along * axis[:, None] + across
+        signs = rng.choice([-1.0, 1.0], (n, 1 if self.coherent else self.children))
+        strength = np.broadcast_to(self.strength * signs, (n, self.children))
+        return position.reshape(-1, 3), strength.ravel().astype(np.float32)
 
 
 @dataclass(frozen=True)
 class TiledMedium:
-    """An unbounded slab of tissue, made on demand in square columns.
+    """A slab without sides, made on demand in square columns.
 
     Parameters
     ----------
     entropy : int
-        Seed; with a tile's index it determines the tile.
+        Seed; with a tile's indices it determines the tile.
     per_mm3 : float
         Density of the diffuse background.
-    bands, spheres, sheets, clusters
-        Later bands and spheres overrule or multiply earlier ones; clusters respect anechoic spheres.
+    layers : sequence of Layer
+        From the skin down.
+    texture : Waves, optional
+        Slow variation of the background's echo strength, in nepers.
+    clusters, spheres
+        Spheres multiply whatever lies in them.
     depth_mm : tuple of float
         The slab, from a little above the skin so that a probe may move up.
+    tile_mm : float
+        Side of the columns; no cluster may reach further than this from its parent.
     """
 
     entropy: int
     per_mm3: float
-    attenuation_db_cm_mhz: float = 0.0
-    bands: Sequence[DepthBand] = ()
-    spheres: Sequence[Sphere] = ()
-    sheets: Sequence[Sheet] = ()
+    attenuation_db_cm_mhz: float
+    layers: Sequence[Layer] = ()
+    texture: Waves | None = None
     clusters: Sequence[Clusters] = ()
+    spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
     tile_mm: float = 4.0
+    fascia_per_mm2: float = 60.0
     _tiles: OrderedDict[tuple[int, int], Scatterers] = field(
         default_factory=OrderedDict, repr=False, compare=False
     )
 
     def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
-        """Blocks of scatterers that together hold all those between the corners."""
-        reach = max((c.reach_mm for c in self.clusters), default=0.0)
-        first = np.floor((low_mm[[0, 2]] - reach) / self.tile_mm).astype(int)
-        last = np.floor((high_mm[[0, 2]] + reach) / self.tile_mm).astype(int)
-        return [self._tile(i, j) for i in range(first[0], last[0] + 1) for j in range(first[1], last[1] + 1)]
+        """Tiles that together hold all scatterers between the corners."""
+        first = np.floor(low_mm[[0, 2]] / self.tile_mm).astype(int)
+        last = np.floor(high_mm[[0, 2]] / self.tile_mm).astype(int)
+        columns = range(first[0], last[0] + 1), range(first[1], last[1] + 1)
+        return [self._tile(i, j) for i in columns[0] for j in columns[1]]
 
     def _tile(self, i: int, j: int) -> Scatterers:
         if (i, j) not in self._tiles:
@@ -160,140 +202,124 @@ class TiledMedium:
         return self._tiles[i, j]
 
     def _make(self, i: int, j: int) -> Scatterers:
-        # Entropy takes no negative numbers; tiles on either side of the origin need distinct ones.
-        rng = np.random.default_rng([self.entropy, i % 2**32, j % 2**32])
-        corner = np.array([i * self.tile_mm, self.depth_mm[0], j * self.tile_mm])
-        size = np.array([self.tile_mm, self.depth_mm[1] - self.depth_mm[0], self.tile_mm])
-        parts = [self._background(rng, corner, size)]
-        parts += [self._sheet(rng, sheet, corner, size) for sheet in self.sheets]
-        parts += [self._cluster(rng, cluster, corner, size) for cluster in self.clusters]
+        parts = [self._background(i, j)]
+        parts += [self._fascia(layer, n, i, j) for n, layer in enumerate(self.layers) if layer.fascia]
+        # Children of a neighbouring tile's parents may lie in this tile.
+        around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)] if self.clusters else []
+        parts += [self._children(i, j, *neighbour) for neighbour in around]
         position = np.concatenate([p for p, _ in parts])
         strength = np.concatenate([s for _, s in parts])
+        for sphere in self.spheres:
+            inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
+            strength[inside] *= sphere.factor
         kept = strength != 0.0
+        return position[kept], strength[kept]
+
+    def _rng(self, part: int, i: int, j: int) -> np.random.Generator:
+        # Seeds take no negative numbers; tiles on either side of the origin need distinct ones.
+        return np.random.default_rng([self.entropy, part, i % 2**32, j % 2**32])
+
+    def _background(self, i: int, j: int) -> Scatterers:
+        rng = self._rng(0, i, j)
+        size = np.array([self.tile_mm, self.depth_mm[1] - self.depth_mm[0], self.tile_mm])
+        n = rng.poisson(self.per_mm3 * size.prod())
+        position = [i * self.tile_mm, self.depth_mm[0], j * self.tile_mm] + rng.random((n, 3)) * size
+        strength, fill = np.ones(n), np.ones(n)
+        for layer in self.layers:
+            below = position[:, 1] >= layer.top_at(position)
+            strength[below], fill[below] = layer.strength, layer.fill
+        if self.texture is not None:
+            strength *= np.exp(self.texture.at(position))
+        # Equal strengths of random sign give fully developed speckle with the fewest scatterers.
+        strength *= rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
+        kept = rng.random(n) < fill
         return position[kept], strength[kept].astype(np.float32)
 
-    def _background(self, rng: np.random.Generator, corner: FloatArray, size: FloatArray) -> Scatterers:
-        n = rng.poisson(self.per_mm3 * size.prod())
-        position = corner + rng.random((n, 3)) * size
-        strength, fill = np.ones(n), np.ones(n)
-        for band in self.bands:
-            inside = (position[:, 1] >= band.from_mm) & (position[:, 1] < band.to_mm)
-            strength[inside], fill[inside] = band.strength, band.fill
-        # Equal strengths of random sign give fully developed speckle with the fewest scatterers.
-        sign = rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
-        return position, self._through_spheres(position, strength * sign) * (rng.random(n) < fill)
+    def _fascia(self, layer: Layer, number: int, i: int, j: int) -> Scatterers:
+        rng = self._rng(1 + number, i, j)
+        n = rng.poisson(self.fascia_per_mm2 * self.tile_mm**2)
+        position = [i * self.tile_mm, 0.0, j * self.tile_mm] + rng.random((n, 3)) * [
+            self.tile_mm,
+            0.0,
+            self.tile_mm,
+        ]
+        position[:, 1] = layer.top_at(position) + rng.normal(0.0, 0.015, n)
+        return position, np.full(n, layer.fascia / self.fascia_per_mm2, np.float32)
 
-    def _through_spheres(self, position: FloatArray, strength: FloatArray) -> FloatArray:
-        for sphere in self.spheres:
-            r2 = ((position - sphere.centre_mm) ** 2).sum(axis=1)
-            strength = np.where(r2 < sphere.radius_mm**2, strength * sphere.factor, strength)
-        return strength
-
-    def _sheet(
-        self, rng: np.random.Generator, sheet: Sheet, corner: FloatArray, size: FloatArray
-    ) -> Scatterers:
-        n = rng.poisson(sheet.per_mm2 * size[0] * size[2])
-        position = corner + rng.random((n, 3)) * size
-        depth = sheet.depth_at(position[:, 0], position[:, 2])
-        position[:, 1] = depth + sheet.thickness_mm * rng.standard_normal(n)
-        return position, self._through_spheres(position, np.full(n, sheet.strength / sheet.per_mm2))
-
-    def _cluster(
-        self, rng: np.random.Generator, kind: Clusters, corner: FloatArray, size: FloatArray
-    ) -> Scatterers:
-        n = rng.poisson(kind.per_mm3 * size.prod())
-        parent = corner + rng.random((n, 3)) * size
-        along = np.minimum(rng.exponential(1.0, n), 3.0) * kind.length_mm
-        axis = np.asarray(kind.direction) + kind.wander_rad * rng.standard_normal((n, 3))
-        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        offset = (rng.random((n, kind.children)) - 0.5) * along[:, None]
-        child = parent[:, None] + offset[..., None] * axis[:, None]
-        across = np.clip(rng.standard_normal(child.shape), -3.0, 3.0) * kind.spread_mm
-        signs = rng.choice([-1.0, 1.0], (n, 1 if kind.coherent else kind.children))
-        strength = np.broadcast_to(signs * kind.strength, (n, kind.children)).ravel()
-        position = (child + across).reshape(-1, 3)
-        return position, self._through_spheres(position, strength)
+    def _children(self, i: int, j: int, parent_i: int, parent_j: int) -> Scatterers:
+        corner = np.array([parent_i, parent_j]) * self.tile_mm
+        drawn = [
+            kind.draw(self._rng(1000 + number, parent_i, parent_j), corner, self.tile_mm)
+            for number, kind in enumerate(self.clusters)
+        ]
+        position = np.concatenate([p for p, _ in drawn])
+        strength = np.concatenate([s for _, s in drawn])
+        mine = (np.floor(position[:, [0, 2]] / self.tile_mm) == [i, j]).all(axis=1)
+        return position[mine], strength[mine]
 
 
-def fully_developed(entropy: int, per_mm3: float = 60.0, attenuation_db_cm_mhz: float = 0.3) -> TiledMedium:
-    """A uniform speckle phantom."""
-    return TiledMedium(entropy, per_mm3, attenuation_db_cm_mhz)
+def fully_developed(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMedium:
+    """Make a uniform speckle phantom."""
+    return TiledMedium(entropy, per_mm3, 0.3)
 
 
-def phantom(entropy: int, per_mm3: float = 60.0) -> TiledMedium:
-    """A speckle phantom with a few spherical inclusions, brighter and darker by 6 to 12 dB."""
+def phantom(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMedium:
+    """Make a speckle phantom with spherical inclusions, brighter and darker by 6 to 12 dB."""
     rng = np.random.default_rng([entropy, 1])
     factors = (2.0, 0.5, 0.25, 3.0, 0.5)
-    spheres = [
-        Sphere((float(rng.uniform(4, 34)), float(rng.uniform(8, 34)), float(rng.uniform(0, 20))), 3.0, f)
-        for f in factors
-    ]
-    return TiledMedium(entropy, per_mm3, 0.3, spheres=spheres)
+    return TiledMedium(
+        entropy, per_mm3, 0.3, spheres=[_sphere(rng, length_mm, (1.5, 4.0), f) for f in factors]
+    )
 
 
-def tissue(entropy: int, per_mm3: float = 60.0) -> TiledMedium:
-    """Layered tissue: skin, fat, muscle between fascias, fibres and clusters, cysts, a poorly filled depth.
+def tissue(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMedium:
+    """Make layered tissue: skin, fat, muscles between fascias, cysts, and a poorly filled depth.
 
-    Fibres mostly run along the sweep and outlast the beam's thickness, by an amount that varies with depth
-    as the beam's thickness does: speckle there is partly coherent and decorrelates too slowly.
+    Fibres run mostly along the sweep and are longer than the beam is thick, more of them in some muscles
+    than in others: there speckle is partly coherent and decorrelates too slowly.
     """
     rng = np.random.default_rng([entropy, 1])
-    fascias = np.array([1.5, 6.5, 7.5, 15.0, 16.5, 23.0, 29.5]) + rng.uniform(-0.5, 0.5, 7)
-    bright = (0.5, 0.8, 0.35, 0.9, 0.4, 0.7, 0.6)
-    cysts = [
-        Sphere(
-            (float(rng.uniform(3, 35)), float(rng.uniform(9, 28)), float(rng.uniform(0, 20))),
-            float(rng.uniform(1.0, 3.0)),
-            0.0,
-        )
-        for _ in range(5)
+    tops = np.array([-3.0, 1.5, 6.5, 7.5, 15.0, 16.2, 23.0, 30.0])
+    tops[2:] += rng.uniform(-0.5, 0.5)
+    strengths = (0.9, 0.35, 0.7, 0.55, 0.9, 0.7, 0.45, 0.2)
+    fills = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2)
+    fascias = (0.0, 3.0, 5.0, 3.0, 6.0, 4.0, 5.0, 4.0)
+    layers = [
+        Layer(float(top), Waves.random(rng, 0.25, (0.25, 0.0, 0.2)), *rest)
+        for top, *rest in zip(tops, strengths, fills, fascias, strict=True)
     ]
+    texture = Waves.random(rng, 0.25, (2.0, 2.0, 2.0), 24)
+    cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]
     return TiledMedium(
-        entropy,
-        per_mm3,
-        0.4,
-        bands=_tissue_bands(fascias),
-        spheres=cysts,
-        sheets=[_fascia(rng, d, s) for d, s in zip(fascias, bright, strict=True)],
-        clusters=_tissue_clusters(rng),
+        entropy, per_mm3, 0.4, layers, texture, _tissue_clusters(rng, tops.tolist()), spheres=cysts
     )
 
 
-def _tissue_bands(fascias: FloatArray) -> list[DepthBand]:
-    edges = [-3.0, *fascias.tolist(), 50.0]
-    strengths = (0.8, 0.35, 0.6, 0.8, 1.0, 0.7, 0.9, 0.25)
-    fills = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.3)
-    rows = zip(edges[:-1], edges[1:], strengths, fills, strict=True)
-    return [DepthBand(*row) for row in rows]
+def _sphere(
+    rng: np.random.Generator, length_mm: float, radius_mm: tuple[float, float], factor: float
+) -> Sphere:
+    centre = rng.uniform([3.0, 8.0, 0.0], [35.0, 34.0, length_mm])
+    x, y, z = (float(c) for c in centre)
+    return Sphere((x, y, z), float(rng.uniform(*radius_mm)), factor)
 
 
-def _fascia(rng: np.random.Generator, depth_mm: float, strength: float) -> Sheet:
-    """Undulate by a few tenths of a millimetre over one to a few centimetres."""
-    waves = np.stack(
-        [
-            rng.uniform(0.05, 0.25, 4),
-            rng.uniform(-0.5, 0.5, 4),
-            rng.uniform(-0.3, 0.3, 4),
-            rng.uniform(0, 2 * np.pi, 4),
-        ],
-        axis=1,
-    )
-    return Sheet(float(depth_mm), waves, strength)
-
-
-def _tissue_clusters(rng: np.random.Generator) -> list[Clusters]:
-    heading, dip = rng.normal(0.0, 0.1), rng.normal(0.0, 0.03)
+def _tissue_clusters(rng: np.random.Generator, tops: Sequence[float]) -> list[Clusters]:
+    """Fibres in three muscles, in ever larger numbers with depth, crossing septa, and round clusters."""
+    heading, dip = rng.normal(0.0, 0.1), rng.normal(0.0, 0.02)
     along = (float(np.sin(heading)), float(np.sin(dip)), float(np.cos(heading)))
-    return [
-        Clusters(0.15, 40, 0.045, length_mm=4.0, spread_mm=0.02, direction=along),
-        Clusters(0.05, 40, 0.045, length_mm=3.0, spread_mm=0.02, direction=(1.0, 0.0, 0.0)),
-        Clusters(0.3, 12, 0.08, spread_mm=0.12, coherent=False),
+    muscles = [(tops[3], tops[4]), (tops[5], tops[6]), (tops[6], tops[7])]
+    fibres = [
+        Clusters(density, 24, 0.05, depth, length_mm=6.0, spread_mm=0.02, direction=along)
+        for density, depth in zip((0.5, 0.9, 1.3), muscles, strict=True)
     ]
+    septa = Clusters(0.12, 24, 0.06, (tops[1], tops[7]), 5.0, 0.02, (1.0, 0.05, 0.1), 0.1)
+    round_ones = Clusters(0.25, 12, 0.09, (tops[1], 42.0), spread_mm=0.12, coherent=False)
+    return [*fibres, septa, round_ones]
 
 
-MEDIA: dict[str, Callable[[int], TiledMedium]] = {
+MEDIA: dict[str, Callable[[int, float], TiledMedium]] = {
     "fully_developed": fully_developed,
     "phantom": phantom,
     "tissue": tissue,
 }
-"""Media by the name that presets use."""
+"""Media by the name that presets use; each takes a seed and the length of the sweep."""

@@ -80,7 +80,7 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     """
     seeds = np.random.SeedSequence(settings.seed)
     medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)
-    medium = MEDIA[_MEDIUM[settings.preset]](_entropy(medium_seed))
+    medium = MEDIA[_MEDIUM[settings.preset]](_entropy(medium_seed), settings.length_mm)
     probe = Probe()
     beam = tabulate_beam(probe, attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
     heading = np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)

@@ -11,18 +11,23 @@ import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.kernels.scatter import scatter_echoes
+from speckle3d.kernels.scatter import gather_near, scatter_echoes, sort_into_cells
 from speckle3d.simulation.beam import BeamTable, Complex64Array
-from speckle3d.simulation.medium import Medium, Scatterers
+from speckle3d.simulation.medium import Medium
+
+Float32Array = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
 
 FULL_SCALE = 8191
 """14 bits, signed."""
 
 SPECKLE_RMS_COUNTS = 350.0
 """Fully developed speckle of unit strength after time-gain compensation: 27 dB below full scale."""
+
+_CELL_MM = 0.3
+"""Lateral cells that scatterers are sorted into: a vector skips those out of its reach."""
 
 _GUARD_SAMPLES = 160
 """Longer than the pulse (its raised-cosine spectrum is 10 MHz wide): keeps the FFT's ends apart."""
@@ -93,23 +98,19 @@ class SimulatedFrames:
 
     def echoes(self, index: int) -> Complex64Array:
         """Baseband echoes of frame `index` at every frequency node, shape (vector, sample, node)."""
-        blocks = self._near(self.medium_from_image[index])
-        position = np.concatenate([p for p, _ in blocks])
-        strength = np.concatenate([s for _, s in blocks])
-        out = np.zeros((self.image.vectors, self._spectra.length, self.beam.node_hz.size), np.complex64)
-        probe, image = self.beam.probe, self.image
-        vector_mm = np.arange(image.vectors) * image.vector_pitch_mm
-        order, start, first, last = _by_lateral_cell(position, vector_mm, self.beam.lateral_extent_mm)
+        probe, image, beam = self.beam.probe, self.image, self.beam
+        out = np.zeros((image.vectors, self._spectra.length, beam.node_hz.size), np.complex64)
+        vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
+        position, strength, cells = self._near(self.medium_from_image[index])
         scatter_echoes(
-            position[order],
-            strength[order],
-            start,
-            first,
-            last,
+            position,
+            strength,
+            cells,
+            *_cells_of(vector_mm, beam.lateral_extent_mm),
             vector_mm,
-            self.beam.residual,
-            self.beam.reach,
-            self.beam.curvature_per_mm,
+            beam.residual,
+            beam.reach,
+            beam.curvature_per_mm,
             self._table_steps,
             image.first_sample_depth_mm,
             image.sample_spacing_mm,
@@ -130,7 +131,7 @@ class SimulatedFrames:
     @cached_property
     def _rms(self) -> tuple[FloatArray, float]:
         """RF rms of unit speckle at each sample, and at the focus."""
-        frequency = np.fft.rfftfreq(1024, 1.0 / self.beam.probe.sampling_rate_hz)
+        frequency = np.linspace(0.0, self.beam.probe.sampling_rate_hz / 2.0, 513)
         rms = np.sqrt(self.beam.echo_power(frequency))
         image = self.image
         depth = image.first_sample_depth_mm + np.arange(image.samples) * image.sample_spacing_mm
@@ -158,29 +159,23 @@ class SimulatedFrames:
         noise[:, band] = scale * white.view(np.complex64)[..., 0]
         return noise
 
-    def _near(self, medium_from_image: RigidTransform) -> list[Scatterers]:
-        """Scatterers within the beam's reach of the image plane, in the image frame."""
-        margin, thick = self.beam.lateral_extent_mm, float(self.beam.elevation_extent_mm.max())
-        low = np.array([-margin, self.beam.depth_mm[0], -thick])
-        high = np.array([self.image.width_mm + margin, self.beam.depth_mm[-1], thick])
-        corners = np.array(
-            [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (-thick, thick)]
-        )
-        seen = medium_from_image.apply(corners)
-        image_from_medium = medium_from_image.inv().as_matrix()
-        blocks = []
-        for position, strength in self.medium.within(seen.min(axis=0), seen.max(axis=0)):
-            moved = position @ image_from_medium[:3, :3].T + image_from_medium[:3, 3]
-            kept = self._in_reach(moved, low, high)
-            blocks.append((moved[kept], strength[kept]))
-        return blocks
-
-    def _in_reach(self, position: FloatArray, low: FloatArray, high: FloatArray) -> npt.NDArray[np.intp]:
-        thick = np.interp(position[:, 1], self.beam.depth_mm, self.beam.elevation_extent_mm)
-        inside = np.abs(position[:, 2]) <= thick
-        inside &= (position[:, 0] > low[0]) & (position[:, 0] < high[0])
-        inside &= (position[:, 1] > low[1]) & (position[:, 1] < high[1])
-        return np.flatnonzero(inside)
+    def _near(self, medium_from_image: RigidTransform) -> tuple[FloatArray, Float32Array, IntArray]:
+        """Scatterers within the beam's reach in the image frame by lateral cell, and the cells' starts."""
+        margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm
+        lateral = np.array([-margin, self.image.width_mm + margin])
+        depth = self.beam.depth_mm
+        corners = np.stack(np.meshgrid(lateral, depth[[0, -1]], [-thick.max(), thick.max()]), axis=-1)
+        seen = medium_from_image.apply(corners.reshape(-1, 3))
+        blocks = self.medium.within(seen.min(axis=0), seen.max(axis=0))
+        position = np.empty((sum(s.size for _, s in blocks), 3))
+        strength = np.empty(position.shape[0], np.float32)
+        matrix, steps, n = medium_from_image.inv().as_matrix(), self._table_steps[:2], 0
+        for block in blocks:
+            n = gather_near(*block, matrix, lateral, steps, thick, position, strength, n)
+        by_cell = np.empty((n, 3)), np.empty(n, np.float32)
+        cells = np.zeros(int(np.ptp(lateral) / _CELL_MM) + 2, np.int64)
+        sort_into_cells(position[:n], strength[:n], lateral[0], _CELL_MM, depth[-1], cells, *by_cell)
+        return *by_cell, cells
 
 
 class _Spectra:
@@ -207,18 +202,8 @@ class _Spectra:
         return wave
 
 
-def _by_lateral_cell(
-    position: FloatArray, vector_mm: FloatArray, extent_mm: float
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Sort by lateral cell, then depth, so that a vector reads a run of cells with the table in cache."""
-    if vector_mm.size < 1:
-        raise InvalidInputError("expected at least one vector, got none")
-    width = 0.3
-    left = vector_mm[0] - extent_mm
-    cell = np.floor((position[:, 0] - left) / width).astype(np.int64)
-    cells = int(np.floor((vector_mm[-1] + extent_mm - left) / width)) + 1
-    order = np.lexsort((position[:, 1], cell))
-    start = np.searchsorted(cell[order], np.arange(cells + 1)).astype(np.int64)
-    first = np.clip(np.floor((vector_mm - extent_mm - left) / width), 0, cells).astype(np.int64)
-    last = np.clip(np.floor((vector_mm + extent_mm - left) / width) + 1, 0, cells).astype(np.int64)
-    return order, start, first, last
+def _cells_of(vector_mm: FloatArray, extent_mm: float) -> tuple[IntArray, IntArray]:
+    """First lateral cell that each vector looks at, and the one after its last."""
+    near = (vector_mm - vector_mm[0]) / _CELL_MM
+    far = near + 2.0 * extent_mm / _CELL_MM
+    return near.astype(np.int64), far.astype(np.int64) + 1
