@@ -61,6 +61,17 @@ class SequenceHeader:
         """Frames, from the third axis; a plane image is one frame."""
         return self.size[2] if len(self.size) > 2 else 1
 
+    @property
+    def file_format(self) -> str:
+        """``"NrrdImage"`` or ``"MetaImage"``."""
+        return "NrrdImage" if "sizes" in self.fields else "MetaImage"
+
+    @property
+    def transforms(self) -> list[str]:
+        """Names of the tracked transforms, as ``ProbeToTracker``."""
+        names = {name for frame in self.frames for name in frame if name.endswith("Transform")}
+        return sorted(name.removesuffix("Transform") for name in names)
+
 
 def is_metaimage(start: bytes) -> bool:
     """Whether a file's first bytes are those of a MetaImage header."""

@@ -211,12 +211,10 @@ def _unit(name: str) -> str:
 
 
 def _describe_header(header: SequenceHeader) -> list[Row]:
-    held = sorted(
-        {key.removesuffix("Transform") for f in header.frames for key in f if key.endswith("Transform")}
-    )
+    held = header.transforms
     spacing = "unknown" if header.spacing_mm is None else " x ".join(f"{s:g}" for s in header.spacing_mm)
     return [
-        ("format", "NRRD" if "sizes" in header.fields else "MetaImage", ""),
+        ("format", header.file_format, ""),
         ("size", " x ".join(str(n) for n in header.size), ""),
         ("frames", str(header.frame_count), ""),
         ("spacing", spacing, "" if header.spacing_mm is None else "mm"),

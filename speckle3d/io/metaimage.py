@@ -26,6 +26,10 @@ SKEW_TOLERANCE = 0.1
 """How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
 published calibrations reach 0.05, an error of the calibration and not of the image."""
 
+ROUNDING_TOLERANCE = 2e-3
+"""How far R^T R of a pose in a header may be from the identity before it is made rigid. An electromagnetic
+tracker that rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
+
 _DEFAULT_TRANSFORMS = ("ProbeToTracker", "ReferenceToTracker")
 
 
@@ -210,9 +214,7 @@ def _transform_name(header: SequenceHeader, given: str | None, default: str) -> 
         return name
     if given is None:
         return None
-    held = sorted(
-        {key.removesuffix("Transform") for f in header.frames for key in f if key.endswith("Transform")}
-    )
+    held = header.transforms
     raise InvalidInputError(f"{header.path}: expected a transform {name}, got {', '.join(held) or 'none'}")
 
 
@@ -222,7 +224,17 @@ def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> R
     for i in np.flatnonzero(valid):
         text = header.frames[i].get(f"{name}Transform", "")
         matrices[i] = np.reshape(numbers(text, 16, f"{where}[{i}]"), (4, 4))
-    return transforms_from_matrices(matrices, where)
+    return transforms_from_matrices(_squared(matrices), where)
+
+
+def _squared(matrices: FloatArray) -> FloatArray:
+    """Nearest rotation of every matrix that is one up to rounding; the others stay for the error to name."""
+    r = matrices[:, :3, :3]
+    rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
+    left, _, right = np.linalg.svd(r[rounded])
+    squared = matrices.copy()
+    squared[rounded, :3, :3] = left @ right
+    return squared
 
 
 def _pixel_size(header: SequenceHeader, settings: ImportSettings) -> tuple[float, float]:

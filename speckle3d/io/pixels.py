@@ -33,7 +33,8 @@ def read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
     import SimpleITK
 
     try:
-        image = SimpleITK.ReadImage(header.path)
+        # Named, because the library otherwise believes the file's suffix.
+        image = SimpleITK.ReadImage(header.path, imageIO=f"{header.file_format}IO")
     except RuntimeError as error:
         raise FileError(f"{header.path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error
     pixels = SimpleITK.GetArrayFromImage(image)

@@ -14,11 +14,12 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import PathLike, atomic_path, naming, one_line
-from speckle3d.io.headers import is_metaimage, read_header
+from speckle3d.io.headers import is_metaimage, is_nrrd, read_header
 
-SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
+SUFFIXES = (".nrrd", ".mha", ".nii.gz")
 
 _PIECE_BYTES = 2**20
+_GZIP_SIGNATURE = b"\x1f\x8b"
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -110,10 +111,10 @@ def _require_whole(path: PathLike) -> None:
             start = stream.read(512)
         if is_metaimage(start):
             read_header(path)
-        elif start.startswith(b"\x1f\x8b"):
-            with gzip.open(path) as unpacked:
-                while unpacked.read(_PIECE_BYTES):
-                    pass
+        elif start.startswith(_GZIP_SIGNATURE):
+            _unpack(path)
+        elif not is_nrrd(start):
+            raise InvalidInputError(f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else")
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise FileError(
             f"{path}: expected a whole gzip file, got a damaged one: {one_line(error)}"
@@ -122,3 +123,10 @@ def _require_whole(path: PathLike) -> None:
         if isinstance(error, FileError):
             raise
         raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+
+
+def _unpack(path: PathLike) -> None:
+    """Read a gzip file to its end, where it keeps its check sum."""
+    with gzip.open(path) as unpacked:
+        while unpacked.read(_PIECE_BYTES):
+            pass

@@ -1,0 +1,87 @@
+import hashlib
+import os
+
+import h5py
+import numpy as np
+import pytest
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.hdf5 import atomic_hdf5, atomic_path, open_hdf5, read_checked, sha256_of
+
+
+def write_then(path, text, error=None):
+    with atomic_path(path) as part:
+        part.write_text(text)
+        if error is not None:
+            raise error
+
+
+def test_a_path_appears_when_the_block_succeeds(tmp_path):
+    target = tmp_path / "volume.nii.gz"
+    with atomic_path(target) as part:
+        assert part.name.endswith(".nii.gz")
+        assert part.parent == tmp_path
+        part.write_text("new")
+        assert not target.exists()
+    assert target.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no"), SystemExit(1), GeneratorExit()])
+def test_nothing_remains_of_a_block_that_fails(tmp_path, error):
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(type(error)):
+        write_then(tmp_path / "a", "new", error)
+    assert (tmp_path / "a").read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_is_one_line_with_the_target_name(tmp_path):
+    full = OSError(28, "No space left on device", "/somewhere/.part-x")
+    with pytest.raises(FileError, match=r"a: cannot be written: No space left on device$"):
+        write_then(tmp_path / "a", "new", full)
+
+
+def test_a_link_is_written_through(tmp_path):
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    write_then(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real").read_text() == "new"
+
+
+def test_a_device_is_not_replaced():
+    with pytest.raises(FileError, match="expected an ordinary file to write"):
+        write_then(os.devnull, "new")
+
+
+def test_digest_matches_that_of_the_bytes(tmp_path):
+    content = np.random.default_rng(0).bytes(300_000)
+    (tmp_path / "a").write_bytes(content)
+    assert sha256_of(tmp_path / "a") == hashlib.sha256(content).hexdigest()
+    with pytest.raises(FileError, match="none: cannot be read: No such file"):
+        sha256_of(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "message"),
+    [
+        ((3, 3), float, r"/g/x: expected shape \(3, 3\), got \(2, 3\)"),
+        (("row",), float, r"/g/x: expected shape \(row,\), got \(2, 3\)"),
+        ((2, 3), int, r"/g/x: expected numbers of type int64, got float64"),
+    ],
+)
+def test_a_data_set_of_another_shape_or_kind_is_named(tmp_path, shape, dtype, message):
+    with atomic_hdf5(tmp_path / "a.h5", "test") as file:
+        file["g/x"] = np.zeros((2, 3))
+    with open_hdf5(tmp_path / "a.h5") as file, pytest.raises(InvalidInputError, match=message):
+        read_checked(file["g"], "x", shape, dtype)
+
+
+def test_a_word_stands_for_any_length(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x"] = np.arange(6).reshape(2, 3)
+    with open_hdf5(tmp_path / "a.h5") as file:
+        got = read_checked(file, "x", ("row", 3))
+    assert got.dtype == np.float64
+    np.testing.assert_array_equal(got, np.arange(6).reshape(2, 3))

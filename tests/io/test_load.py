@@ -1,0 +1,112 @@
+import h5py
+import numpy as np
+import pytest
+import sweep_examples
+from image_examples import grey, tracked, write_mha
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.reconstruction import Provenance
+from speckle3d.io.load import describe, load_sweep
+from speckle3d.io.metaimage import ImportSettings
+from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.sweep_writer import write_sweep
+
+BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
+
+
+def values(path):
+    return {name: (value, unit) for name, value, unit in describe(path)}
+
+
+def test_the_reader_is_chosen_by_content_not_by_name(tmp_path):
+    write_sweep(tmp_path / "sweep.mha", sweep_examples.rf_sweep())
+    write_mha(tmp_path / "images.h5", grey(), frames=tracked(3)[2])
+    assert len(load_sweep(tmp_path / "sweep.mha")) == 6
+    assert len(load_sweep(tmp_path / "images.h5", BMODE)) == 3
+
+
+@pytest.mark.parametrize("read", [load_sweep, describe])
+def test_what_is_of_no_known_kind_is_refused(tmp_path, read):
+    (tmp_path / "a.h5").write_bytes(b"")
+    with pytest.raises(InvalidInputError, match=r"a\.h5: expected a sweep file, .* got an empty file"):
+        read(tmp_path / "a.h5")
+    (tmp_path / "a.h5").write_bytes(np.random.default_rng(0).bytes(4000))
+    with pytest.raises(InvalidInputError, match="got something else"):
+        read(tmp_path / "a.h5")
+    with pytest.raises(FileError, match="expected a file, got none"):
+        read(tmp_path / "none.h5")
+    with pytest.raises(FileError, match="expected a file, got a folder"):
+        read(tmp_path)
+
+
+def test_a_sweep_is_described(tmp_path):
+    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep())
+    rows = values(tmp_path / "s.h5")
+    assert rows["format"] == ("speckle3d.sweep", "")
+    assert rows["frames"] == ("6", "")
+    assert rows["rate"] == ("25.00", "frames/s")
+    assert rows["vectors x samples"] == ("5 x 40", "")
+    assert rows["vector pitch"] == ("0.3", "mm")
+    assert rows["depth"] == ("2.00 to 2.75", "mm")  # 39 steps of 19.25 um below 2 mm
+    assert rows["band"] == ("4 to 8", "MHz")
+    assert rows["orientation sensor"] == ("18", "samples")
+    assert rows["orientation sensor rate"] == ("100.00", "samples/s")
+    # Readings at 10.015 to 10.185 s of image time miss the frames at 10.00 and 10.20 s.
+    assert rows["orientation sensor covers"] == ("4", "frames")
+    assert rows["tracker calibrated"] == ("yes", "")
+    assert rows["truth"] == ("yes", "")
+
+
+def test_a_bmode_sweep_is_described(tmp_path):
+    write_sweep(tmp_path / "s.h5", sweep_examples.bmode_sweep())
+    rows = values(tmp_path / "s.h5")
+    assert rows["signal"] == ("B-mode", "")
+    assert rows["dynamic range"] == ("60", "dB")
+
+
+def test_a_reconstruction_is_described(tmp_path):
+    sweep = sweep_examples.rf_sweep()
+    with ReconstructionWriter(tmp_path / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
+        writer.finish({"image": sweep.truth}, Provenance("in.h5", "ab", "0.1.0"))
+    rows = values(tmp_path / "r.h5")
+    centres = sweep.truth.apply(sweep.grid.centre_mm)
+    assert rows["length, mode image"] == (f"{np.linalg.norm(centres[-1] - centres[0]):.2f}", "mm")
+    assert rows["frame pairs"] == ("0", "")
+    assert rows["input"] == ("in.h5", "")
+
+
+@pytest.mark.parametrize("name", ["curves", "calibration"])
+def test_the_smaller_files_of_the_family_are_listed(tmp_path, name):
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file.attrs.update(format=f"speckle3d.{name}", version=1, patch_width_mm=5.0, signal="rf")
+        file["depth_mm"] = np.arange(3.0)
+        file["rms_mm"] = 0.25
+        file["speed/at_m_s"] = np.ones((2, 2))
+        file["speed"].attrs["centre_frequency_hz"] = 6e6
+    rows = values(tmp_path / "c.h5")
+    assert rows == {
+        "format": (f"speckle3d.{name}", ""),
+        "version": ("1", ""),
+        "patch width": ("5.0", "mm"),
+        "signal": ("rf", ""),
+        "depth": ("3", "mm"),
+        "rms": ("0.25", "mm"),
+        "speed, at": ("2 x 2", "m/s"),
+        "speed centre frequency": ("6000000.0", "Hz"),
+    }
+
+
+def test_an_unknown_member_of_the_family_is_refused(tmp_path):
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file.attrs["format"] = "speckle3d.recipe"
+    with pytest.raises(InvalidInputError, match=r"x\.h5: expected a format among .* got 'speckle3d\.recipe'"):
+        describe(tmp_path / "x.h5")
+
+
+def test_an_image_sequence_is_described_from_its_header(tmp_path):
+    rows = values(write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2]))
+    assert rows["size"] == ("5 x 4 x 3", "")
+    assert rows["spacing"] == ("unknown", "")
+    assert rows["image type"] == ("BRIGHTNESS", "")
+    assert rows["transforms"] == ("ProbeToTracker, ReferenceToTracker", "")
+    assert rows["time stamps"] == ("yes", "")

@@ -1,0 +1,388 @@
+import json
+import pickle
+import tracemalloc
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import sweep_examples
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.sweep import BModeSettings
+from speckle3d.io.sweep_writer import SweepWriter, write_sweep
+from speckle3d.io.sweeps import HDF5Frames, open_sweep, read_sweep
+
+
+@pytest.fixture
+def path(tmp_path):
+    target = tmp_path / "sweep.h5"
+    write_sweep(target, sweep_examples.rf_sweep())
+    return target
+
+
+def all_frames(sweep):
+    return np.stack([sweep.frames[i] for i in range(len(sweep))])
+
+
+def assert_same_sweep(got, expected):
+    np.testing.assert_array_equal(all_frames(got), all_frames(expected))
+    assert got.frames.dtype == expected.frames.dtype
+    assert (got.grid, got.signal) == (expected.grid, expected.signal)
+    np.testing.assert_array_equal(got.frame_time_s, expected.frame_time_s)
+    for ours, theirs in ((got.orientation, expected.orientation), (got.tracker, expected.tracker)):
+        np.testing.assert_array_equal(ours.readings.time_s, theirs.readings.time_s)
+        assert ours.time_offset_s == theirs.time_offset_s
+        # 1e-12: the poses go through a matrix or quaternion and back in double precision.
+        np.testing.assert_allclose(
+            ours.readings.world_from_sensor.as_matrix(),
+            theirs.readings.world_from_sensor.as_matrix(),
+            atol=1e-12,
+        )
+        np.testing.assert_allclose(
+            ours.sensor_from_image.as_matrix(), theirs.sensor_from_image.as_matrix(), atol=1e-12
+        )
+    np.testing.assert_allclose(got.truth.as_matrix(), expected.truth.as_matrix(), atol=1e-12)
+    np.testing.assert_array_equal(got.orientation.accelerometer_m_s2, expected.orientation.accelerometer_m_s2)
+    assert got.orientation.magnetometer_au is None
+
+
+@pytest.mark.parametrize("compression", ["gzip", "lzf", None])
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+def test_everything_a_sweep_carries_comes_back(tmp_path, dtype, compression):
+    sweep = sweep_examples.rf_sweep(dtype=dtype)
+    write_sweep(tmp_path / "s.h5", sweep, compression=compression)
+    with open_sweep(tmp_path / "s.h5") as got:
+        assert_same_sweep(got, sweep)
+
+
+def test_bmode_comes_back(tmp_path):
+    sweep = sweep_examples.bmode_sweep()
+    write_sweep(tmp_path / "s.h5", sweep)
+    got = read_sweep(tmp_path / "s.h5")
+    assert_same_sweep(got, sweep)
+    assert got.signal == BModeSettings(60.0, 250.0)
+
+
+def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file.attrs.update(format=np.bytes_(b"speckle3d.sweep"), version=1)
+        rf = file.create_dataset("rf", data=np.arange(24, dtype=">i2").reshape(2, 3, 4))
+        rf.attrs.update(sampling_rate_hz=40_000_000, vector_pitch_mm=[0.3], speed_of_sound_m_s=1540.0)
+        rf.attrs.update(first_sample_depth_mm=0, centre_frequency_hz=6e6, bandwidth_hz=[4e6, 8e6])
+        file["frame_time_s"] = [0.0, 0.04]
+        file["orientation/time_s"] = [0.0, 0.01]
+        file["orientation/quaternion_wxyz"] = [[1, 0, 0, 0], [1, 0, 0, 0]]
+        file["tracker/time_s"] = [0.0, 0.01, 0.02]
+        file["tracker/world_from_sensor"] = np.stack([np.eye(4), np.full((4, 4), np.nan), np.eye(4)])
+        file["tracker/valid"] = np.array([1, 0, 1], dtype=np.uint8)
+    sweep = read_sweep(tmp_path / "s.h5")
+    np.testing.assert_array_equal(all_frames(sweep), np.arange(24).reshape(2, 3, 4))
+    assert sweep.orientation.time_offset_s == 0.0
+    assert sweep.orientation.sensor_from_image is None
+    np.testing.assert_array_equal(sweep.tracker.readings.time_s, [0.0, 0.02])
+    assert sweep.truth is None
+
+
+def drop(*names):
+    def edit(file):
+        for name in names:
+            del file[name]
+
+    return edit
+
+
+def without_attribute(node, name):
+    return lambda file: file[node].attrs.__delitem__(name)
+
+
+def with_attribute(node, name, value):
+    return lambda file: file[node].attrs.__setitem__(name, value)
+
+
+def entry(node, index, value):
+    return lambda file: file[node].__setitem__(index, value)
+
+
+def replaced(node, value):
+    def edit(file):
+        kept = dict(file[node].attrs)
+        del file[node]
+        file[node] = value
+        file[node].attrs.update(kept)
+
+    return edit
+
+
+CORRUPTIONS = [
+    (drop("rf"), r"/: expected a data set rf or bmode, got neither"),
+    (drop("frame_time_s"), r"/frame_time_s: expected a data set, got none"),
+    (drop("orientation/time_s"), r"/orientation/time_s: expected a data set, got none"),
+    (drop("tracker/world_from_sensor"), r"/tracker/world_from_sensor: expected a data set, got none"),
+    (drop("truth/world_from_image"), r"/truth/world_from_image: expected a data set, got none"),
+    (replaced("rf", np.zeros((6, 5, 40))), r"/rf: expected samples of type int16 or float32, got float64"),
+    (replaced("rf", np.zeros((6, 200), np.int16)), r"/rf: expected shape \(frame, vector, sample\)"),
+    (replaced("rf", np.zeros((0, 5, 40), np.int16)), r"/rf: expected shape \(frame, vector, sample\)"),
+    (replaced("frame_time_s", np.arange(5.0)), r"/frame_time_s: expected shape \(6,\), got \(5,\)"),
+    (replaced("frame_time_s", [b"a"] * 6), r"/frame_time_s: expected numbers of type float64"),
+    (entry("frame_time_s", 3, np.nan), r"/frame_time_s\[3\]: expected a finite value"),
+    (entry("frame_time_s", 4, 10.0), r"/frame_time_s\[4\]: expected strictly increasing times"),
+    (entry("orientation/time_s", 7, 0.0), r"/orientation/time_s\[7\]: expected strictly increasing"),
+    (entry("tracker/time_s", 2, np.inf), r"/tracker/time_s\[2\]: expected a finite value"),
+    (entry("orientation/quaternion_wxyz", 5, [2, 0, 0, 0]), r"/quaternion_wxyz\[5\]: expected a unit"),
+    (entry("orientation/quaternion_wxyz", (5, 2), np.nan), r"/quaternion_wxyz\[\(5, 2\)\]: expected a fin"),
+    (
+        replaced("orientation/quaternion_wxyz", np.zeros((18, 3))),
+        r"/quaternion_wxyz: expected shape \(18, 4\)",
+    ),
+    (
+        entry("orientation/gyroscope_rad_s", (3, 1), np.nan),
+        r"/gyroscope_rad_s\[\(3, 1\)\]: expected a finite",
+    ),
+    (entry("tracker/world_from_sensor", (4, 0, 0), 9.0), r"/world_from_sensor\[4\]: expected a rigid"),
+    (entry("tracker/world_from_sensor", 4, np.diag([1, 1, -1, 1])), r"/world_from_sensor\[4\]: expected a r"),
+    (entry("truth/world_from_image", (2, 3, 3), 2.0), r"/truth/world_from_image\[2\]: expected a rigid"),
+    (entry("tracker/valid", slice(None), False), r"/tracker/valid: expected a valid sample, got none"),
+    (replaced("tracker/valid", np.ones(4, bool)), r"/tracker/valid: expected shape \(18,\), got \(4,\)"),
+    (without_attribute("rf", "vector_pitch_mm"), r"/rf: expected attribute vector_pitch_mm, got none"),
+    (with_attribute("rf", "vector_pitch_mm", 0.0), r"/rf: vector_pitch_mm: expected a value above zero"),
+    (with_attribute("rf", "sampling_rate_hz", -1.0), r"/rf: sampling_rate_hz: expected a value above zero"),
+    (with_attribute("rf", "sampling_rate_hz", "fast"), r"/rf attribute sampling_rate_hz: expected 1 number"),
+    (with_attribute("rf", "vector_pitch_mm", np.nan), r"/rf attribute vector_pitch_mm: expected finite"),
+    (with_attribute("rf", "bandwidth_hz", 4e6), r"/rf attribute bandwidth_hz: expected 2 number"),
+    (with_attribute("rf", "bandwidth_hz", [8e6, 4e6]), r"/rf: bandwidth_hz: expected 0 < low < high"),
+    (without_attribute("rf", "bandwidth_hz"), r"/rf: expected attribute bandwidth_hz, got none"),
+    (without_attribute("rf", "first_sample_depth_mm"), r"/rf: expected attribute first_sample_depth_mm"),
+    (
+        with_attribute("orientation", "sensor_from_image_wxyz", [1, 1, 0, 0]),
+        r"/orientation: .*unit quaternion",
+    ),
+    (with_attribute("tracker", "sensor_from_image", np.zeros((4, 4))), r"/tracker: .*rigid 4x4"),
+    (
+        with_attribute("tracker", "time_offset_s", np.nan),
+        r"/tracker attribute time_offset_s: expected finite",
+    ),
+    (with_attribute("/", "version", 2), r"expected speckle3d.sweep version 1, got 2"),
+    (
+        with_attribute("/", "format", "speckle3d.curves"),
+        r"expected format 'speckle3d.sweep', got 'speckle3d.c",
+    ),
+    (without_attribute("/", "format"), r"/: expected text attribute format, got none"),
+]
+
+
+@pytest.mark.parametrize(("edit", "message"), CORRUPTIONS, ids=[m for _, m in CORRUPTIONS])
+def test_what_is_wrong_is_named_in_one_line(path, edit, message):
+    with h5py.File(path, "r+") as file:
+        edit(file)
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        read_sweep(path)
+    assert str(path) in str(caught.value)
+    assert str(caught.value).count(str(path)) == 1
+    assert "\n" not in str(caught.value)
+
+
+def test_a_member_of_the_wrong_kind_is_named(path):
+    with h5py.File(path, "r+") as file:
+        del file["orientation"]
+        file["orientation"] = 1.0
+        del file["frame_time_s"]
+        file.create_group("frame_time_s")
+    with pytest.raises(InvalidInputError, match="/frame_time_s: expected a data set, got group"):
+        read_sweep(path)
+    with h5py.File(path, "r+") as file:
+        del file["frame_time_s"]
+        file["frame_time_s"] = np.arange(6.0)
+    with pytest.raises(InvalidInputError, match="/orientation: expected a group, got dataset"):
+        read_sweep(path)
+
+
+def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path):
+    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(dtype=np.float32))
+    with h5py.File(tmp_path / "s.h5", "r+") as file:
+        file["rf"][2, 1, 7] = np.nan
+    sweep = read_sweep(tmp_path / "s.h5")
+    sweep.frames[1], sweep.frames[3]
+    with pytest.raises(InvalidInputError, match=r"/rf\[2\]\[\(1, 7\)\]: expected a finite value"):
+        sweep.frames[2]
+
+
+@pytest.mark.parametrize("content", [b"", b"text", b"\x89HDF\r\n\x1a\n" + bytes(200)])
+def test_what_is_not_hdf5_is_a_file_error(tmp_path, content):
+    (tmp_path / "s.h5").write_bytes(content)
+    with pytest.raises(FileError, match=r"s\.h5: (expected an HDF5 file|cannot be opened)"):
+        read_sweep(tmp_path / "s.h5")
+
+
+def test_a_missing_file_and_a_folder_are_file_errors(tmp_path):
+    with pytest.raises(FileError, match="expected a file, got none"):
+        read_sweep(tmp_path / "none.h5")
+    with pytest.raises(FileError, match="expected a file, got a folder"):
+        read_sweep(tmp_path)
+
+
+@settings(deadline=None, max_examples=40)
+@given(kept=st.floats(0, 1, exclude_max=True))
+def test_a_truncated_file_is_a_file_error_wherever_it_ends(tmp_path_factory, kept):
+    folder = tmp_path_factory.mktemp("cut")
+    write_sweep(folder / "whole.h5", sweep_examples.rf_sweep())
+    whole = (folder / "whole.h5").read_bytes()
+    (folder / "cut.h5").write_bytes(whole[: int(kept * len(whole))])
+    with pytest.raises(FileError, match=r"cut\.h5: "):
+        read_sweep(folder / "cut.h5")
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_damaged_bytes_are_read_or_refused_but_never_a_surprise(tmp_path_factory, data):
+    # Only sample and stream data are damaged: HDF5's own structures are its library's to defend.
+    folder = tmp_path_factory.mktemp("damage")
+    write_sweep(folder / "s.h5", sweep_examples.rf_sweep(dtype=np.float32))
+    with h5py.File(folder / "s.h5") as file:
+        chunks = [file["rf"].id.get_chunk_info(i) for i in range(6)]
+        spans = [(c.byte_offset, c.size) for c in chunks]
+        clock = file["orientation/time_s"]
+        spans.append((clock.id.get_offset(), clock.id.get_storage_size()))
+    start, size = data.draw(st.sampled_from(spans))
+    content = bytearray((folder / "s.h5").read_bytes())
+    for _ in range(3):
+        content[start + data.draw(st.integers(0, size - 1))] = data.draw(st.integers(0, 255))
+    (folder / "s.h5").write_bytes(bytes(content))
+    try:
+        all_frames(read_sweep(folder / "s.h5"))
+    except Speckle3DError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - either outcome is right
+
+
+def test_reading_a_frame_touches_no_other(path):
+    with h5py.File(path) as file:
+        chunks = [file["rf"].id.get_chunk_info(i) for i in range(6)]
+    content = bytearray(path.read_bytes())
+    for chunk in chunks[:3] + chunks[4:]:
+        content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
+    path.write_bytes(bytes(content))
+    sweep = read_sweep(path)
+    np.testing.assert_array_equal(sweep.frames[3], sweep_examples.rf_sweep().frames[3])
+    with pytest.raises(FileError, match=r"/rf\[2\]: cannot be read"):
+        sweep.frames[2]
+
+
+def test_reading_frames_holds_no_more_than_a_few(tmp_path):
+    big = replace(sweep_examples.rf_sweep(60, 64, 1024), orientation=None, tracker=None)
+    write_sweep(tmp_path / "s.h5", big, compression=None)
+    sweep = read_sweep(tmp_path / "s.h5")
+    sweep.frames[0]
+    tracemalloc.start()
+    for i in range(len(sweep)):
+        sweep.frames[i]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 3 * big.frames[0].nbytes  # the sweep is 60 frames
+
+
+def test_frames_may_be_closed_indexed_and_sent_elsewhere(path):
+    frames = read_sweep(path).frames
+    assert isinstance(frames, HDF5Frames)
+    last = frames[-1]
+    frames.close()
+    frames.close()
+    np.testing.assert_array_equal(frames[np.int64(5)], last)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(frames))[5], last)
+    with pytest.raises(IndexError):
+        frames[6]
+    assert len(list(frames)) == 6
+
+
+def test_rewriting_keeps_unknown_groups(path, tmp_path):
+    with h5py.File(path, "r+") as file:
+        file["annotations/landmarks_mm"] = np.eye(3)
+        file["annotations"].attrs["by"] = "someone"
+        file.attrs["operator_note"] = "left arm"
+    write_sweep(path, replace(read_sweep(path), tracker=None))
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(file["annotations/landmarks_mm"], np.eye(3))
+        assert file["annotations"].attrs["by"] == "someone"
+        assert file.attrs["operator_note"] == "left arm"
+        assert "tracker" not in file
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_progress_counts_every_frame(tmp_path):
+    seen = []
+    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(), lambda done, total: seen.append((done, total)))
+    assert seen == [(i, 6) for i in range(1, 7)]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, SystemExit])
+def test_an_interrupted_writer_leaves_nothing(tmp_path, error):
+    def frames():
+        yield sweep_examples.rf_sweep().frames[0]
+        assert len(list(tmp_path.iterdir())) == 1
+        raise error
+
+    with pytest.raises(error):
+        append_all(tmp_path / "s.h5", frames(), [0.0, 1.0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_writer_leaves_the_old_file(path):
+    before = path.read_bytes()
+
+    def stop(done, total):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_sweep(path, sweep_examples.rf_sweep(seed=3), stop)
+    assert path.read_bytes() == before
+    assert len(list(path.parent.iterdir())) == 1
+
+
+def append_all(path, frames, times, **options):
+    sweep = sweep_examples.rf_sweep()
+    with SweepWriter(path, sweep.grid, sweep.signal, **options) as writer:
+        for frame, time_s in zip(frames, times, strict=True):
+            writer.append(frame, time_s)
+
+
+@pytest.mark.parametrize(
+    ("frames", "times", "options", "message"),
+    [
+        ([], [], {}, r"/rf: expected at least one frame, got none"),
+        (
+            [np.zeros((5, 39), np.int16)],
+            [0],
+            {},
+            r"/rf\[0\]: expected a frame of shape \(5, 40\), got \(5, 39\)",
+        ),
+        ([np.zeros((5, 40))], [0], {}, r"/rf\[0\]: expected samples of type int16, got float64"),
+        ([np.full((5, 40), np.nan)], [0], {"dtype": np.float32}, r"/rf\[0\]\[\(0, 0\)\]: expected a finite"),
+        ([np.zeros((5, 40), np.int16)] * 2, [1, 1], {}, r"/frame_time_s\[1\]: expected strictly increasing"),
+        ([], [], {"dtype": np.complex64}, r"expected rf samples of type int16 or float32, got complex64"),
+    ],
+)
+def test_the_writer_refuses_what_the_reader_would(tmp_path, frames, times, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        append_all(tmp_path / "s.h5", frames, times, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unwritable_place_is_a_file_error(tmp_path):
+    sweep = sweep_examples.rf_sweep()
+    with pytest.raises(FileError, match="expected an existing folder"):
+        write_sweep(tmp_path / "none" / "s.h5", sweep)
+    with pytest.raises(FileError, match="expected an ordinary file to write"):
+        write_sweep(tmp_path, sweep)
+
+
+def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
+    sweep = sweep_examples.rf_sweep()
+    with SweepWriter(tmp_path / "s.h5", sweep.grid, sweep.signal) as writer:
+        writer.append(sweep.frames[0], 0.0)
+        writer.write_simulation({"seed": 7, "preset": "tissue", "movement": {"length_mm": 40.0}})
+    assert len(read_sweep(tmp_path / "s.h5")) == 1
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert file["simulation"].attrs["seed"] == 7
+        assert json.loads(file["simulation"].attrs["movement"]) == {"length_mm": 40.0}

@@ -1,0 +1,48 @@
+"""Small sweeps with everything a sweep may carry."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+
+RF = RFSettings(
+    sampling_rate_hz=40e6, speed_of_sound_m_s=1540.0, centre_frequency_hz=6e6, bandwidth_hz=(4e6, 8e6)
+)
+
+
+def poses(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return RigidTransform.from_components(rng.normal(0, 5, (n, 3)), Rotation.random(n, rng=rng))
+
+
+def rf_sweep(frames=6, vectors=5, samples=40, dtype=np.int16, seed=0):
+    rng = np.random.default_rng(seed)
+    data = rng.normal(0, 1000, (frames, vectors, samples)).astype(dtype)
+    grid = ImageGrid(vectors, samples, 0.3, RF.sample_spacing_mm, 2.0)
+    m = 3 * frames
+    return Sweep(
+        frames=data,
+        grid=grid,
+        signal=RF,
+        frame_time_s=10.0 + 0.04 * np.arange(frames),
+        orientation=OrientationSensor(
+            TimedRotations(10.0 + 0.01 * np.arange(m), Rotation.random(m, rng=rng)),
+            sensor_from_image=Rotation.random(rng=rng),
+            time_offset_s=0.015,
+            accelerometer_m_s2=rng.normal(size=(m, 3)),
+            gyroscope_rad_s=rng.normal(size=(m, 3)),
+        ),
+        tracker=Tracker(TimedPoses(10.0 + 0.012 * np.arange(m), poses(m)), poses(1)[0], -0.02),
+        truth=poses(frames, seed=1),
+        name="example",
+    )
+
+
+def bmode_sweep(frames=4, columns=6, rows=9):
+    data = np.random.default_rng(0).integers(0, 256, (frames, columns, rows)).astype(np.uint8)
+    plain = rf_sweep(frames, columns, rows)
+    grid = ImageGrid(columns, rows, 0.085, 0.09, 0.0)
+    return replace(plain, frames=data, grid=grid, signal=BModeSettings(60.0, 250.0))
