@@ -1,0 +1,85 @@
+"""The whole configuration: one small model per stage, read from TOML, saved with every result."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import tomlkit
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.correction.drift import DriftSettings
+from speckle3d.motion.decorrelation import CurveSettings
+from speckle3d.motion.inplane import InPlaneSettings
+from speckle3d.motion.intensity import IntensitySettings
+from speckle3d.motion.patches import PatchSettings
+from speckle3d.motion.planes import PlaneSettings
+from speckle3d.motion.trajectory import TrajectorySettings
+
+
+class SensorSettings(BaseModel):
+    """How sensor streams are used."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    consistent_subset: bool = Field(
+        True, description="In mode `orientation`, drop distances that the sensed orientation contradicts."
+    )
+    smooth_s: float = Field(
+        0.2,
+        ge=0,
+        description="Standard deviation of the Gaussian that smooths sensed orientation for the subset.",
+    )
+    direction: int = Field(
+        0,
+        ge=-1,
+        le=1,
+        description="Sign of the first elevational motion; 0: from a sensor, or positive without one.",
+    )
+
+
+class Config(BaseModel):
+    """Every setting of a reconstruction."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    intensity: IntensitySettings = IntensitySettings()
+    patches: PatchSettings = PatchSettings()
+    inplane: InPlaneSettings = InPlaneSettings()
+    curves: CurveSettings = CurveSettings()
+    planes: PlaneSettings = PlaneSettings()
+    trajectory: TrajectorySettings = TrajectorySettings()
+    sensors: SensorSettings = SensorSettings()
+    drift: DriftSettings = DriftSettings()
+
+    def to_toml(self) -> str:
+        """Render as TOML text."""
+        return tomlkit.dumps(self.model_dump(mode="json"))
+
+
+def config_from_toml(text: str, where: str = "configuration") -> Config:
+    """Parse TOML; settings that are not given keep their defaults.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the setting that is unknown or out of range.
+    """
+    try:
+        return Config.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise InvalidInputError(f"{where}: {name}: {first['msg']}, got {first['input']!r}") from error
+
+
+def load_config(path: Path) -> Config:
+    """Read a configuration file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"{path}: {error.strerror}") from error
+    return config_from_toml(text, str(path))

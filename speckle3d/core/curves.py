@@ -1,0 +1,91 @@
+"""Decorrelation curves and what they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import BModeSettings, RFSettings
+
+
+@dataclass(frozen=True)
+class CurveKey:
+    """What curves belong to; reading a sweep with curves of another key is an error."""
+
+    signal: RFSettings | BModeSettings
+    vector_pitch_mm: float
+    patch_width_mm: float
+    patch_height_mm: float
+    equalise_mm: float
+
+    def require_same(self, other: CurveKey) -> None:
+        """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
+        for name, mine, theirs in _differing(self, other):
+            raise MismatchError(f"the curves do not match the sweep: {name} is {mine} and {theirs}")
+
+
+@dataclass(frozen=True)
+class DecorrelationCurves:
+    """Correlation of fully developed speckle against elevational distance, by depth.
+
+    Attributes
+    ----------
+    depth_mm : ndarray, shape (r,)
+        Increasing.
+    distance_mm : ndarray, shape (k,)
+        Increasing from zero.
+    correlation : ndarray, shape (r, k)
+        Decreasing along k.
+    cells : ndarray, shape (r,)
+        Independent speckle cells in a patch: Var(rho) = (1 - rho^2)^2 / cells.
+    """
+
+    key: CurveKey
+    depth_mm: FloatArray
+    distance_mm: FloatArray
+    correlation: FloatArray
+    cells: FloatArray
+    pairs_used: int = 0
+
+    def __post_init__(self) -> None:
+        if self.correlation.shape != (self.depth_mm.size, self.distance_mm.size):
+            raise InvalidInputError(
+                f"correlation: expected shape ({self.depth_mm.size}, {self.distance_mm.size}), "
+                f"got {self.correlation.shape}"
+            )
+        if not ((self.correlation > 0) & (self.correlation <= 1)).all():
+            raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
+        if (np.diff(self.correlation, axis=1) > 0).any():
+            raise InvalidInputError(
+                "correlation: expected curves that fall with distance, got one that rises"
+            )
+
+    def at(self, depth_mm: FloatArray) -> DecorrelationCurves:
+        """Curves at other depths, shape (p,), by linear interpolation of sqrt(-ln rho)."""
+        roots = np.sqrt(-np.log(self.correlation))
+        columns = [np.interp(depth_mm, self.depth_mm, column) for column in roots.T]
+        return DecorrelationCurves(
+            self.key,
+            np.asarray(depth_mm),
+            self.distance_mm,
+            np.exp(-(np.stack(columns, axis=1) ** 2)),
+            np.interp(depth_mm, self.depth_mm, self.cells),
+            self.pairs_used,
+        )
+
+
+def _differing(a: CurveKey, b: CurveKey) -> Iterable[tuple[str, object, object]]:
+    if type(a.signal) is not type(b.signal):
+        yield "signal", type(a.signal).__name__, type(b.signal).__name__
+        return
+    names = vars(a.signal).keys()
+    pairs = [(name, getattr(a.signal, name), getattr(b.signal, name)) for name in names]
+    own = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
+    pairs += [(name, getattr(a, name), getattr(b, name)) for name in own]
+    for name, mine, theirs in pairs:
+        if not np.allclose(np.asarray(mine, float), np.asarray(theirs, float), rtol=1e-3, atol=1e-9):
+            yield name, mine, theirs

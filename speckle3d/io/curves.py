@@ -1,0 +1,69 @@
+"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1)."""
+
+from __future__ import annotations
+
+import h5py
+
+from speckle3d.core.curves import CurveKey, DecorrelationCurves
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import BModeSettings, RFSettings
+from speckle3d.io.hdf5 import (
+    PathLike,
+    atomic_hdf5,
+    naming,
+    opened,
+    read_attribute,
+    read_checked,
+    read_text,
+    read_vector_attribute,
+)
+
+FORMAT = "speckle3d.curves"
+KEY_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
+
+
+def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
+    """Write curves, whole or not at all."""
+    with atomic_hdf5(path, FORMAT) as file:
+        for name in ("depth_mm", "distance_mm", "correlation", "cells"):
+            file[name] = getattr(curves, name)
+        file.attrs["pairs_used"] = curves.pairs_used
+        for name in KEY_NUMBERS:
+            file.attrs[name] = getattr(curves.key, name)
+        file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
+        for name, value in vars(curves.key.signal).items():
+            file.attrs[name] = value
+
+
+def read_curves(path: PathLike) -> DecorrelationCurves:
+    """Read curves, checked.
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        Naming the file and what in it is wrong.
+    """
+    with opened(path, FORMAT) as file, naming(str(path)):
+        depth = read_checked(file, "depth_mm", ("r",))
+        distance = read_checked(file, "distance_mm", ("k",))
+        correlation = read_checked(file, "correlation", (depth.size, distance.size))
+        cells = read_checked(file, "cells", (depth.size,))
+        key = CurveKey(_read_signal(file), *(read_attribute(file, name) for name in KEY_NUMBERS))
+        pairs = int(read_attribute(file, "pairs_used", 0))
+        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs)
+
+
+def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:
+    kind = read_text(file, "signal")
+    if kind == "bmode":
+        return BModeSettings(read_attribute(file, "dynamic_range_db"), read_attribute(file, "full_scale"))
+    if kind != "rf":
+        raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
+    band = read_vector_attribute(file, "bandwidth_hz", 2)
+    if band is None:
+        raise InvalidInputError("expected attribute bandwidth_hz, got none")
+    rate, speed, centre = (
+        read_attribute(file, name)
+        for name in ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
+    )
+    return RFSettings(rate, speed, centre, (float(band[0]), float(band[1])))

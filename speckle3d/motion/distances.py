@@ -1,0 +1,73 @@
+"""Correlation to unsigned elevational distance, with its standard deviation, per patch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.geometry import FloatArray
+from speckle3d.motion.patches import PatchGrid
+
+LEAST_CORRELATION = 0.03
+"""A patch that correlates less than this holds no distance at all."""
+TABLE_STEPS = 400
+
+
+@dataclass(frozen=True)
+class PatchDistances:
+    """Unsigned elevational distance of each patch between two frames.
+
+    Attributes
+    ----------
+    distance_mm, sigma_mm : ndarray, shape (p,)
+        NaN where a patch holds no distance.
+    """
+
+    distance_mm: FloatArray
+    sigma_mm: FloatArray
+
+
+class DistanceEstimator:
+    """Inverts decorrelation curves at the depths of a sweep's patches."""
+
+    def __init__(self, curves: DecorrelationCurves, patches: PatchGrid) -> None:
+        here = curves.at(patches.centre_mm[:, 1])
+        self._cells = here.cells
+        self._grid = curves.distance_mm
+        self._rho = here.correlation
+        root = np.sqrt(-np.log(here.correlation))
+        self._root_step = root.max() / (TABLE_STEPS - 1)
+        roots = np.arange(TABLE_STEPS) * self._root_step
+        # sqrt(-ln rho) is nearly straight in distance, so a uniform table of it inverts well.
+        self._distance = np.stack([np.interp(roots, row, self._grid) for row in root])
+
+    def distances(self, correlation: FloatArray) -> PatchDistances:
+        """Distance and standard deviation for one correlation per patch, shape (p,)."""
+        rho = np.where(correlation > LEAST_CORRELATION, np.minimum(correlation, 0.9999), np.nan)
+        with np.errstate(invalid="ignore"):
+            position = np.sqrt(-np.log(rho)) / self._root_step
+        cell = np.clip(np.nan_to_num(position), 0, TABLE_STEPS - 1.001).astype(int)
+        patch = np.arange(rho.size)
+        low, high = self._distance[patch, cell], self._distance[patch, cell + 1]
+        distance = low + np.clip(position - cell, 0, 1) * (high - low)
+        return PatchDistances(distance, np.where(np.isnan(rho), np.nan, self.sigma(distance)))
+
+    def sigma(self, distance_mm: FloatArray) -> FloatArray:
+        """Standard deviation of a distance estimate where the true distance is `distance_mm`, shape (p,).
+
+        From Var(rho) = (1 - rho^2)^2 / N for N independent cells and the curve's slope. Near zero the slope
+        vanishes; there it is the squared distance whose deviation stays finite.
+        """
+        step = self._grid[1]
+        position = np.clip(np.abs(np.nan_to_num(distance_mm)) / step, 0, self._grid.size - 2.001)
+        cell = position.astype(int)
+        patch = np.arange(cell.size)
+        low, high = self._rho[patch, cell], self._rho[patch, cell + 1]
+        rho = low + (position - cell) * (high - low)
+        slope = (low - high) / step
+        sigma_rho = (1 - rho**2) / np.sqrt(self._cells)
+        d = np.maximum(position * step, 1e-3)
+        direct = sigma_rho / np.maximum(slope, 1e-9)
+        return np.asarray(np.minimum(direct, np.sqrt(2 * d * direct)))

@@ -1,0 +1,237 @@
+"""In-plane motion of patches and of the whole frame, sub-sample in both directions.
+
+The shift comes from all patches together, and the correlation is read at that shift: taking each patch's own
+maximum over lags biases the correlation upward and distances short.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+from scipy import fft
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.kernels.correlation import patch_correlations
+from speckle3d.motion.intensity import Complex64Array, Float32Array
+from speckle3d.motion.patches import PatchGrid
+
+LEAST_CORRELATION = 0.05
+"""Below this at any lag, the logarithm is mostly noise; the parabola is then put through the coefficient."""
+
+
+class InPlaneSettings(BaseModel):
+    """How in-plane motion is searched."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    search_mm: float = Field(3.0, gt=0, description="Largest in-plane shift looked for between two frames.")
+    least_overlap: float = Field(
+        0.6, gt=0, le=1, description="Share of a patch that must still lie in the other image."
+    )
+    passes: int = Field(2, ge=1, le=5, description="How often lags are centred anew on the fitted motion.")
+
+
+@dataclass(frozen=True)
+class InPlaneMotion:
+    """Motion of the second frame in the first frame's plane, about the image's centre.
+
+    Attributes
+    ----------
+    x_mm, y_mm : float
+        Displacement of the image's centre.
+    roll_rad : float
+    covariance : ndarray, shape (3, 3)
+        Of (x, y, roll).
+    """
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    roll_rad: float = 0.0
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class PatchMatch:
+    """What two frames' patches have in common once in-plane motion is taken out.
+
+    Attributes
+    ----------
+    correlation : ndarray, shape (p,)
+        Of intensity, at the frame's in-plane shift; NaN where a patch left the image or is flat.
+    shift_mm : ndarray, shape (p, 2)
+        Each patch's own shift, lateral and axial; NaN where it has no peak.
+    motion : InPlaneMotion
+    """
+
+    correlation: FloatArray
+    shift_mm: FloatArray
+    motion: InPlaneMotion
+
+
+class CoarseMatcher:
+    """Whole-frame cross-correlation by FFT: the shift to the nearest sample, without a first guess."""
+
+    def __init__(self, grid: ImageGrid, search_mm: float) -> None:
+        # Axial samples are pooled to about a third of the speckle's length: faster, and no peak is lost.
+        self._pool = max(1, int(0.1 / grid.sample_spacing_mm))
+        self._reach = (
+            int(np.ceil(search_mm / grid.vector_pitch_mm)),
+            int(np.ceil(search_mm / (grid.sample_spacing_mm * self._pool))),
+        )
+        rows = min(self._reach[0], grid.vectors - 1)
+        columns = min(self._reach[1], grid.samples // self._pool - 1)
+        self._reach = (rows, columns)
+        self._shape = (
+            fft.next_fast_len(grid.vectors + rows, real=True),
+            fft.next_fast_len(grid.samples // self._pool + columns, real=True),
+        )
+
+    def spectrum(self, image: Float32Array) -> Complex64Array:
+        """Transform one frame; keep the result for every pair the frame is in."""
+        usable = image.shape[1] // self._pool * self._pool
+        pooled = image[:, :usable].reshape(image.shape[0], -1, self._pool).mean(axis=2)
+        pooled -= pooled.mean()
+        return np.asarray(fft.rfft2(pooled, self._shape))
+
+    def shift(self, fixed: Complex64Array, moving: Complex64Array) -> npt.NDArray[np.int64]:
+        """Vectors and samples by which `moving` is displaced, shape (2,)."""
+        product = fft.irfft2(np.conj(fixed) * moving, self._shape)
+        rows, columns = self._reach
+        near = np.roll(product, (rows, columns), axis=(0, 1))[: 2 * rows + 1, : 2 * columns + 1]
+        peak = np.unravel_index(np.argmax(near), near.shape)
+        return np.array([peak[0] - rows, (peak[1] - columns) * self._pool], dtype=np.int64)
+
+
+def match_patches(
+    fixed: Float32Array,
+    moving: Float32Array,
+    patches: PatchGrid,
+    start: InPlaneMotion,
+    centre_mm: FloatArray,
+    settings: InPlaneSettings | None = None,
+) -> PatchMatch:
+    """Find the in-plane motion between two frames and the correlation left at it.
+
+    Parameters
+    ----------
+    fixed, moving : ndarray of float32, shape (vector, sample)
+        Equalised intensity.
+    patches : PatchGrid
+    start : InPlaneMotion
+        Right to about a sample, e.g. from `CoarseMatcher` or from the step before.
+    centre_mm : ndarray, shape (3,)
+        The image's centre.
+
+    References
+    ----------
+    .. [1] Housden et al., "Subsample interpolation strategies for sensorless freehand 3D ultrasound",
+       Ultrasound Med. Biol. 32(12), 2006: sub-sample lateral motion must not read as elevation.
+    """
+    if fixed.shape != moving.shape:
+        raise InvalidInputError(f"expected two frames of one shape, got {fixed.shape} and {moving.shape}")
+    s = settings or InPlaneSettings()
+    at = patches.centre_mm - centre_mm[:2]
+    predicted = _shift_field(start, at)
+    for _ in range(s.passes):
+        lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
+        rho = np.empty((len(patches), 3, 3))
+        patch_correlations(fixed, moving, patches.first, patches.size, lag, s.least_overlap, rho)
+        shift, weight = _patch_peaks(rho, lag, patches)
+        motion, predicted = _fit_motion(shift, weight, at, start, predicted)
+    correlation = _read_at(rho, predicted / patches.spacing_mm - lag)
+    return PatchMatch(correlation, shift, motion)
+
+
+def _shift_field(motion: InPlaneMotion, at: FloatArray) -> FloatArray:
+    """Where each point of the first frame, `at` mm from the centre, is found in the second, less itself."""
+    c, s = np.cos(motion.roll_rad), np.sin(motion.roll_rad)
+    moved = at - [motion.x_mm, motion.y_mm]
+    return np.asarray(moved @ np.array([[c, -s], [s, c]]) - at)
+
+
+def _patch_peaks(
+    rho: FloatArray, lag: npt.NDArray[np.int64], patches: PatchGrid
+) -> tuple[FloatArray, FloatArray]:
+    """Sub-sample peak of each patch from parabolas through ln(rho), and how much it is worth."""
+    values = _logarithm_or_self(rho)
+    offset = np.stack(
+        [
+            _vertex(values[:, 0, 1], values[:, 1, 1], values[:, 2, 1]),
+            _vertex(values[:, 1, 0], values[:, 1, 1], values[:, 1, 2]),
+        ],
+        axis=1,
+    )
+    peak = np.clip(rho[:, 1, 1], 0.0, 0.999)
+    # Variance of a peak's place goes as (1 - rho^2) / rho^2 (Walker & Trahey 1995).
+    weight = np.where(np.isfinite(offset).all(axis=1), peak**2 / (1 - peak**2), 0.0)
+    weight = np.where(np.abs(offset).max(axis=1) <= 1.5, weight, 0.0)
+    return (lag + offset) * patches.spacing_mm, np.nan_to_num(weight)
+
+
+def _logarithm_or_self(rho: FloatArray) -> FloatArray:
+    """ln(rho) of patches whose every lag is well above zero; else rho itself."""
+    sound = np.nanmin(np.where(np.isnan(rho), np.inf, rho), axis=(1, 2)) > LEAST_CORRELATION
+    return np.where(sound[:, None, None], np.log(np.maximum(rho, LEAST_CORRELATION)), rho)
+
+
+def _vertex(before: FloatArray, at: FloatArray, after: FloatArray) -> FloatArray:
+    curvature = before - 2 * at + after
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(curvature < 0, (before - after) / (2 * curvature), np.nan)
+
+
+def _fit_motion(
+    shift: FloatArray, weight: FloatArray, at: FloatArray, start: InPlaneMotion, predicted: FloatArray
+) -> tuple[InPlaneMotion, FloatArray]:
+    """Rigid motion by robust least squares, and the smooth (affine) field to read correlations at."""
+    good = weight > 0
+    if good.sum() < 3:
+        return start, predicted
+    p, d, w = at[good], shift[good], weight[good]
+    rigid = np.zeros((2 * p.shape[0], 3))
+    rigid[0::2, 0] = rigid[1::2, 1] = -1.0
+    # Turning the second frame by roll moves the first frame's points by -roll in it.
+    rigid[0::2, 2], rigid[1::2, 2] = p[:, 1], -p[:, 0]
+    solution, covariance = _robust_fit(rigid, d.ravel(), np.repeat(w, 2))
+    motion = InPlaneMotion(float(solution[0]), float(solution[1]), float(solution[2]), covariance)
+    affine = np.column_stack([np.ones(len(p)), p])
+    if np.linalg.matrix_rank(affine) < 3 or good.sum() < 9:
+        return motion, _shift_field(motion, at)
+    everywhere = np.column_stack([np.ones(len(at)), at])
+    smooth = [everywhere @ _robust_fit(affine, d[:, k], w)[0] for k in range(2)]
+    return motion, np.stack(smooth, axis=1)
+
+
+def _robust_fit(
+    design: FloatArray, data: FloatArray, weight: FloatArray, rounds: int = 5
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted least squares with Huber weights at 1.5 robust standard deviations."""
+    robust = np.ones_like(weight)
+    for _ in range(rounds):
+        w = weight * robust
+        normal = design.T @ (design * w[:, None])
+        inverse = np.linalg.pinv(normal, hermitian=True)
+        solution = inverse @ (design.T @ (w * data))
+        size = np.abs(data - design @ solution) * np.sqrt(weight)
+        scale = 1.4826 * np.median(size) + 1e-12
+        robust = np.minimum(1.0, 1.5 * scale / np.maximum(size, 1e-12))
+    return solution, inverse * scale**2
+
+
+def _read_at(rho: FloatArray, offset: FloatArray) -> FloatArray:
+    """Correlation a fraction of a lag off the centre, by quadratics through ln(rho) in both directions."""
+    lateral, axial = (_quadratic_weights(np.clip(offset[:, k], -1.0, 1.0)) for k in range(2))
+    sound = np.nan_to_num(rho, nan=1.0).min(axis=(1, 2)) > LEAST_CORRELATION
+    log_value = np.einsum("pi,pj,pij->p", lateral, axial, np.log(np.maximum(rho, LEAST_CORRELATION)))
+    value = np.einsum("pi,pj,pij->p", lateral, axial, rho)
+    return np.asarray(np.where(sound, np.exp(log_value), value))
+
+
+def _quadratic_weights(t: FloatArray) -> FloatArray:
+    """Weights of the values at -1, 0 and 1 in the parabola through them, read at t; shape (p, 3)."""
+    return np.stack([t * (t - 1) / 2, 1 - t * t, t * (t + 1) / 2], axis=1)

@@ -1,0 +1,170 @@
+"""Frames to echo intensity: zero-phase band-pass, analytic signal, squared magnitude.
+
+Intensity, not amplitude, is what is correlated later: for fully developed speckle its correlation is the
+squared magnitude of the complex one. The analytic signal is band-limited, so it is resampled on the way back
+from the frequency domain to the coarsest rate that still holds the intensity's bandwidth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+from scipy import fft, ndimage
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+
+Float32Array = npt.NDArray[np.float32]
+Complex64Array = npt.NDArray[np.complex64]
+
+
+class IntensitySettings(BaseModel):
+    """How frames become intensity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    edge_fraction: float = Field(
+        0.1, gt=0, le=0.5, description="Width of each raised-cosine band edge over the bandwidth."
+    )
+    equalise_mm: float = Field(
+        2.0,
+        ge=0,
+        description="Side of the window whose mean is divided out before correlation; 0: none.",
+    )
+
+
+@dataclass(frozen=True)
+class _Resampling:
+    """Fourier bins of the band and where they go in the shorter inverse transform."""
+
+    length: int
+    short_length: int
+    decimation: int
+    first_bin: int
+    weights: Float32Array
+    destination: npt.NDArray[np.intp]
+
+
+class IntensityExtractor:
+    """Makes intensity images of one sweep's frames.
+
+    Attributes
+    ----------
+    grid : ImageGrid
+        Where the intensity samples lie; coarser in depth than the RF samples.
+    """
+
+    def __init__(
+        self, signal: RFSettings | BModeSettings, grid: ImageGrid, settings: IntensitySettings | None = None
+    ) -> None:
+        self.settings = settings or IntensitySettings()
+        self.signal = signal
+        self.grid = grid
+        self._frame_shape = (grid.vectors, grid.samples)
+        self._plan: _Resampling | None = None
+        if isinstance(signal, RFSettings):
+            self._plan = _plan_resampling(signal, grid.samples, self.settings.edge_fraction)
+            step = self._plan.decimation
+            self.grid = replace(
+                grid, samples=-(-grid.samples // step), sample_spacing_mm=grid.sample_spacing_mm * step
+            )
+
+    @classmethod
+    def for_sweep(cls, sweep: Sweep, settings: IntensitySettings | None = None) -> IntensityExtractor:
+        """Plan for the frames of `sweep`."""
+        return cls(sweep.signal, sweep.grid, settings)
+
+    def analytic(self, frame: npt.NDArray[Any]) -> Complex64Array:
+        """Band-passed analytic signal about the band's centre, resampled in depth.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (vector, sample)
+            RF samples, real, or analytic samples, complex.
+
+        Returns
+        -------
+        ndarray of complex64, shape (vector, grid.samples)
+
+        Raises
+        ------
+        InvalidInputError
+            If the frame has another shape, or the sweep holds B-mode images.
+        """
+        if self._plan is None:
+            raise InvalidInputError("expected RF frames, got B-mode images: there is no phase to recover")
+        self._check(frame)
+        return _resample(frame, self._plan, self.grid.samples)
+
+    def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
+        """Echo intensity, shape (vector, grid.samples), arbitrary units, from RF or B-mode grey levels."""
+        if isinstance(self.signal, BModeSettings):
+            self._check(frame)
+            return _decompress(frame, self.signal)
+        a = self.analytic(frame)
+        return np.asarray(a.real * a.real + a.imag * a.imag)
+
+    def equalise(self, intensity: Float32Array) -> Float32Array:
+        """Divide out the local mean, so that echogenicity does not read as speckle that stays.
+
+        Brightness that varies within a patch correlates between frames whatever the probe did.
+        """
+        if self.settings.equalise_mm == 0:
+            return intensity
+        sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
+        size = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
+        mean = ndimage.uniform_filter(intensity, size=size, mode="nearest")
+        floor = np.float32(1e-9) * mean.max() + np.finfo(np.float32).tiny
+        return np.asarray(intensity / np.maximum(mean, floor), dtype=np.float32)
+
+    def _check(self, frame: npt.NDArray[Any]) -> None:
+        if frame.shape != self._frame_shape:
+            raise InvalidInputError(f"expected a frame of shape {self._frame_shape}, got {frame.shape}")
+
+
+def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> _Resampling:
+    low, high = signal.bandwidth_hz
+    edge = edge_fraction * (high - low)
+    # Intensity holds frequencies up to the whole pass-band's width on either side of zero.
+    decimation = max(1, int(signal.sampling_rate_hz / (2 * (high - low + 2 * edge))))
+    padding = int(2 * signal.sampling_rate_hz / edge)
+    short = fft.next_fast_len(-(-(samples + padding) // decimation))
+    length = short * decimation
+    frequency = np.arange(length // 2 + 1) * signal.sampling_rate_hz / length
+    weights = _band_weights(frequency, low, high, edge)
+    bins = np.flatnonzero(weights)[:short]
+    destination = (bins - bins[bins.size // 2]) % short
+    # Two for the analytic signal, one over `decimation` for the shorter inverse transform.
+    scale = 2.0 / decimation
+    return _Resampling(
+        length, short, decimation, int(bins[0]), (scale * weights[bins]).astype(np.float32), destination
+    )
+
+
+def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:
+    """One inside the band, raised-cosine edges outside it."""
+    outside = np.maximum(low - frequency, frequency - high)
+    return np.asarray(np.where(outside < edge, np.cos(np.pi / 2 * np.clip(outside / edge, 0, 1)) ** 2, 0.0))
+
+
+def _resample(frame: npt.NDArray[Any], plan: _Resampling, samples: int) -> Complex64Array:
+    if np.iscomplexobj(frame):
+        # Analytic data carry their signal in the positive frequencies alone, at twice the real signal's.
+        spectrum = fft.fft(frame.astype(np.complex64, copy=False), plan.length, axis=1) / 2
+    else:
+        spectrum = fft.rfft(frame.astype(np.float32, copy=False), plan.length, axis=1)
+    band = spectrum[:, plan.first_bin : plan.first_bin + plan.weights.size] * plan.weights
+    short = np.zeros((frame.shape[0], plan.short_length), dtype=np.complex64)
+    short[:, plan.destination] = band
+    return np.asarray(fft.ifft(short, axis=1, overwrite_x=True)[:, :samples])
+
+
+def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
+    """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
+    decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
+    return np.asarray(10 ** (decibel / 10), dtype=np.float32)

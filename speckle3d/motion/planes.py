@@ -1,0 +1,143 @@
+"""A plane through the patches' distances: the second frame seen from the first.
+
+z(x, y) = a + b (x - xc) + c (y - yc) for points of the second frame, about the image's centre, where
+b = R31 and c = R32 of the relative rotation. Distances are unsigned; the plane returned has a >= 0 and
+its sign is settled by the trajectory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from speckle3d.core.geometry import FloatArray
+from speckle3d.motion.distances import DistanceEstimator, PatchDistances
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+class PlaneSettings(BaseModel):
+    """How planes are fitted."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    bias_mm: float = Field(
+        0.02,
+        ge=0,
+        description="Error common to a pair's distances that no number of patches averages out; it keeps "
+        "tiny separations from outweighing long ones.",
+    )
+    huber: float = Field(1.5, gt=0, description="Standard deviations at which a patch begins to lose weight.")
+    support_sigma: float = Field(
+        1.0, gt=0, description="Threshold of the orientation-consistent subset, standard deviations."
+    )
+
+
+@dataclass(frozen=True)
+class PairPlane:
+    """Plane of one frame pair.
+
+    Attributes
+    ----------
+    offset_mm, slope_x, slope_y : float
+        a, b and c.
+    covariance : ndarray, shape (3, 3)
+        Of (a, b, c).
+    used : ndarray of bool, shape (p,)
+        Patches that took part.
+    """
+
+    offset_mm: float
+    slope_x: float
+    slope_y: float
+    covariance: FloatArray
+    used: BoolArray
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """(a, b, c)."""
+        return np.array([self.offset_mm, self.slope_x, self.slope_y])
+
+
+def fit_plane(
+    distances: PatchDistances,
+    estimator: DistanceEstimator,
+    at_mm: FloatArray,
+    settings: PlaneSettings | None = None,
+    subset: BoolArray | None = None,
+) -> PairPlane | None:
+    """Robust weighted least squares; None if fewer than six patches can take part.
+
+    Each patch is weighted by the deviation expected at the plane's distance, not at its own: weights
+    taken from the estimates themselves favour those that came out short.
+
+    Parameters
+    ----------
+    at_mm : ndarray, shape (p, 2)
+        Patch centres less the image's centre.
+    subset : ndarray of bool, shape (p,), optional
+        Patches allowed to take part.
+    """
+    s = settings or PlaneSettings()
+    d = distances.distance_mm
+    used = np.isfinite(d) if subset is None else np.isfinite(d) & subset
+    if used.sum() < 6:
+        return None
+    design = np.column_stack([np.ones(len(d)), at_mm])
+    predicted = np.full(len(d), np.median(d[used]))
+    robust = np.ones(len(d))
+    data = np.nan_to_num(d)
+    for _ in range(5):
+        sigma = estimator.sigma(predicted)
+        weight = used * robust / sigma**2
+        inverse = np.linalg.pinv(design.T @ (design * weight[:, None]), hermitian=True)
+        plane = inverse @ (design.T @ (weight * data))
+        predicted = design @ plane
+        size = np.abs(data - predicted) / sigma
+        robust = np.minimum(1.0, s.huber / np.maximum(size, 1e-9))
+    excess = max(1.0, float((weight * (data - predicted) ** 2).sum() / max(used.sum() - 3, 1)))
+    covariance = np.asarray(inverse * excess, dtype=float)
+    covariance[0, 0] += s.bias_mm**2
+    if plane[0] < 0:
+        plane = -plane
+    return PairPlane(float(plane[0]), float(plane[1]), float(plane[2]), covariance, used)
+
+
+def consistent_subset(
+    distances: PatchDistances, at_mm: FloatArray, slopes: FloatArray, settings: PlaneSettings | None = None
+) -> BoolArray:
+    """Patches whose distances agree on one plane of the orientation that the sensor measured.
+
+    Every patch in turn places the plane, through +d and through -d; the placement that most others agree
+    with, in magnitude and within `support_sigma` of their own deviations, keeps its supporters.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (2,)
+        R31 and R32 of the relative rotation from the sensor.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, "Sensorless drift correction using
+       orientation measurements", figure 4.
+    """
+    s = settings or PlaneSettings()
+    d, sigma = distances.distance_mm, distances.sigma_mm
+    known = np.flatnonzero(np.isfinite(d))
+    support = np.zeros(len(d), dtype=bool)
+    if known.size == 0:
+        return support
+    tilt = at_mm[known] @ slopes
+    offsets = np.concatenate([d[known] - tilt, -d[known] - tilt])
+    distance = np.abs(offsets[:, None] + tilt)
+    error = np.abs(distance - d[known]) / sigma[known]
+    agree = error <= s.support_sigma
+    # Among placements of equal support, the one whose supporters lie closest.
+    score = agree.sum(axis=1) - np.where(agree, error, 0.0).sum(axis=1) / (
+        agree.shape[1] * s.support_sigma + 1
+    )
+    support[known] = agree[int(np.argmax(score))]
+    return support

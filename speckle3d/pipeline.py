@@ -1,0 +1,398 @@
+"""The stages in order, streaming: RF sweep in, poses of every frame out.
+
+RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma -> plane per frame pair
+(orientation-consistent subset) -> graph of relative poses -> trajectory -> drift correction.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.config import Config
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.reconstruction import FramePairs
+from speckle3d.core.sweep import Sweep
+from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.motion.distances import DistanceEstimator, PatchDistances
+from speckle3d.motion.inplane import InPlaneMotion
+from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.motion.planes import PairPlane, consistent_subset, fit_plane
+from speckle3d.motion.trajectory import (
+    PairMeasurement,
+    PairSchedule,
+    SignedPair,
+    SignResolver,
+    sign_pair,
+    solve_trajectory,
+)
+
+Progress = Callable[[int, int], None]
+"""Called with frames done and frames in all."""
+PairSink = Callable[[FramePairs], None]
+"""Called with the pairs of some frames at a time, in order."""
+
+
+@dataclass
+class StageTimes:
+    """Seconds spent in each stage; reading and intensity overlap with the rest on another core."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def add(self, stage: str, since: float) -> float:
+        """Book the time since `since` on `stage`; returns now."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - since
+        return now
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What the image-based stages found.
+
+    Attributes
+    ----------
+    image : RigidTransform, length n
+        Poses from all patches.
+    subset : RigidTransform, length n, or None
+        Poses from the orientation-consistent patches.
+    rejected_share : float
+        Share of measured patches outside the consistent subset; NaN without one.
+    unreliable : ndarray of int
+        Frames that no reliable pair joins to an earlier one.
+    direction_from : str
+        What settled the sign of the elevational motion.
+    """
+
+    image: RigidTransform
+    subset: RigidTransform | None
+    rejected_share: float
+    unreliable: tuple[int, ...]
+    pairs: int
+    direction: int
+    direction_from: str
+    times: StageTimes
+
+
+@dataclass(frozen=True)
+class _MeasuredPair:
+    """One pair with everything later stages and the file want of it."""
+
+    pair: PairMeasurement
+    distances: PatchDistances
+    subset_plane: PairPlane | None
+    reliable: bool
+
+
+def track(
+    sweep: Sweep,
+    curves: DecorrelationCurves,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    sink: PairSink | None = None,
+) -> Tracked:
+    """Estimate the pose of every frame from the images, and from the orientation-consistent patches if asked.
+
+    Raises
+    ------
+    MismatchError
+        If the curves belong to another probe, frequency, sampling or patch size.
+    InsufficientDataError
+        If frames have no speckle in common.
+    """
+    settings = config or Config()
+    matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane)
+    curves.key.require_same(matcher.key)
+    walk = _Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
+    for frame, ready in enumerate(_prefetch(sweep, matcher, walk.times)):
+        measured = walk.advance(frame, ready)
+        if sink and measured:
+            sink(walk.table(measured))
+        if progress:
+            progress(frame + 1, len(sweep))
+    return walk.finish()
+
+
+class _Walk:
+    """The state carried from frame to frame."""
+
+    def __init__(
+        self, sweep: Sweep, matcher: FrameMatcher, estimator: DistanceEstimator, config: Config
+    ) -> None:
+        self.sweep, self.matcher, self.estimator, self.config = sweep, matcher, estimator, config
+        self.times = StageTimes()
+        self._schedule = PairSchedule(config.trajectory)
+        self._signs = SignResolver()
+        self._ready: dict[int, ReadyFrame] = {}
+        self._motion: dict[int, InPlaneMotion] = {0: InPlaneMotion()}
+        self._sensed = sensed_orientation(sweep, config)
+        self._image_pairs: list[SignedPair] = []
+        self._subset_pairs: list[SignedPair] = []
+        self._counted, self._rejected = 0, 0
+        self._unreliable: list[int] = []
+        self._latest_signs = np.ones(0)
+
+    def advance(self, frame: int, ready: ReadyFrame) -> list[_MeasuredPair]:
+        """Measure a frame against its references, place it, and let go of what is no longer needed."""
+        self._ready[frame] = ready
+        references = self._schedule.references(frame)
+        measured = [self._measure(first, frame) for first in references]
+        usable = self._usable(frame, [m for m in measured if m is not None])
+        self._schedule.settle(frame, {m.pair.first: m.pair.correlation for m in measured if m is not None})
+        if usable:
+            self._join(usable)
+        keep = self._schedule.needed(frame)
+        self._signs.forget(keep)
+        self._ready = {k: v for k, v in self._ready.items() if k in keep}
+        self._motion = {k: v for k, v in self._motion.items() if k in keep}
+        return usable
+
+    def _usable(self, frame: int, measured: list[_MeasuredPair]) -> list[_MeasuredPair]:
+        reliable = [m for m in measured if m.reliable]
+        if reliable or frame == 0:
+            return reliable
+        if not measured:
+            raise InsufficientDataError(
+                f"{self.sweep.name}: frame {frame}: expected speckle in common with frame {frame - 1}, "
+                "found none"
+            )
+        self._unreliable.append(frame)
+        return [max(measured, key=lambda m: m.pair.correlation)]
+
+    def _measure(self, first: int, second: int) -> _MeasuredPair | None:
+        then = time.perf_counter()
+        fixed, moving = self._ready[first], self._ready[second]
+        if second not in self._motion:
+            self._motion[second] = compose(self._motion[first], self.matcher.search(fixed, moving))
+        start = compose(inverse(self._motion[first]), self._motion[second])
+        match = self.matcher.match(fixed, moving, start)
+        if second - first == 1:
+            self._motion[second] = compose(self._motion[first], match.motion)
+        then = self.times.add("in-plane motion and correlation", then)
+        distances = self.estimator.distances(match.correlation)
+        plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes)
+        subset = self._subset(first, second, distances)
+        self.times.add("distances and planes", then)
+        if plane is None:
+            return None
+        correlation = float(np.nanmedian(match.correlation))
+        reliable = correlation >= self.config.trajectory.least_correlation
+        pair = PairMeasurement(first, second, match.motion, plane, correlation)
+        return _MeasuredPair(pair, distances, subset, reliable)
+
+    def _subset(self, first: int, second: int, distances: PatchDistances) -> PairPlane | None:
+        if self._sensed is None:
+            return None
+        relative = (self._sensed[first].inv() * self._sensed[second]).as_matrix()
+        support = consistent_subset(distances, self.matcher.at_mm, relative[2, :2], self.config.planes)
+        plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes, support)
+        known = np.isfinite(distances.distance_mm)
+        if plane is not None:
+            self._counted += int(known.sum())
+            self._rejected += int((known & ~support).sum())
+        return plane
+
+    def _join(self, usable: list[_MeasuredPair]) -> None:
+        then = time.perf_counter()
+        signs = self._signs.place([m.pair for m in usable])
+        self._latest_signs = signs
+        for m, sign in zip(usable, signs, strict=True):
+            self._image_pairs.append(sign_pair(m.pair, m.pair.plane, sign))
+            if self._sensed is not None:
+                self._subset_pairs.append(sign_pair(m.pair, m.subset_plane or m.pair.plane, sign))
+        self.times.add("trajectory", then)
+
+    def table(self, measured: list[_MeasuredPair]) -> FramePairs:
+        """Rows for the reconstruction file, of the pairs joined last."""
+        signed = self._image_pairs[-len(measured) :]
+        centre = RigidTransform.from_translation(self.matcher.centre_mm)
+        poses = [(centre * s.pose * centre.inv()).as_matrix() for s in signed]
+        planes = [m.subset_plane or m.pair.plane for m in measured]
+        return FramePairs(
+            first=np.array([s.first for s in signed]),
+            second=np.array([s.second for s in signed]),
+            first_from_second=np.array(poses),
+            covariance=np.array([s.covariance for s in signed]),
+            distance_mm=np.array([m.distances.distance_mm for m in measured], dtype=np.float32),
+            sigma_mm=np.array([m.distances.sigma_mm for m in measured], dtype=np.float32),
+            used=np.array([plane.used for plane in planes]),
+            patch_centre_mm=self.matcher.patches.centre_mm,
+        )
+
+    def finish(self) -> Tracked:
+        """Solve the trajectory over all pairs and settle the overall sign."""
+        then = time.perf_counter()
+        frames, centre = len(self.sweep), self.matcher.centre_mm
+        image = solve_trajectory(self._image_pairs, frames, centre, self.config.trajectory)
+        subset = None
+        if self._sensed is not None:
+            subset = solve_trajectory(self._subset_pairs, frames, centre, self.config.trajectory)
+        direction, source = settle_direction(self.sweep, image, self.config)
+        if direction < 0:
+            image, subset = mirrored(image), mirrored(subset) if subset is not None else None
+        self.times.add("trajectory", then)
+        share = self._rejected / self._counted if self._counted else float("nan")
+        return Tracked(
+            image,
+            subset,
+            share,
+            tuple(self._unreliable),
+            len(self._image_pairs),
+            direction,
+            source,
+            self.times,
+        )
+
+
+def correct(
+    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
+) -> dict[str, DriftCorrection]:
+    """Correct the drift of the image-based poses in each of `modes`.
+
+    Raises
+    ------
+    InsufficientDataError
+        If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
+    """
+    settings = config or Config()
+    done: dict[str, DriftCorrection] = {}
+    for mode in modes:
+        if mode == "pose":
+            done[mode] = _correct_by_tracker(tracked.image, sweep, settings)
+        elif mode == "orientation":
+            start = tracked.subset if tracked.subset is not None else tracked.image
+            done[mode] = _correct_by_orientation(start, sweep, settings)
+        else:
+            raise InvalidInputError(f"expected a drift mode among orientation, pose; got {mode!r}")
+    return done
+
+
+def _correct_by_tracker(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
+    if sweep.tracker is None:
+        raise InsufficientDataError(
+            f"{sweep.name}: drift mode pose: expected a tracker in /tracker, got none"
+        )
+    covered = sweep.tracker.covers(sweep.frame_time_s)
+    if not covered.any():
+        raise InsufficientDataError(f"{sweep.name}: drift mode pose: no tracker reading covers any frame")
+    measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
+    return correct_pose(poses, measured, covered, sweep.grid.corners_mm, config.drift)
+
+
+def _correct_by_orientation(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
+    if sweep.orientation is None and sweep.tracker is None:
+        raise InsufficientDataError(
+            f"{sweep.name}: drift mode orientation: expected an orientation sensor in /orientation, got none"
+        )
+    sensor = sweep.orientation or sweep.tracker
+    assert sensor is not None
+    covered = sensor.covers(sweep.frame_time_s)
+    if not covered.any():
+        raise InsufficientDataError(
+            f"{sweep.name}: drift mode orientation: no orientation reading covers any frame"
+        )
+    measured = sensor.world_from_image(sweep.frame_time_s[covered])
+    rotation = measured.rotation if isinstance(measured, RigidTransform) else measured
+    return correct_orientation(poses, rotation, covered, sweep.grid.centre_mm, config.drift)
+
+
+def sensed_orientation(sweep: Sweep, config: Config) -> Rotation | None:
+    """Smoothed orientation of every frame for the consistent subset; None if off or not known throughout."""
+    sensor = sweep.orientation
+    if not config.sensors.consistent_subset or sensor is None or sensor.sensor_from_image is None:
+        return None
+    if not sensor.covers(sweep.frame_time_s).all():
+        return None
+    return smooth_rotations(
+        sensor.world_from_image(sweep.frame_time_s), sweep.frame_time_s, config.sensors.smooth_s
+    )
+
+
+def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) -> Rotation:
+    """Smooth rotations that stay within a half turn of their mean, by a Gaussian over time."""
+    if sigma_s == 0 or len(rotations) < 3:
+        return rotations
+    mean = rotations.mean()
+    vectors = (mean.inv() * rotations).as_rotvec()
+    sigma = sigma_s / float(np.median(np.diff(time_s)))
+    return mean * Rotation.from_rotvec(gaussian_filter1d(vectors, sigma, axis=0, mode="nearest"))
+
+
+def mirrored(world_from_image: RigidTransform) -> RigidTransform:
+    """The same motion seen in a mirror in the image plane: elevation, tilt and yaw change sign."""
+    flip = np.diag([1.0, 1.0, -1.0, 1.0])
+    return RigidTransform.from_matrix(flip @ world_from_image.as_matrix() @ flip)
+
+
+def settle_direction(sweep: Sweep, image: RigidTransform, config: Config) -> tuple[int, str]:
+    """Sign of the elevational motion, which images alone cannot tell, and what told it."""
+    if config.sensors.direction:
+        return config.sensors.direction, "setting"
+    centre = sweep.grid.centre_mm
+    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
+        covered = np.flatnonzero(sweep.tracker.covers(sweep.frame_time_s))
+        if covered.size > 1:
+            measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
+            agreement = float(np.sum(_travel(measured, centre) * _travel(image[covered], centre)))
+            return (1 if agreement >= 0 else -1), "tracker"
+    if sweep.orientation is not None and sweep.orientation.sensor_from_image is not None:
+        turned = _turn_agreement(sweep, image)
+        if turned is not None:
+            return turned, "orientation sensor"
+    return 1, "assumed"
+
+
+def _travel(world_from_image: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Elevational position of the image's centre in the first frame, less its mean."""
+    z = (world_from_image[0].inv() * world_from_image).apply(centre_mm)[:, 2]
+    return np.asarray(z - z.mean())
+
+
+def _turn_agreement(sweep: Sweep, image: RigidTransform) -> int | None:
+    """Whether image and sensor turn the same way, drift aside; None if they do not turn enough to tell."""
+    sensor = sweep.orientation
+    assert sensor is not None
+    covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
+    if covered.size < 20:
+        return None
+    measured = sensor.world_from_image(sweep.frame_time_s[covered])
+    sensed = (measured[0].inv() * measured).as_rotvec()[:, :2]
+    seen = (image.rotation[covered[0]].inv() * image.rotation[covered]).as_rotvec()[:, :2]
+    t = np.linspace(-1, 1, covered.size)
+    trend = np.vander(t, 3)
+    left = [v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen)]
+    correlation = float(np.sum(left[0] * left[1]) / np.sqrt(np.sum(left[0] ** 2) * np.sum(left[1] ** 2)))
+    # Slow turns have some ten independent values in a sweep: 0.5 is about two standard deviations.
+    return None if abs(correlation) < 0.5 else int(np.sign(correlation))
+
+
+def _prefetch(sweep: Sweep, matcher: FrameMatcher, times: StageTimes, ahead: int = 3) -> Iterator[ReadyFrame]:
+    """Frames made ready, a few ahead of their use, on a thread of their own."""
+
+    def make(index: int) -> ReadyFrame:
+        then = time.perf_counter()
+        frame = sweep.frames[index]
+        then = times.add("reading", then)
+        ready = matcher.prepare(frame)
+        times.add("intensity", then)
+        return ready
+
+    with ThreadPoolExecutor(1) as worker:
+        waiting: list[Future[ReadyFrame]] = []
+        try:
+            for index in range(len(sweep)):
+                waiting.append(worker.submit(make, index))
+                if len(waiting) > ahead:
+                    yield waiting.pop(0).result()
+            for future in waiting:
+                yield future.result()
+        finally:
+            worker.shutdown(wait=True, cancel_futures=True)
