@@ -114,7 +114,9 @@ def _require_whole(path: PathLike) -> None:
         elif start.startswith(_GZIP_SIGNATURE):
             _unpack(path)
         elif not is_nrrd(start):
-            raise InvalidInputError(f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else")
+            raise InvalidInputError(
+                f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else"
+            )
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise FileError(
             f"{path}: expected a whole gzip file, got a damaged one: {one_line(error)}"
