@@ -78,7 +78,11 @@ class Probe:
 
 @dataclass(frozen=True)
 class BeamGrid:
-    """Where the beam is tabulated. Lateral positions are `per_pitch` to the element pitch."""
+    """Where the beam is tabulated. Lateral positions are `per_pitch` to the element pitch.
+
+    The field is computed at the frequencies `node_hz` and kept as its `components` main components over
+    frequency, which is what makes a short sum broadband.
+    """
 
     first_depth_mm: float = 1.0
     last_depth_mm: float = 45.0
@@ -88,7 +92,8 @@ class BeamGrid:
     elevation_reach_mm: float = 4.0
     elevation_step_mm: float = 0.08
     strips: int = 64
-    node_hz: tuple[float, ...] = (4e6, 5.75e6, 7.5e6, 9.25e6, 11e6)
+    node_hz: tuple[float, ...] = tuple(np.linspace(3e6, 12e6, 13).tolist())
+    components: int = 4
     floor_db: float = -40.0
 
 
@@ -96,14 +101,16 @@ class BeamGrid:
 class BeamTable:
     """Two-way complex field relative to a delay model, ready for interpolation.
 
-    The field at depth y, lateral x, elevation z and frequency f is
-    ``residual * exp(-4 pi i f (y + kx x^2 + kz z^2) / c)``: the delay carries the fast phase, so that the
-    residual is smooth enough for linear interpolation.
+    The field at depth y, lateral x, elevation z and node frequency f is
+    ``residual @ components * exp(-4 pi i f (y + kx x^2 + kz z^2) / c)``: the delay carries the fast phase, so
+    that the residual is smooth enough for linear interpolation.
 
     Parameters
     ----------
-    residual : ndarray, shape (depth, lateral, elevation, node)
+    residual : ndarray, shape (depth, lateral, elevation, component)
         For x >= 0 and z >= 0; the beam is symmetric in both.
+    components : ndarray, shape (component, node)
+        How each component is spread over frequency.
     reach : ndarray, shape (depth, lateral)
         Elevational steps to where the amplitude has fallen to the grid's floor for good.
     curvature_per_mm : ndarray, shape (depth, 2)
@@ -116,13 +123,9 @@ class BeamTable:
     lateral_mm: FloatArray
     elevation_mm: FloatArray
     residual: Complex64Array
+    components: npt.NDArray[np.complex128]
     reach: npt.NDArray[np.int64]
     curvature_per_mm: FloatArray
-
-    @property
-    def node_hz(self) -> FloatArray:
-        """Frequencies at which the field is tabulated."""
-        return np.asarray(self.grid.node_hz)
 
     @property
     def lateral_extent_mm(self) -> float:
@@ -134,25 +137,27 @@ class BeamTable:
         """How far from the image plane the field is above the floor, per depth."""
         return np.asarray(self.reach.max(axis=1) * self.grid.elevation_step_mm)
 
-    def node_spectra(self, frequency_hz: FloatArray) -> FloatArray:
-        """Pulse spectrum times each node's linear interpolation weight, shape (node, frequency)."""
-        hats = np.stack([np.interp(frequency_hz, self.node_hz, row) for row in np.eye(self.node_hz.size)])
-        return np.asarray(hats * self.probe.spectrum(frequency_hz))
+    def spectra(self, frequency_hz: FloatArray) -> npt.NDArray[np.complex128]:
+        """Two-way pulse spectrum of each component, shape (component, frequency)."""
+        nodes = np.asarray(self.grid.node_hz)
+        hats = np.stack([np.interp(frequency_hz, nodes, row) for row in np.eye(nodes.size)])
+        return np.asarray(self.components @ hats * self.probe.spectrum(frequency_hz))
 
     def echo_power(self, frequency_hz: FloatArray) -> FloatArray:
-        """Mean square of the RF from one scatterer per mm^3 of unit strength at each depth.
+        """Mean square RF at each depth from unit strength at one scatterer per mm^3.
 
-        The pulse has the spectrum of `Probe.spectrum` per sample, as `speckle3d.simulation.scan` makes it.
+        ``frequency_hz`` are evenly spaced and cover the band. An echo's discrete spectrum at positive
+        frequencies is the pulse's, as `speckle3d.simulation.scan` makes it.
         """
-        spectra = self.node_spectra(frequency_hz)
+        spectra = self.spectra(frequency_hz)
         df = frequency_hz[1] - frequency_hz[0]
-        gram = 2.0 * spectra @ spectra.T * df / self.probe.sampling_rate_hz
+        gram = 2.0 * spectra @ spectra.conj().T * df / self.probe.sampling_rate_hz
         inside = np.arange(self.elevation_mm.size) < self.reach[:, :, None]
         field = self.residual * inside[..., None]
         # Both mirror halves count, the axis once.
         sides = np.outer(_sides(self.lateral_mm), _sides(self.elevation_mm))
         cell_mm2 = self.lateral_mm[1] * self.elevation_mm[1]
-        power = np.einsum("yxzk,kl,yxzl,xz->y", field.conj(), gram, field, sides, optimize=True).real
+        power = np.einsum("yxzk,kl,yxzl,xz->y", field, gram, field.conj(), sides, optimize=True).real
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
 
 
@@ -185,15 +190,18 @@ def tabulate_beam(
     curvature = _fit_curvature(field, depth, lateral, elevation, _wavenumbers(probe, nodes))
     echo = depth[:, None, None] + curvature[:, 0, None, None] * lateral[:, None] ** 2
     echo = echo + curvature[:, 1, None, None] * elevation**2
-    residual = field * np.exp(2j * echo[..., None] * _wavenumbers(probe, nodes))
+    reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (grid.floor_db / 20.0))
+    field *= np.exp(2j * echo[..., None] * _wavenumbers(probe, nodes))
+    residual, components = _compress(field, probe.spectrum(nodes), grid.components)
     return BeamTable(
         probe,
         grid,
         depth,
         lateral,
         elevation,
-        residual.astype(np.complex64),
-        _reach(np.abs(field).max(axis=-1), 10.0 ** (grid.floor_db / 20.0)),
+        residual,
+        components,
+        reach,
         curvature,
     )
 
@@ -284,6 +292,19 @@ def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumbe
     path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
     weight = np.abs(profile[lobe]) ** 2
     return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())
+
+
+def _compress(
+    field: npt.NDArray[np.complex128], pulse: FloatArray, count: int
+) -> tuple[Complex64Array, npt.NDArray[np.complex128]]:
+    """Principal components of the field over frequency, every depth and the pulse's band counting alike."""
+    weight = np.maximum(pulse, 0.1 * pulse.max())
+    depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3)))
+    rows = (field * weight / depth_rms[:, None, None, None]).reshape(-1, pulse.size)
+    _, vectors = np.linalg.eigh(rows.conj().T @ rows)
+    main = vectors[:, : -count - 1 : -1]
+    residual = (field * weight) @ main
+    return residual.astype(np.complex64), main.conj().T / weight
 
 
 def _reach(amplitude: FloatArray, floor: float) -> npt.NDArray[np.int64]:

@@ -97,9 +97,9 @@ class SimulatedFrames:
         return np.clip(np.rint(counts), -FULL_SCALE, FULL_SCALE).astype(np.int16)
 
     def echoes(self, index: int) -> Complex64Array:
-        """Baseband echoes of frame `index` at every frequency node, shape (vector, sample, node)."""
+        """Baseband echoes of frame `index` for every component of the beam, shape (vector, sample, component)."""
         probe, image, beam = self.beam.probe, self.image, self.beam
-        out = np.zeros((image.vectors, self._spectra.length, beam.node_hz.size), np.complex64)
+        out = np.zeros((image.vectors, self._spectra.length, beam.grid.components), np.complex64)
         vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
         position, strength, cells = self._near(self.medium_from_image[index])
         scatter_echoes(
@@ -114,7 +114,7 @@ class SimulatedFrames:
             self._table_steps,
             image.first_sample_depth_mm,
             image.sample_spacing_mm,
-            2e3 * self._spectra.carrier_hz / probe.speed_of_sound_m_s,
+            2e-3 * self._spectra.carrier_hz / probe.speed_of_sound_m_s,
             out,
         )
         return out
@@ -179,7 +179,7 @@ class SimulatedFrames:
 
 
 class _Spectra:
-    """Pulse spectra of the nodes on the FFT's bins, and the way from baseband echoes to RF."""
+    """Pulse spectra of the beam's components on the FFT's bins, and the way from baseband echoes to RF."""
 
     def __init__(self, beam: BeamTable, samples: int) -> None:
         rate = beam.probe.sampling_rate_hz
@@ -188,12 +188,12 @@ class _Spectra:
         self.frequency_hz = np.arange(self.length // 2 + 1) * rate / self.length
         self._carrier_bin = round(beam.probe.centre_frequency_hz / rate * self.length)
         self.carrier_hz = float(self.frequency_hz[self._carrier_bin])
-        spectra = beam.node_spectra(self.frequency_hz)
+        spectra = beam.spectra(self.frequency_hz)
         self._band = np.flatnonzero(spectra.any(axis=0))
-        self._pulse = np.ascontiguousarray(spectra[:, self._band].T).astype(np.float32)
+        self._pulse = np.ascontiguousarray(spectra[:, self._band].T).astype(np.complex64)
 
     def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> npt.NDArray[np.float32]:
-        """RF, shape (vector, sample): each node's echoes through its pulse, and the noise, summed."""
+        """RF, shape (vector, sample): each component's echoes through its pulse, and the noise, summed."""
         # The band holds less than half of the bins: baseband bins wrap, so negative ones are in place.
         baseband = fft(echoes, axis=1, workers=2)[:, self._band - self._carrier_bin]
         spectrum = noise
