@@ -5,7 +5,8 @@
 The image-based poses of a hand-like 20 mm sweep of 150 to 300 frames are 15 % too long and drift by
 1.5 degrees of tilt; the tracker has 0.15 mm and 0.1 degrees of noise per axis. Length error is the error of
 the accumulated elevational travel of the image centre from the first to the last frame; in a reversal
-(20 mm and back) it is that of the forward half.
+(20 mm and back) it is that of the forward half. On a busy machine set OPENBLAS_NUM_THREADS=1: the threads
+of a small singular value decomposition otherwise wait for each other, half a second for 2 ms of work.
 """
 
 from __future__ import annotations
