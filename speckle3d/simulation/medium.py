@@ -24,6 +24,10 @@ _KEPT_TILES = 160
 """A frame of 127 vectors sees about 40 tiles; the rest serve neighbouring frames and turned ones."""
 
 
+_CELL_MM = 0.5
+"""Sides, lateral and elevational, of cells that hold one background scatterer each: as the focused beam."""
+
+
 class Medium(Protocol):
     """Anything that can list its scatterers in a box."""
 
@@ -221,9 +225,9 @@ class TiledMedium:
 
     def _background(self, i: int, j: int) -> Scatterers:
         rng = self._rng(0, i, j)
-        size = np.array([self.tile_mm, self.depth_mm[1] - self.depth_mm[0], self.tile_mm])
-        n = rng.poisson(self.per_mm3 * size.prod())
-        position = [i * self.tile_mm, self.depth_mm[0], j * self.tile_mm] + rng.random((n, 3)) * size
+        position = np.concatenate([self._at_random(rng), self._one_per_cell(rng)])
+        position += [i * self.tile_mm, self.depth_mm[0], j * self.tile_mm]
+        n = len(position)
         strength, fill = np.ones(n), np.ones(n)
         for layer in self.layers:
             below = position[:, 1] >= layer.top_at(position)
@@ -234,6 +238,25 @@ class TiledMedium:
         strength *= rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
         kept = rng.random(n) < fill
         return position[kept], strength[kept].astype(np.float32)
+
+    def _at_random(self, rng: np.random.Generator) -> FloatArray:
+        """Half of the background, Poisson distributed over a tile at the origin."""
+        size = np.array([self.tile_mm, self.depth_mm[1] - self.depth_mm[0], self.tile_mm])
+        return np.asarray(rng.random((rng.poisson(self.per_mm3 / 2.0 * size.prod()), 3)) * size)
+
+    def _one_per_cell(self, rng: np.random.Generator) -> FloatArray:
+        """Return the other half of the background: one scatterer anywhere in each of equal cells.
+
+        Few scatterers per resolution cell make intensity vary more than fully developed speckle's if they
+        are Poisson distributed, and less by as much if their number does not vary. Half and half, the
+        moments up to the fourth, and so the correlation of intensity, are those of a dense medium.
+        """
+        across = round(self.tile_mm / _CELL_MM)
+        side = self.tile_mm / across
+        height = self.depth_mm[1] - self.depth_mm[0]
+        down = round(height * self.per_mm3 / 2.0 * side**2)
+        cell = np.indices((across, down, across)).reshape(3, -1).T
+        return np.asarray((cell + rng.random(cell.shape)) * [side, height / down, side])
 
     def _fascia(self, layer: Layer, number: int, i: int, j: int) -> Scatterers:
         rng = self._rng(1 + number, i, j)
@@ -258,12 +281,12 @@ class TiledMedium:
         return position[mine], strength[mine]
 
 
-def fully_developed(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMedium:
+def fully_developed(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
     """Make a uniform speckle phantom."""
     return TiledMedium(entropy, per_mm3, 0.3)
 
 
-def phantom(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMedium:
+def phantom(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
     """Make a speckle phantom with spherical inclusions, brighter and darker by 6 to 12 dB."""
     rng = np.random.default_rng([entropy, 1])
     factors = (2.0, 0.5, 0.25, 3.0, 0.5)
@@ -272,7 +295,7 @@ def phantom(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMediu
     )
 
 
-def tissue(entropy: int, length_mm: float, per_mm3: float = 60.0) -> TiledMedium:
+def tissue(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
     """Make layered tissue: skin, fat, muscles between fascias, cysts, and a poorly filled depth.
 
     Fibres run mostly along the sweep and are longer than the beam is thick, more of them in some muscles

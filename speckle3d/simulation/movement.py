@@ -50,7 +50,7 @@ class HandMotion:
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tremor_band_hz: tuple[float, float] = (8.0, 12.0)
     tremor_mm: float = 0.015
-    tremor_rad: float = np.deg2rad(0.012)
+    tremor_rad: float = np.deg2rad(0.02)
     reverse: bool = False
 
 

@@ -97,7 +97,7 @@ class SimulatedFrames:
         return np.clip(np.rint(counts), -FULL_SCALE, FULL_SCALE).astype(np.int16)
 
     def echoes(self, index: int) -> Complex64Array:
-        """Baseband echoes of frame `index` for every component of the beam, shape (vector, sample, component)."""
+        """Baseband echoes of frame `index`, shape (vector, sample, component of the beam)."""
         probe, image, beam = self.beam.probe, self.image, self.beam
         out = np.zeros((image.vectors, self._spectra.length, beam.grid.components), np.complex64)
         vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
