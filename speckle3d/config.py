@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.correction.curves import Curves
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.inplane import InPlaneSettings
@@ -52,6 +55,15 @@ class Config(BaseModel):
     trajectory: TrajectorySettings = TrajectorySettings()
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()
+
+    def with_choices(self, consistent_subset: bool | None, drift_curves: str | None) -> Config:
+        """Return a configuration with command-line choices in place of its own; None leaves one as it is."""
+        sensors, drift = self.sensors, self.drift
+        if consistent_subset is not None:
+            sensors = sensors.model_copy(update={"consistent_subset": consistent_subset})
+        if drift_curves is not None:
+            drift = replace(drift, curves=cast("Curves", drift_curves))
+        return self.model_copy(update={"sensors": sensors, "drift": drift})
 
     def to_toml(self) -> str:
         """Render as TOML text."""

@@ -22,9 +22,12 @@ from speckle3d.core.geometry import FloatArray
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.distances import DistanceEstimator, PatchDistances
 from speckle3d.motion.inplane import InPlaneMotion
+from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.motion.phantom import phantom_samples
 from speckle3d.motion.planes import PairPlane, consistent_subset, fit_plane
 from speckle3d.motion.trajectory import (
     PairMeasurement,
@@ -37,6 +40,8 @@ from speckle3d.motion.trajectory import (
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
+ImageSink = Callable[[int, Float32Array], None]
+"""Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
 PairSink = Callable[[FramePairs], None]
 """Called with the pairs of some frames at a time, in order."""
 
@@ -98,6 +103,7 @@ def track(
     config: Config | None = None,
     progress: Progress | None = None,
     sink: PairSink | None = None,
+    images: ImageSink | None = None,
 ) -> Tracked:
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches if asked.
 
@@ -112,13 +118,43 @@ def track(
     matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane)
     curves.key.require_same(matcher.key)
     walk = _Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
-    for frame, ready in enumerate(_prefetch(sweep, matcher, walk.times)):
+    for frame, ready in enumerate(_prefetch(sweep, matcher, walk.times, images)):
         measured = walk.advance(frame, ready)
         if sink and measured:
             sink(walk.table(measured))
         if progress:
             progress(frame + 1, len(sweep))
     return walk.finish()
+
+
+def calibrate_curves(
+    sweeps: Sequence[Sweep], config: Config | None = None, progress: Progress | None = None
+) -> DecorrelationCurves:
+    """Measure decorrelation curves on phantom sweeps whose positions are known.
+
+    Raises
+    ------
+    InsufficientDataError
+        If positions are not known, or the distances do not span the curves.
+    MismatchError
+        If the sweeps differ in probe, frequency or sampling.
+    """
+    settings = config or Config()
+    if not sweeps:
+        raise InsufficientDataError("expected at least one phantom sweep, got none")
+    samples, keys = [], []
+    total, before = sum(len(sweep) for sweep in sweeps), 0
+    for sweep in sweeps:
+        matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane)
+        keys.append(matcher.key)
+        keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
+        samples.append(phantom_samples(sweep, matcher, settings.curves, _shifted(progress, before, total)))
+        before += len(sweep)
+    return fit_curves(keys[0], samples, settings.curves)
+
+
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 class _Walk:
@@ -374,14 +410,19 @@ def _turn_agreement(sweep: Sweep, image: RigidTransform) -> int | None:
     return None if abs(correlation) < 0.5 else int(np.sign(correlation))
 
 
-def _prefetch(sweep: Sweep, matcher: FrameMatcher, times: StageTimes, ahead: int = 3) -> Iterator[ReadyFrame]:
+def _prefetch(
+    sweep: Sweep, matcher: FrameMatcher, times: StageTimes, images: ImageSink | None, ahead: int = 3
+) -> Iterator[ReadyFrame]:
     """Frames made ready, a few ahead of their use, on a thread of their own."""
 
     def make(index: int) -> ReadyFrame:
         then = time.perf_counter()
         frame = sweep.frames[index]
         then = times.add("reading", then)
-        ready = matcher.prepare(frame)
+        intensity = matcher.intensity(frame)
+        if images:
+            images(index, intensity)
+        ready = matcher.prepare(intensity)
         times.add("intensity", then)
         return ready
 

@@ -22,10 +22,10 @@ class CurveKey:
     patch_height_mm: float
     equalise_mm: float
 
-    def require_same(self, other: CurveKey) -> None:
+    def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         for name, mine, theirs in _differing(self, other):
-            raise MismatchError(f"the curves do not match the sweep: {name} is {mine} and {theirs}")
+            raise MismatchError(f"{what}: {name} is {mine} and {theirs}")
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,11 @@ def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
     if q.ndim != 2 or q.shape[1] != 4:
         raise InvalidInputError(f"{where}: expected shape (m, 4), got {q.shape}")
     require_finite(q, where)
-    bad = np.flatnonzero(np.abs(np.linalg.norm(q, axis=1) - 1.0) > RIGID_TOLERANCE)
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(q, axis=1)
+    bad = np.flatnonzero(np.abs(norms - 1.0) > RIGID_TOLERANCE)
     if bad.size:
-        norm = np.linalg.norm(q[bad[0]])
+        norm = norms[bad[0]]
         raise InvalidInputError(f"{where}[{bad[0]}]: expected a unit quaternion, got norm {norm:.6g}")
     return Rotation.from_quat(q, scalar_first=True)
 
@@ -79,17 +81,19 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
     InvalidInputError
         Naming `where` and the first index that is not a proper rotation with translation.
     """
-    m = np.asarray(matrices, dtype=float)
+    m = np.array(matrices, dtype=float)
     if m.ndim != 3 or m.shape[1:] != (4, 4):
         raise InvalidInputError(f"{where}: expected shape (m, 4, 4), got {m.shape}")
     require_finite(m, where)
     r = m[:, :3, :3]
-    skewed = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) > RIGID_TOLERANCE
-    mirrored = np.linalg.det(r) < 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        skewed = ~(np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE)
+        mirrored = np.linalg.det(r) < 0
     affine = np.abs(m[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > RIGID_TOLERANCE
     bad = np.flatnonzero(skewed | mirrored | affine)
     if bad.size:
         raise InvalidInputError(f"{where}[{bad[0]}]: expected a rigid 4x4 matrix, got one that is not")
+    m[:, 3] = [0.0, 0.0, 0.0, 1.0]  # SciPy wants it exact
     return RigidTransform.from_matrix(m)
 
 

@@ -88,9 +88,20 @@ def open_hdf5(path: PathLike) -> h5py.File:
 
 
 @contextmanager
+def reading(path: PathLike) -> Iterator[None]:
+    """Turn what h5py raises over damaged structures in the block into a `FileError` of one line."""
+    try:
+        yield
+    except _READ_FAILURES as error:
+        if isinstance(error, Speckle3DError):
+            raise
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+
+
+@contextmanager
 def opened(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
     """Open an HDF5 file of the family for reading and require its format and version."""
-    with open_hdf5(path) as file:
+    with reading(path), open_hdf5(path) as file:
         found = file_format(file)
         if found != format_name:
             raise InvalidInputError(f"{path}: expected format {format_name!r}, got {found!r}")

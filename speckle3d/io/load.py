@@ -13,7 +13,7 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.io import reconstructions, sweeps
-from speckle3d.io.hdf5 import PathLike, file_format, one_line, open_hdf5
+from speckle3d.io.hdf5 import PathLike, file_format, one_line, open_hdf5, reading
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.metaimage import ImportSettings, read_metaimage
 from speckle3d.io.pixels import image_orientation, image_type
@@ -60,7 +60,7 @@ def describe(path: PathLike) -> list[Row]:
     """
     if sniff(path) == "image":
         return _describe_header(read_header(path))
-    with open_hdf5(path) as file:
+    with reading(path), open_hdf5(path) as file:
         found = file_format(file)
         if found not in _DESCRIBERS:
             known = ", ".join(sorted(_DESCRIBERS))
@@ -176,12 +176,9 @@ def _describe_members(path: PathLike) -> list[Row]:
         if isinstance(node, h5py.Dataset):
             rows.append(_dataset_row(name, node))
 
-    try:
-        with open_hdf5(path) as file:
-            rows += [row for row in _attribute_rows("", file) if row[0] != "format"]
-            file.visititems(visit)
-    except (RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), open_hdf5(path) as file:
+        rows += [row for row in _attribute_rows("", file) if row[0] != "format"]
+        file.visititems(visit)
     return rows
 
 

@@ -64,7 +64,9 @@ class SweepWriter:
     def __enter__(self) -> SweepWriter:
         with ExitStack() as stack:
             self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, FORMAT, VERSION))
-            self._frames: h5py.Dataset = self._create_frames()
+            self._frames = self._create_frames().id
+            self._in_memory = h5py.h5s.create_simple((self._grid.vectors, self._grid.samples))
+            self._kind = h5py.h5t.py_create(self._dtype)
             self._stack = stack.pop_all()
         return self
 
@@ -94,8 +96,7 @@ class SweepWriter:
             raise InvalidInputError(f"{where}: expected samples of type {self._dtype}, got {frame.dtype}")
         if frame.dtype.kind == "f":
             require_finite(frame, where)
-        self._frames.resize(i + 1, axis=0)
-        self._frames[i] = frame
+        self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
         self._time_s.append(float(time_s))
 
     def write_orientation(self, sensor: OrientationSensor) -> None:
@@ -141,6 +142,14 @@ class SweepWriter:
                 if name not in self._file.attrs:
                     self._file.attrs[name] = value
 
+    def _write(self, i: int, frame: npt.NDArray[Any]) -> None:
+        self._frames.set_extent((i + 1, *frame.shape))
+        on_disk = self._frames.get_space()
+        on_disk.select_hyperslab((i, 0, 0), (1, *frame.shape))
+        self._frames.write(self._in_memory, on_disk, frame, self._kind)
+        # Kept until the next frame, so that a Ctrl-C pressed meanwhile is not lost (as in HDF5Frames).
+        self._on_disk = on_disk
+
     def _create_frames(self) -> h5py.Dataset:
         shape = (self._grid.vectors, self._grid.samples)
         node = self._file.create_dataset(
@@ -169,7 +178,11 @@ class SweepWriter:
 
 
 def write_sweep(
-    path: PathLike, sweep: Sweep, progress: Progress | None = None, compression: Compression = "gzip"
+    path: PathLike,
+    sweep: Sweep,
+    progress: Progress | None = None,
+    compression: Compression = "gzip",
+    simulation: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a sweep; what its own file holds beyond the format is copied along.
 
@@ -177,6 +190,8 @@ def write_sweep(
     ----------
     progress : callable, optional
         Called with the number of frames written and their total.
+    simulation : mapping, optional
+        How the sweep was simulated, for ``/simulation``.
 
     Raises
     ------
@@ -194,6 +209,8 @@ def write_sweep(
             writer.write_tracker(sweep.tracker)
         if sweep.truth is not None:
             writer.write_truth(sweep.truth)
+        if simulation is not None:
+            writer.write_simulation(simulation)
         if isinstance(sweep.frames, HDF5Frames):
             writer.copy_unknown(sweep.frames.path)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import (
     FloatArray,
     require_finite,
@@ -28,12 +29,12 @@ from speckle3d.io.hdf5 import (
     find_group,
     locate,
     naming,
-    one_line,
     open_hdf5,
     opened,
     read_attribute,
     read_checked,
     read_vector_attribute,
+    reading,
     require_dataset,
 )
 
@@ -59,7 +60,8 @@ class HDF5Frames:
         self.name = name
         self._shape = shape
         self._dtype = dtype
-        self._file: h5py.File | None = None
+        self._open: _OpenFrames | None = None
+        self._lock = threading.Lock()
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -79,28 +81,47 @@ class HDF5Frames:
         if not -len(self) <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
         i %= len(self)
-        frame = self._read(i)
+        with self._lock, reading(f"{self.path}: /{self.name}[{i}]"):
+            if self._open is None:
+                self._open = _OpenFrames(self)
+            frame = self._open.read(i)
         if frame.dtype.kind == "f":
             require_finite(frame, f"{self.path}: /{self.name}[{i}]")
         return frame
 
     def close(self) -> None:
         """Close the file if it is open."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        with self._lock:
+            if self._open is not None:
+                self._open.file.close()
+                self._open = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None}
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self.path, self.name, self._shape, self._dtype
 
-    def _read(self, i: int) -> npt.NDArray[Any]:
-        if self._file is None:
-            self._file = open_hdf5(self.path)
-        frame = np.empty(self._shape[1:], self._dtype)
-        try:
-            self._file[self.name].read_direct(frame, np.s_[i])
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise FileError(f"{self.path}: /{self.name}[{i}]: cannot be read: {one_line(error)}") from error
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.__init__(*state)  # type: ignore[misc]
+
+
+class _OpenFrames:
+    """The open data set and HDF5's handles to it, made once.
+
+    h5py frees a handle in a callback, and Python drops a Ctrl-C that is pending there: the one pressed while
+    a frame was read or written. So no handle is freed from frame to frame.
+    """
+
+    def __init__(self, frames: HDF5Frames) -> None:
+        self.file = open_hdf5(frames.path)
+        self._frame_shape, self._dtype = frames.shape[1:], frames.dtype
+        self._node = self.file[frames.name].id
+        self._on_disk = self._node.get_space()
+        self._in_memory = h5py.h5s.create_simple(self._frame_shape)
+        self._kind = h5py.h5t.py_create(self._dtype)
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        frame = np.empty(self._frame_shape, self._dtype)
+        self._on_disk.select_hyperslab((i, 0, 0), (1, *self._frame_shape))
+        self._node.read(self._in_memory, self._on_disk, frame, self._kind)
         return frame
 
 

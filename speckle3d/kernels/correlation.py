@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 
-@njit(cache=True, parallel=True, fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
 def patch_correlations(
     fixed: Float32Array,
     moving: Float32Array,
@@ -40,7 +42,7 @@ def patch_correlations(
     rows, columns = fixed.shape
     lateral_radius = out.shape[1] // 2
     axial_radius = out.shape[2] // 2
-    for p in prange(first.shape[0]):
+    for p in range(first.shape[0]):
         dv, ds = shift[p, 0], shift[p, 1]
         # The part of the patch that stays inside both images at every lag, so that all lags share it.
         v0 = max(first[p, 0], 0, lateral_radius - dv)
@@ -56,8 +58,8 @@ def patch_correlations(
         aa_sum = 0.0
         for v in range(v0, v1):
             a_row = fixed[v, s0:s1]
-            row_sum = np.float32(0.0)
-            row_square = np.float32(0.0)
+            row_sum: Any = np.float32(0.0)
+            row_square: Any = np.float32(0.0)
             for k in range(width):
                 row_sum += a_row[k]
                 row_square += a_row[k] * a_row[k]
@@ -73,9 +75,9 @@ def patch_correlations(
                 for v in range(v0, v1):
                     a_row = fixed[v, s0:s1]
                     b_row = moving[v + dv + i - lateral_radius, start : start + width]
-                    row_b = np.float32(0.0)
-                    row_bb = np.float32(0.0)
-                    row_ab = np.float32(0.0)
+                    row_b: Any = np.float32(0.0)
+                    row_bb: Any = np.float32(0.0)
+                    row_ab: Any = np.float32(0.0)
                     for k in range(width):
                         row_b += b_row[k]
                         row_bb += b_row[k] * b_row[k]

@@ -188,23 +188,23 @@ def _vertex(before: FloatArray, at: FloatArray, after: FloatArray) -> FloatArray
 def _fit_motion(
     shift: FloatArray, weight: FloatArray, at: FloatArray, start: InPlaneMotion, predicted: FloatArray
 ) -> tuple[InPlaneMotion, FloatArray]:
-    """Rigid motion by robust least squares, and the smooth (affine) field to read correlations at."""
+    """In-plane motion by robust least squares, and the smooth (affine) field to read correlations at.
+
+    Roll comes from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves
+    speckle laterally about the focus rather than about the probe, and lateral shifts understate it by a
+    fifth and more.
+    """
     good = weight > 0
-    if good.sum() < 3:
+    design = np.column_stack([np.ones(len(at)), at])
+    if good.sum() < 6 or np.linalg.matrix_rank(design[good]) < 3:
         return start, predicted
-    p, d, w = at[good], shift[good], weight[good]
-    rigid = np.zeros((2 * p.shape[0], 3))
-    rigid[0::2, 0] = rigid[1::2, 1] = -1.0
-    # Turning the second frame by roll moves the first frame's points by -roll in it.
-    rigid[0::2, 2], rigid[1::2, 2] = p[:, 1], -p[:, 0]
-    solution, covariance = _robust_fit(rigid, d.ravel(), np.repeat(w, 2))
-    motion = InPlaneMotion(float(solution[0]), float(solution[1]), float(solution[2]), covariance)
-    affine = np.column_stack([np.ones(len(p)), p])
-    if np.linalg.matrix_rank(affine) < 3 or good.sum() < 9:
-        return motion, _shift_field(motion, at)
-    everywhere = np.column_stack([np.ones(len(at)), at])
-    smooth = [everywhere @ _robust_fit(affine, d[:, k], w)[0] for k in range(2)]
-    return motion, np.stack(smooth, axis=1)
+    fits = [_robust_fit(design[good], shift[good, k], weight[good]) for k in range(2)]
+    (lateral, lateral_covariance), (axial, axial_covariance) = fits
+    covariance = np.zeros((3, 3))
+    covariance[0, 0] = lateral_covariance[0, 0]
+    covariance[1:, 1:] = axial_covariance[:2, :2]
+    motion = InPlaneMotion(-float(lateral[0]), -float(axial[0]), -float(axial[1]), covariance)
+    return motion, np.stack([design @ lateral, design @ axial], axis=1)
 
 
 def _robust_fit(

@@ -51,9 +51,13 @@ class FrameMatcher:
             intensity.equalise_mm,
         )
 
-    def prepare(self, frame: npt.NDArray[Any]) -> ReadyFrame:
-        """Intensity, equalised, and its spectrum."""
-        image = self.extractor.equalise(self.extractor.intensity(frame))
+    def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
+        """Echo intensity of a frame as read, shape (vector, grid.samples)."""
+        return self.extractor.intensity(frame)
+
+    def prepare(self, intensity: Float32Array) -> ReadyFrame:
+        """Equalise an intensity image and transform it for the coarse search."""
+        image = self.extractor.equalise(intensity)
         return ReadyFrame(image, self._coarse.spectrum(image))
 
     def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:

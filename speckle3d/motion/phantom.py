@@ -66,7 +66,7 @@ def phantom_samples(
     motion = {0: InPlaneMotion()}
     rows: list[FloatArray] = []
     for frame in range(len(sweep)):
-        kept[frame] = matcher.prepare(sweep.frames[frame])
+        kept[frame] = matcher.prepare(matcher.intensity(sweep.frames[frame]))
         if frame:
             start = matcher.search(kept[frame - 1], kept[frame])
             step = matcher.match(kept[frame - 1], kept[frame], start).motion

@@ -1,1 +1,5 @@
-"""Simulated sweeps with truth."""
+"""Simulated sweeps with truth: diffraction beam, scatterers, hand motion, sensors on their own clocks."""
+
+from speckle3d.simulation.presets import SimulatedSweep, SimulationSettings, simulate
+
+__all__ = ["SimulatedSweep", "SimulationSettings", "simulate"]

@@ -49,8 +49,8 @@ class HandMotion:
     wander_rad: float = np.deg2rad(0.6)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tremor_band_hz: tuple[float, float] = (8.0, 12.0)
-    tremor_mm: float = 0.015
-    tremor_rad: float = np.deg2rad(0.02)
+    tremor_mm: float = 0.012
+    tremor_rad: float = np.deg2rad(0.016)
     reverse: bool = False
 
 

@@ -173,7 +173,8 @@ class SimulatedFrames:
         for block in blocks:
             n = gather_near(*block, matrix, lateral, steps, thick, position, strength, n)
         by_cell = np.empty((n, 3)), np.empty(n, np.float32)
-        cells = np.zeros(int(np.ptp(lateral) / _CELL_MM) + 2, np.int64)
+        # One spare cell: rounding may put the rightmost scatterer past the last one that a vector looks at.
+        cells = np.zeros(int(np.ptp(lateral) / _CELL_MM + 1e-6) + 3, np.int64)
         sort_into_cells(position[:n], strength[:n], lateral[0], _CELL_MM, depth[-1], cells, *by_cell)
         return *by_cell, cells
 
@@ -206,4 +207,4 @@ def _cells_of(vector_mm: FloatArray, extent_mm: float) -> tuple[IntArray, IntArr
     """First lateral cell that each vector looks at, and the one after its last."""
     near = (vector_mm - vector_mm[0]) / _CELL_MM
     far = near + 2.0 * extent_mm / _CELL_MM
-    return near.astype(np.int64), far.astype(np.int64) + 1
+    return (near + 1e-6).astype(np.int64), (far + 1e-6).astype(np.int64) + 1

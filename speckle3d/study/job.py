@@ -1,0 +1,271 @@
+"""A sweep file in, a folder of results out: what ``speckle3d reconstruct`` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.config import Config
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError
+from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.streams import BoolArray
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.correction.drift import DriftCorrection
+from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
+from speckle3d.io.hdf5 import sha256_of
+from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.motion.intensity import Float32Array, IntensityExtractor
+from speckle3d.pipeline import Progress, Tracked, correct, track
+from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
+from speckle3d.study.metrics import ModeError, align_sign, compare_modes
+from speckle3d.study.summary import Summary, table_text, write_summary
+
+REFERENCES = ("tracker", "truth")
+STRIP_MM = 2.4
+STRIP_SPACING_MM = 0.1
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the modes are compared with."""
+
+    name: str
+    world_from_image: RigidTransform
+    covered: BoolArray
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """What a job found, and where it is."""
+
+    directory: Path
+    summary: Summary
+    table: str
+    files: tuple[Path, ...]
+    seconds: float
+
+
+def run_job(
+    sweep: Sweep,
+    source: Path,
+    curves: DecorrelationCurves,
+    directory: Path,
+    drift: Sequence[str] = (),
+    reference: str | None = None,
+    config: Config | None = None,
+    progress: Progress | None = None,
+) -> JobResult:
+    """Reconstruct a sweep and write everything that belongs to it into `directory`.
+
+    Written: ``reconstruction.h5``, ``summary.json``, ``table.txt``, ``table.csv``, ``drift.png`` and
+    ``reslice.png``; each appears whole or not at all.
+
+    Parameters
+    ----------
+    drift : sequence of str
+        Correction modes beside `image`: "orientation", "pose".
+    reference : {"tracker", "truth"}, optional
+        What to compare with; by default the truth if stored, else the tracker, else nothing.
+    """
+    settings = config or Config()
+    began = time.perf_counter()
+    compared = find_reference(sweep, reference)
+    make_folder(directory)
+    strip = _Strip(sweep, settings)
+    path = directory / "reconstruction.h5"
+    with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
+        tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep)
+        if tracked.direction < 0:
+            writer.mirror_pairs()
+        corrections = correct(tracked, sweep, drift, settings)
+        poses = {"image": tracked.image} | {mode: c.poses for mode, c in corrections.items()}
+        provenance = Provenance(str(source), sha256_of(source), version("speckle3d"))
+        writer.finish(poses, provenance, settings.to_toml())
+    summary = _summarise(sweep, tracked, corrections, poses, compared, provenance)
+    files = [path, *write_summary(directory, [summary])]
+    files += _draw(directory, sweep, poses, compared, strip)
+    return JobResult(directory, summary, table_text([summary]), tuple(files), time.perf_counter() - began)
+
+
+def find_reference(sweep: Sweep, wanted: str | None) -> Reference | None:
+    """The poses that modes are compared with.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the wanted reference is not in the sweep.
+    """
+    if wanted is not None and wanted not in REFERENCES:
+        raise InvalidInputError(f"expected a reference among {', '.join(REFERENCES)}; got {wanted!r}")
+    if sweep.truth is not None and wanted != "tracker":
+        return Reference("truth", sweep.truth, np.ones(len(sweep), dtype=bool))
+    if wanted == "truth":
+        raise InsufficientDataError(f"{sweep.name}: expected true poses in /truth, got none")
+    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
+        covered = sweep.tracker.covers(sweep.frame_time_s)
+        if covered.sum() >= 2:
+            poses = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
+            return Reference("tracker", poses, covered)
+    if wanted == "tracker":
+        raise InsufficientDataError(f"{sweep.name}: expected a calibrated tracker over the frames, got none")
+    return None
+
+
+def make_folder(directory: Path) -> None:
+    """Make the results' folder, or raise `FileError`."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{directory}: cannot be made a folder: {error.strerror}") from error
+
+
+def _summarise(
+    sweep: Sweep,
+    tracked: Tracked,
+    corrections: dict[str, DriftCorrection],
+    poses: dict[str, RigidTransform],
+    reference: Reference | None,
+    provenance: Provenance,
+) -> Summary:
+    rows: list[ModeError] = []
+    if reference is not None:
+        rows = compare_modes(
+            _scored(poses, reference, sweep, tracked),
+            reference.world_from_image,
+            sweep.grid.centre_mm,
+            reference.covered,
+            end_frames=1 if reference.name == "truth" else 25,
+        )
+    details: dict[str, Any] = {
+        "provenance": provenance,
+        "pairs": tracked.pairs,
+        "unreliable_frames": tracked.unreliable,
+        "rejected_patch_share": tracked.rejected_share,
+        "direction": tracked.direction,
+        "direction_from": tracked.direction_from,
+        "seconds_by_stage": tracked.times.seconds,
+        "corrections": {mode: _fit_details(c) for mode, c in corrections.items()},
+    }
+    return Summary(
+        sweep.name,
+        reference.name if reference else "none",
+        len(sweep),
+        float(reference.covered.mean()) if reference else 0.0,
+        rows,
+        details,
+    )
+
+
+def _scored(
+    poses: dict[str, RigidTransform], reference: Reference, sweep: Sweep, tracked: Tracked
+) -> dict[str, RigidTransform]:
+    """Poses to score; where nothing told the sign of the motion, the mirror image that fits is scored."""
+    if tracked.direction_from != "assumed" or "pose" in poses:
+        return poses
+    centre, used = sweep.grid.centre_mm, reference.covered
+    image = align_sign(poses["image"][used], reference.world_from_image, centre)
+    if np.allclose(image.as_matrix(), poses["image"][used].as_matrix()):
+        return poses
+    flip = np.diag([1.0, 1.0, -1.0, 1.0])
+    mirror = {}
+    for mode, each in poses.items():
+        first = (each[0].inv() * each).as_matrix()
+        mirror[mode] = each[0] * RigidTransform.from_matrix(flip @ first @ flip)
+    return mirror if set(poses) == {"image"} else {**poses, "image": mirror["image"]}
+
+
+def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
+    fit = correction.fit
+    return {
+        "curves": correction.settings.curves,
+        "coverage": correction.coverage,
+        "rms": fit.rms,
+        "condition_number": fit.condition_number,
+        "evaluations": fit.evaluations,
+        "converged": fit.converged,
+        "parameters": dict(zip(fit.names, fit.parameters.tolist(), strict=True)),
+        "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
+    }
+
+
+class _Strip:
+    """A few vectors about the middle of every frame, pooled in depth: enough for a reslice, and small."""
+
+    def __init__(self, sweep: Sweep, config: Config) -> None:
+        grid = IntensityExtractor.for_sweep(sweep, config.intensity).grid
+        width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
+        self._first = (grid.vectors - width) // 2
+        self._pool = max(1, round(STRIP_SPACING_MM / grid.sample_spacing_mm))
+        self.grid = ImageGrid(
+            width,
+            grid.samples // self._pool,
+            grid.vector_pitch_mm,
+            grid.sample_spacing_mm * self._pool,
+            grid.first_sample_depth_mm + (self._pool - 1) / 2 * grid.sample_spacing_mm,
+        )
+        self.left_mm = self._first * grid.vector_pitch_mm
+        self._images: list[npt.NDArray[np.float16]] = []
+
+    def keep(self, index: int, intensity: Float32Array) -> None:
+        """Keep the strip of the next frame."""
+        part = intensity[self._first : self._first + self.grid.vectors, : self.grid.samples * self._pool]
+        pooled = part.reshape(self.grid.vectors, self.grid.samples, self._pool).mean(axis=2)
+        decibel = 10 * np.log10(np.maximum(pooled, 1e-12))
+        self._images.append(decibel.astype(np.float16))
+
+    def __getitem__(self, index: int) -> Float32Array:
+        return self._images[index].astype(np.float32)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (frame, vector, sample)."""
+        return len(self._images), self.grid.vectors, self.grid.samples
+
+
+def _draw(
+    directory: Path,
+    sweep: Sweep,
+    poses: dict[str, RigidTransform],
+    reference: Reference | None,
+    strip: _Strip,
+) -> list[Path]:
+    drift = figure_drift(
+        poses,
+        sweep.grid.centre_mm,
+        reference.world_from_image if reference else None,
+        reference.covered if reference else None,
+        reference.name if reference else "reference",
+        sweep.name,
+    )
+    shown = dict(poses)
+    if reference is not None and reference.covered.all():
+        shown[reference.name] = reference.world_from_image
+    left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
+    images, extents = {}, {}
+    for mode, world_from_image in shown.items():
+        images[mode], extents[mode] = _reslice(strip, world_from_image * left)
+    reslice = figure_reslice(images, extents, title=f"{sweep.name}: along the sweep, at the middle vector")
+    return [
+        save_figure(drift, directory / "drift.png"),
+        save_figure(reslice, directory / "reslice.png"),
+    ]
+
+
+def _reslice(
+    strip: _Strip, world_from_image: RigidTransform
+) -> tuple[Float32Array, tuple[float, float, float, float]]:
+    plane = along_sweep_plane(world_from_image, strip.grid, strip.grid.width_mm / 2, pixel_mm=0.1)
+    plane = replace(plane, height_mm=min(plane.height_mm, 200.0), width_mm=min(plane.width_mm, 400.0))
+    steps = np.abs(np.diff((world_from_image[0].inv() * world_from_image).translation[:, 2]))
+    reach = max(0.3, 2.0 * float(np.percentile(steps, 99)))
+    image = reslice_frames(strip, strip.grid, world_from_image, plane, reach)
+    return image, (0.0, plane.width_mm, plane.height_mm, 0.0)
