@@ -1,5 +1,7 @@
 import json
 import pickle
+import signal
+import threading
 import tracemalloc
 from dataclasses import replace
 
@@ -144,6 +146,8 @@ CORRUPTIONS = [
     (entry("tracker/world_from_sensor", (4, 0, 0), 9.0), r"/world_from_sensor\[4\]: expected a rigid"),
     (entry("tracker/world_from_sensor", 4, np.diag([1, 1, -1, 1])), r"/world_from_sensor\[4\]: expected a r"),
     (entry("truth/world_from_image", (2, 3, 3), 2.0), r"/truth/world_from_image\[2\]: expected a rigid"),
+    (entry("truth/world_from_image", (2, 0, 0), 1e300), r"/truth/world_from_image\[2\]: expected a rigid"),
+    (entry("orientation/quaternion_wxyz", (5, 0), 1e300), r"/quaternion_wxyz\[5\]: expected a unit"),
     (entry("tracker/valid", slice(None), False), r"/tracker/valid: expected a valid sample, got none"),
     (replaced("tracker/valid", np.ones(4, bool)), r"/tracker/valid: expected shape \(18,\), got \(4,\)"),
     (without_attribute("rf", "vector_pitch_mm"), r"/rf: expected attribute vector_pitch_mm, got none"),
@@ -182,6 +186,15 @@ def test_what_is_wrong_is_named_in_one_line(path, edit, message):
     assert str(path) in str(caught.value)
     assert str(caught.value).count(str(path)) == 1
     assert "\n" not in str(caught.value)
+
+
+def test_rounding_in_a_pose_is_forgiven(path):
+    with h5py.File(path, "r+") as file:
+        # A float32 writer leaves about 1e-7 everywhere, the last row included.
+        file["truth/world_from_image"][2] += 1e-7
+    np.testing.assert_allclose(
+        read_sweep(path).truth.as_matrix(), sweep_examples.rf_sweep().truth.as_matrix(), atol=1e-6
+    )
 
 
 def test_a_member_of_the_wrong_kind_is_named(path):
@@ -325,6 +338,29 @@ def test_an_interrupted_writer_leaves_nothing(tmp_path, error):
     with pytest.raises(error):
         append_all(tmp_path / "s.h5", frames(), [0.0, 1.0])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_control_c_is_not_lost_while_frames_are_written_or_read(tmp_path):
+    sweep = replace(sweep_examples.rf_sweep(1, 128, 2048), orientation=None, tracker=None)
+    write_sweep(tmp_path / "whole.h5", sweep)
+    frames = read_sweep(tmp_path / "whole.h5").frames
+
+    def endlessly(act):
+        # Seconds more than the timer below, and few enough to fail rather than hang.
+        for i in range(2000):
+            act(i)
+
+    def write():
+        with SweepWriter(tmp_path / "s.h5", sweep.grid, sweep.signal) as writer:
+            endlessly(lambda i: writer.append(sweep.frames[0], i))
+
+    for work in (write, lambda: endlessly(lambda i: frames[0])):
+        timer = threading.Timer(0.1, signal.raise_signal, (signal.SIGINT,))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        timer.join()
+    assert [p.name for p in tmp_path.iterdir()] == ["whole.h5"]
 
 
 def test_an_interrupted_writer_leaves_the_old_file(path):
