@@ -1,7 +1,9 @@
 import json
 import pickle
 import signal
-import threading
+import subprocess
+import sys
+import time
 import tracemalloc
 from dataclasses import replace
 
@@ -340,26 +342,37 @@ def test_an_interrupted_writer_leaves_nothing(tmp_path, error):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_control_c_is_not_lost_while_frames_are_written_or_read(tmp_path):
-    sweep = replace(sweep_examples.rf_sweep(1, 128, 2048), orientation=None, tracker=None)
-    write_sweep(tmp_path / "whole.h5", sweep)
-    frames = read_sweep(tmp_path / "whole.h5").frames
+ENDLESS = """
+import itertools, sys
+from speckle3d.io.sweep_writer import SweepWriter
+from speckle3d.io.sweeps import read_sweep
+whole, target = sys.argv[1:]
+sweep = read_sweep(whole)
+frame = sweep.frames[0]
+print("started", flush=True)
+if target == "none":
+    for i in itertools.count():
+        sweep.frames[i % len(sweep)]
+with SweepWriter(target, sweep.grid, sweep.signal) as writer:
+    for i in itertools.count():
+        writer.append(frame, i)
+"""
 
-    def endlessly(act):
-        # Seconds more than the timer below, and few enough to fail rather than hang.
-        for i in range(2000):
-            act(i)
 
-    def write():
-        with SweepWriter(tmp_path / "s.h5", sweep.grid, sweep.signal) as writer:
-            endlessly(lambda i: writer.append(sweep.frames[0], i))
-
-    for work in (write, lambda: endlessly(lambda i: frames[0])):
-        timer = threading.Timer(0.1, signal.raise_signal, (signal.SIGINT,))
-        timer.start()
-        with pytest.raises(KeyboardInterrupt):
-            work()
-        timer.join()
+@pytest.mark.parametrize("target", ["none", "new.h5"])
+def test_control_c_is_not_lost_while_frames_are_read_or_written(tmp_path, target):
+    write_sweep(tmp_path / "whole.h5", sweep_examples.rf_sweep(8, 128, 2048))
+    command = [sys.executable, "-c", ENDLESS, "whole.h5", target]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline().strip() == b"started"
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        try:
+            _, trace = process.communicate(timeout=10)  # it stops within a frame, some milliseconds
+        finally:
+            process.kill()
+    assert trace.strip().endswith(b"KeyboardInterrupt")
+    assert b"Exception ignored" not in trace
     assert [p.name for p in tmp_path.iterdir()] == ["whole.h5"]
 
 
