@@ -64,3 +64,90 @@ def fill_holes(voxels, cap):
                 filled[tuple(at)] = np.nanmean(cube)
                 break
     return filled
+
+
+def linear_array_response(points_mm, frequency_hz, *, step_mm, pitch_mm, elements, focus_mm, widths_mm,
+                          edge_weight, height_mm, lens_focus_mm, speed_m_s):  # fmt: skip
+    """Two-way response of a focused linear array with a lens at points of one depth, point by point.
+
+    A plain Rayleigh-Sommerfeld sum over squares of about `step_mm` on the array's face, elements focused
+    at `focus_mm` and apodised over `widths_mm` (both: transmit, receive). points_mm: (n, 3). Returns
+    (n, frequencies).
+    """
+    per_element = max(round(pitch_mm / step_mm), 1)
+    element = (np.arange(elements) - (elements - 1) / 2) * pitch_mm
+    x = np.add.outer(element, ((np.arange(per_element) + 0.5) / per_element - 0.5) * pitch_mm)
+    z = ((np.arange(round(height_mm / step_mm)) + 0.5) / round(height_mm / step_mm) - 0.5) * height_mm
+    lens_path = lens_focus_mm - np.sqrt(lens_focus_mm**2 + z**2)
+    k = 2e-3 * np.pi * np.asarray(frequency_hz) / speed_m_s
+    phase, weight = [], []
+    for focus, width in zip(focus_mm, widths_mm, strict=True):
+        phase.append(focus - np.sqrt(focus**2 + element**2))
+        hump = edge_weight + (1 - edge_weight) * np.cos(np.pi * element / width) ** 2
+        weight.append(np.where(np.abs(element) <= width / 2, hump, 0))
+    out = np.zeros((len(points_mm), len(k)), complex)
+    for n, (px, py, pz) in enumerate(points_mm):
+        r = np.sqrt((px - x[:, :, None]) ** 2 + py**2 + (pz - z) ** 2)
+        for j, kj in enumerate(k):
+            per_element_field = (py / r**2 * np.exp(-1j * kj * (r + lens_path))).sum(axis=(1, 2))
+            sent, heard = (
+                (w * np.exp(-1j * kj * p) * per_element_field).sum()
+                for w, p in zip(weight, phase, strict=True)
+            )
+            out[n, j] = sent * heard
+    return out
+
+
+def scatter_echoes(position_mm, amplitude, vector_mm, field, reach, curvature, grid, sample_mm,
+                   cycles_per_mm, shape):  # fmt: skip
+    """Twin of `speckle3d.kernels.scatter.scatter_echoes`: every scatterer for every vector, in loops."""
+    out = np.zeros(shape, complex)
+    for v, vector in enumerate(vector_mm):
+        for (px, py, pz), a in zip(position_mm, amplitude, strict=True):
+            at = np.array([(py - grid[0]) / grid[1], abs(px - vector) / grid[2], abs(pz) / grid[3]])
+            low = np.floor(at).astype(int)
+            if (low < 0).any() or (low[:2] > np.array(field.shape[:2]) - 2).any():
+                continue
+            if low[2] >= reach[low[0], low[1]]:
+                continue
+            value = 0
+            for corner in np.ndindex(2, 2, 2):
+                weight = np.prod(np.where(np.array(corner) == 1, at - low, 1 - (at - low)))
+                value = value + weight * field[tuple(low + corner)]
+            part = at[0] - low[0]
+            kx, kz = (1 - part) * curvature[low[0]] + part * curvature[low[0] + 1]
+            path = py + kx * (px - vector) ** 2 + kz * pz**2
+            sample = int(path / sample_mm)
+            late = path / sample_mm - sample
+            value = a * value * np.exp(-2j * np.pi * cycles_per_mm * path)
+            out[v, sample] += (1 - late) * value
+            out[v, sample + 1] += late * value
+    return out
+
+
+def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius):
+    """Twin of `speckle3d.kernels.correlation.patch_correlations`: `numpy.corrcoef` sample by sample.
+
+    radius: (lateral, axial). Returns (p, 2 * lateral + 1, 2 * axial + 1).
+    """
+    lags = [(i, j) for i in range(-radius[0], radius[0] + 1) for j in range(-radius[1], radius[1] + 1)]
+    out = np.full((len(first), len(lags)), np.nan)
+    for p, (corner, about) in enumerate(zip(first, shift, strict=True)):
+        patch = [(corner[0] + v, corner[1] + s) for v in range(size[0]) for s in range(size[1])]
+        inside = [
+            (v, s)
+            for v, s in patch
+            if (0 <= v < fixed.shape[0] and 0 <= s < fixed.shape[1])
+            and all(
+                0 <= v + about[0] + i < moving.shape[0] and 0 <= s + about[1] + j < moving.shape[1]
+                for i, j in lags
+            )
+        ]
+        if not inside or len(inside) < least_overlap * size[0] * size[1]:
+            continue
+        a = np.array([fixed[at] for at in inside], float)
+        for n, (i, j) in enumerate(lags):
+            b = np.array([moving[v + about[0] + i, s + about[1] + j] for v, s in inside], float)
+            if np.ptp(a) > 0 and np.ptp(b) > 0:
+                out[p, n] = np.corrcoef(a, b)[0, 1]
+    return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -161,10 +162,13 @@ class BeamTable:
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
 
 
+@lru_cache(maxsize=2)
 def tabulate_beam(
     probe: Probe | None = None, grid: BeamGrid | None = None, attenuation_db_cm_mhz: float = 0.0
 ) -> BeamTable:
     """Compute the two-way field of `probe` by Rayleigh-Sommerfeld sums over elements and lens strips.
+
+    The last two tables are kept: the two sweeps of a pair, say, share one.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
-from speckle3d.simulation.medium import MEDIA, TiledMedium
+from speckle3d.simulation.medium import TiledMedium
 from speckle3d.simulation.movement import (
     HandMotion,
     frame_times,
@@ -20,6 +20,7 @@ from speckle3d.simulation.movement import (
     turned_about,
     world_from_medium,
 )
+from speckle3d.simulation.recipes import MEDIA
 from speckle3d.simulation.scan import Receiver, SimulatedFrames
 from speckle3d.simulation.sensors import (
     OrientationModel,

@@ -1,0 +1,100 @@
+"""Hand-like trajectories: their limits, their smoothness, the world they live in."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
+from speckle3d.simulation.movement import (
+    HandMotion,
+    frame_times,
+    hand_sweep,
+    stepped_poses,
+    turned_about,
+    world_from_medium,
+)
+
+HERE = RigidTransform.identity()
+
+
+def sweep(seed, motion=None, length_mm=20.0, duration_s=6.4):
+    rng = np.random.default_rng(seed)
+    return hand_sweep(length_mm, duration_s, 37.8, motion or HandMotion(), HERE, HERE, rng)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_sweep_stays_within_what_a_hand_does(seed):
+    poses = sweep(seed).medium_from_image(np.arange(160) / 25.0)
+    steps = relative_poses(poses)
+    # Speed at most doubles from unevenness and catching up after a pause; tremor adds a few times 0.02 mm.
+    assert np.abs(steps.translation[:, 2]).max() < 0.4
+    # Bounded by construction: twelve sinusoids of rms one never exceed sqrt(24).
+    pivot = poses.apply([18.9, 0.0, 0.0])
+    assert np.abs(pivot[:, :2] - [18.9, 0.0]).max() < np.sqrt(24) * (0.5 + 0.012) + 0.01
+    assert np.rad2deg(np.abs(roll_yaw_tilt(poses.rotation))).max() < np.sqrt(24) * 0.62
+    assert pivot[-1, 2] - pivot[0, 2] == pytest.approx(20.0, abs=0.3)
+
+
+def test_a_reversal_comes_back():
+    motion = HandMotion(reverse=True)
+    z = sweep(3, motion, duration_s=12.8).medium_from_image(np.arange(320) / 25.0).apply([18.9, 0, 0])[:, 2]
+    assert z.max() == pytest.approx(20.0, abs=0.2)
+    assert z[[0, -1]] == pytest.approx([0.0, 0.0], abs=0.3)
+    assert 120 < z.argmax() < 200
+
+
+def test_a_deliberate_turn_is_made_about_the_face():
+    still = HandMotion(0.0, 0, 0.0, 0.0, 0.0, (np.deg2rad(5.0), 0.0, 0.0), tremor_mm=0.0, tremor_rad=0.0)
+    poses = sweep(1, still).medium_from_image(np.array([0.0, 6.4]))
+    roll, yaw, tilt = roll_yaw_tilt(poses.rotation[-1])
+    assert np.rad2deg([roll, yaw, tilt]) == pytest.approx([0.0, 0.0, 5.0], abs=0.01)
+    # The hand starts and stops within 60 ms either side of the clock: 3 mm/s for a sixth of that.
+    np.testing.assert_allclose(poses.apply([18.9, 0.0, 0.0])[:, 2], [0.0, 20.0], atol=0.06)
+
+
+def test_pauses_stop_the_probe():
+    steady = HandMotion(0.0, 1, 0.5, 0.0, 0.0, tremor_mm=0.0, tremor_rad=0.0)
+    z = sweep(2, steady).medium_from_image(np.arange(160) / 25.0).translation[:, 2]
+    # Half a second at rest, less a twentieth at either end while the hand brakes: ten frames.
+    assert (np.abs(np.diff(z)) < 1e-3).sum() >= 10
+
+
+def test_a_trajectory_is_smooth_between_its_knots():
+    trajectory = sweep(4)
+    t = np.arange(1.0, 1.2, 1e-3)
+    position = trajectory.medium_from_image(t).translation
+    acceleration = np.diff(position, 2, axis=0) / 1e-3**2
+    # Tremor of 12 um at 12 Hz: (2 pi 12)^2 0.012 mm = 70 mm/s^2, times the peak factor, plus starts.
+    assert np.abs(acceleration).max() < 1000.0
+    assert np.abs(np.diff(acceleration, axis=0)).max() < 100.0
+
+
+def test_times_beyond_the_knots_are_refused():
+    with pytest.raises(InvalidInputError, match=r"expected -0\.500 to 6\.900 s"):
+        sweep(1).medium_from_image(np.array([8.0]))
+
+
+def test_the_frame_clock_increases_with_a_little_jitter():
+    times = frame_times(200, 25.0, np.random.default_rng(1))
+    assert (np.diff(times) > 0).all()
+    assert 1e-4 < np.diff(times).std() < 1e-3
+
+
+def test_steps_are_exact_and_blocks_apart():
+    z = stepped_poses(5, 0.05, 3, 8.0).translation[:, 2]
+    np.testing.assert_allclose(np.diff(z[:5]), 0.05, atol=1e-12)
+    assert z[5] - z[4] == pytest.approx(8.0)
+
+
+def test_the_probe_looks_down_in_the_world():
+    np.testing.assert_allclose(world_from_medium(0.7).rotation.apply([0, 1, 0]), [0, 0, -1], atol=1e-12)
+
+
+def test_a_crossing_sweep_starts_turned_about_the_beam():
+    turned = turned_about(np.array([19.0, 0.0, 10.0]), np.pi / 2)
+    np.testing.assert_allclose(turned.apply([19.0, 5.0, 10.0]), [19.0, 5.0, 10.0], atol=1e-12)
+    np.testing.assert_allclose(turned.rotation.apply([0, 0, 1]), [1, 0, 0], atol=1e-12)

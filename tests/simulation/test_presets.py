@@ -1,0 +1,65 @@
+"""Presets: from settings to whole sweeps."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from speckle3d.core.geometry import roll_yaw_tilt
+from speckle3d.simulation import SimulationSettings, simulate
+
+
+def small(preset, **changes):
+    return SimulationSettings(preset=preset, **{"seed": 3, "vectors": 4, "samples": 600, **changes})
+
+
+@pytest.mark.parametrize("preset", ["phantom", "tissue", "reversal", "rotation", "crossed", "stepped"])
+def test_every_preset_makes_sweeps_with_truth_and_seed(preset):
+    made = simulate(small(preset))
+    assert len(made) == (2 if preset == "crossed" else 1)
+    for item in made:
+        sweep = item.sweep
+        assert sweep.truth is not None
+        assert item.settings.seed == 3
+        frame = sweep.frames[len(sweep) // 2]
+        assert frame.shape == (4, 600)
+        assert frame.std() > 30
+        if preset != "stepped":
+            assert sweep.tracker.covers(sweep.frame_time_s).all()
+            assert sweep.orientation.covers(sweep.frame_time_s).all()
+
+
+def test_the_same_seed_gives_the_same_sweep_and_another_another():
+    a, b, c = (simulate(small("tissue", seed=s))[0].sweep for s in (5, 5, 6))
+    np.testing.assert_array_equal(a.frames[7], b.frames[7])
+    np.testing.assert_array_equal(a.truth.as_matrix(), b.truth.as_matrix())
+    np.testing.assert_array_equal(a.orientation.accelerometer_m_s2, b.orientation.accelerometer_m_s2)
+    assert not np.array_equal(a.frames[7], c.frames[7])
+    assert not np.allclose(a.truth.as_matrix(), c.truth.as_matrix())
+
+
+def test_a_rotation_turns_as_far_as_asked():
+    with_turn, without = (
+        simulate(small("rotation", turn_deg=t, turn_axis="yaw"))[0].sweep.truth.rotation for t in (6.0, 0.0)
+    )
+    turned, plain = (roll_yaw_tilt(r[0].inv() * r[-1]) for r in (with_turn, without))
+    assert np.rad2deg(turned - plain)[1] == pytest.approx(6.0, abs=0.1)
+
+
+def test_crossed_sweeps_cross():
+    first, second = (item.sweep for item in simulate(small("crossed")))
+    middle = [s.truth.rotation[len(s) // 2].apply([0, 0, 1]) for s in (first, second)]
+    # Within the few degrees that a hand wanders.
+    assert abs(middle[0] @ middle[1]) < np.sin(np.deg2rad(8.0))
+
+
+def test_steps_are_blocks_of_equal_distance():
+    sweep = simulate(small("stepped", steps=3, step_mm=0.1, blocks=2))[0].sweep
+    z = (sweep.truth[0].inv() * sweep.truth).translation[:, 2]
+    np.testing.assert_allclose(np.diff(z)[[0, 1, 3, 4]], 0.1, atol=1e-9)
+    assert np.diff(z)[2] > 5.0
+
+
+@pytest.mark.parametrize("wrong", [{"preset": "moon"}, {"vectors": 0}, {"length_mm": -1.0}, {"noise": 3}])
+def test_settings_refuse_what_cannot_be_simulated(wrong):
+    with pytest.raises(ValidationError):
+        SimulationSettings(**wrong)

@@ -1,0 +1,125 @@
+"""Simulated frames: determinism, statistics, invariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import hilbert
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.simulation.beam import tabulate_beam
+from speckle3d.simulation.medium import PointMedium, TiledMedium
+from speckle3d.simulation.recipes import fully_developed, tissue
+from speckle3d.simulation.scan import FULL_SCALE, Receiver, SimulatedFrames
+
+STILL = RigidTransform.from_matrix(np.eye(4)[None])
+
+
+@pytest.fixture(scope="module")
+def beam():
+    return tabulate_beam(attenuation_db_cm_mhz=0.3)
+
+
+def image(vectors, beam, samples=3818):
+    return ImageGrid(vectors, samples, 0.3, beam.probe.signal.sample_spacing_mm)
+
+
+def test_uniform_speckle_is_fully_developed_at_every_depth(beam):
+    frames = SimulatedFrames(beam, fully_developed(7, 20.0), STILL, image(48, beam), Receiver(snr_db=60.0))
+    rf = frames[0].astype(float)
+    intensity = np.abs(hilbert(rf, axis=-1)) ** 2
+    for depth_mm in (5, 10, 20, 30, 40):
+        row = round(depth_mm / frames.image.sample_spacing_mm)
+        patch = intensity[:, row - 250 : row + 250]
+        # About 14.4 mm x 5.8 mm / (0.5 mm x 0.12 mm) = 1400 cells. Variance of the contrast of exponential
+        # intensity is 1 / cells (delta method): standard error 0.027; three of them.
+        assert patch.std() / patch.mean() == pytest.approx(1.0, abs=0.08)
+        # Mean intensity: standard error 0.027 likewise; the amplitude is its root.
+        assert rf[:, row - 250 : row + 250].std() == pytest.approx(350.0, rel=0.06)
+
+
+def test_a_frame_is_the_same_however_often_and_in_whatever_order_it_is_read(beam):
+    poses = RigidTransform.from_translation([[0, 0, 0.0], [0, 0, 5.0], [0, 0, 0.4]])
+    one, other = (
+        SimulatedFrames(beam, tissue(3, 20.0), poses, image(6, beam), noise_entropy=4) for _ in range(2)
+    )
+    forward, backward = [one[i] for i in range(3)], [other[i] for i in (2, 1, 0)][::-1]
+    np.testing.assert_array_equal(forward, backward)
+    np.testing.assert_array_equal(one[-1], forward[2])
+
+
+def test_another_seed_is_another_noise(beam):
+    medium = PointMedium(np.array([[0.0, 20.0, 0.0]]), np.zeros(1, np.float32))
+    a, b = (SimulatedFrames(beam, medium, STILL, image(2, beam), noise_entropy=n)[0] for n in (1, 2))
+    assert np.corrcoef(a.ravel(), b.ravel())[0, 1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_electronic_noise_is_as_far_below_speckle_as_asked_at_the_focus_and_grows_with_gain(beam):
+    medium = PointMedium(np.array([[0.0, 20.0, 0.0]]), np.zeros(1, np.float32))
+    noise = SimulatedFrames(beam, medium, STILL, image(32, beam), Receiver(snr_db=30.0))[0].astype(float)
+    at = {d: round(d / beam.probe.signal.sample_spacing_mm) for d in (20, 38)}
+    level = {d: noise[:, row - 100 : row + 100].std() for d, row in at.items()}
+    # 6400 samples, a third of them independent: 1.5 % standard error, and the gain's slope.
+    assert level[20] == pytest.approx(350.0 * 10**-1.5, rel=0.06)
+    assert level[38] > 2.0 * level[20]
+
+
+def test_moving_medium_and_probe_together_changes_nothing(beam):
+    rng = np.random.default_rng(5)
+    position = rng.uniform([-2, 5, -2], [4, 35, 2], (3000, 3))
+    strength = rng.standard_normal(3000).astype(np.float32)
+    shift = RigidTransform.from_components([12.0, -7.0, 31.0], Rotation.from_rotvec([0.3, -1.1, 0.7]))
+    here = SimulatedFrames(beam, PointMedium(position, strength), STILL, image(8, beam))
+    there = SimulatedFrames(beam, PointMedium(shift.apply(position), strength), shift * STILL, image(8, beam))
+    # Rounding of positions may tip a count over its edge.
+    assert np.abs(here[0].astype(int) - there[0]).max() <= 1
+
+
+def test_counts_are_fourteen_bits(beam):
+    medium = PointMedium(np.array([[0.3, 20.0, 0.0]]), np.full(1, 1e4, np.float32))
+    frame = SimulatedFrames(beam, medium, STILL, image(3, beam))[0]
+    assert frame.dtype == np.int16
+    assert frame.max() == FULL_SCALE
+    assert frame.min() == -FULL_SCALE
+
+
+def test_a_medium_needs_the_memory_of_its_neighbourhood_only(beam):
+    medium = TiledMedium(1, 1.0, 0.3)
+    far = RigidTransform.from_translation(np.outer(np.arange(0.0, 800.0, 8.0), [0.0, 0.0, 1.0]))
+    frames = SimulatedFrames(beam, medium, far, image(4, beam))
+    for i in range(len(frames)):
+        frames.medium.within(*_box(i * 8.0))
+    assert len(medium._tiles) <= 160
+
+
+def test_tiles_join_without_a_seam():
+    low, high = np.array([-6.0, 0.0, -6.0]), np.array([6.0, 0.0, 6.0])
+    for medium in (TiledMedium(1, 50.0, 0.0), tissue(1, 20.0)):
+        position = np.concatenate([p for p, _ in medium.within(low, high)])
+        edge = np.abs(((position[:, 2] + 2.0) % 4.0) - 2.0) < 0.25
+        # An eighth of the volume lies this close to an edge; clusters and cysts make the count uneven.
+        assert edge.mean() == pytest.approx(0.125, rel=0.1)
+
+
+def test_tissue_has_cysts_layers_and_a_poorly_filled_depth():
+    medium = tissue(4, 20.0)
+    blocks = medium.within(np.array([0.0, 0.0, 0.0]), np.array([18.0, 0.0, 10.0]))
+    position = np.concatenate([p for p, _ in blocks])
+    power = np.concatenate([s for _, s in blocks]).astype(float) ** 2
+    by_depth = np.histogram(position[:, 1], [3.0, 6.0, 17.0, 22.0, 32.0, 42.0], weights=power)[0]
+    by_depth /= [3.0, 11.0, 5.0, 10.0, 10.0]
+    assert by_depth[-1] < 0.2 * by_depth[2]
+    assert by_depth[0] < 0.6 * by_depth[2]
+    for cyst in medium.spheres:
+        assert (np.linalg.norm(position - cyst.centre_mm, axis=1) >= cyst.radius_mm).all()
+
+
+def test_every_medium_of_another_seed_is_another():
+    a, b = (tissue(seed, 20.0).within(np.zeros(3), np.zeros(3))[0][0] for seed in (1, 2))
+    assert a.shape != b.shape or not np.allclose(a, b)
+    assert replace(tissue(1, 20.0), entropy=9).within(np.zeros(3), np.zeros(3))[0][0].shape != a.shape
+
+
+def _box(z_mm):
+    return np.array([0.0, 0.0, z_mm - 4.0]), np.array([38.0, 0.0, z_mm + 4.0])

@@ -1,0 +1,134 @@
+"""Simulated sensors: each on its own clock, with the errors that its model states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.simulation.movement import HandMotion, hand_sweep, world_from_medium
+from speckle3d.simulation.sensors import (
+    OrientationModel,
+    TrackerModel,
+    simulate_orientation,
+    simulate_tracker,
+)
+
+HERE = RigidTransform.identity()
+SPAN_S = (-0.3, 20.3)
+FRAMES_S = np.arange(500) / 25.0
+EXACT = OrientationModel(
+    clock_jitter_s=0.0,
+    inclination_rad=0.0,
+    heading_rad=0.0,
+    white_rad=0.0,
+    gyroscope_rad_s=0.0,
+    gyroscope_bias_rad_s=0.0,
+    accelerometer_m_s2=0.0,
+    accelerometer_bias_m_s2=0.0,
+    magnetometer_au=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def trajectory():
+    rng = np.random.default_rng(11)
+    return hand_sweep(20.0, 20.0, 37.8, HandMotion(), HERE, world_from_medium(0.6), rng)
+
+
+def test_tracker_errors_are_the_stated_jitter(trajectory):
+    model = TrackerModel()
+    tracker = simulate_tracker(trajectory, SPAN_S, model, np.random.default_rng(1))
+    times = tracker.readings.time_s + tracker.time_offset_s
+    true = trajectory.world_from_image(times) * model.sensor_from_image.inv()
+    error = true.inv() * tracker.readings.world_from_sensor
+    # About 1000 samples: standard deviations to 2.2 %; four standard errors.
+    shift = tracker.readings.world_from_sensor.translation - true.translation
+    assert shift.std(axis=0) == pytest.approx([0.15] * 3, rel=0.09)
+    assert np.rad2deg(error.rotation.as_rotvec()).std(axis=0) == pytest.approx([0.1] * 3, rel=0.09)
+
+
+def test_tracker_latency_is_recorded_and_undone(trajectory):
+    exact = TrackerModel(position_mm=0.0, orientation_rad=0.0)
+    tracker = simulate_tracker(trajectory, SPAN_S, exact, np.random.default_rng(1))
+    assert tracker.time_offset_s == pytest.approx(-0.04)
+    error = trajectory.world_from_image(FRAMES_S).inv() * tracker.world_from_image(FRAMES_S)
+    # Linear interpolation over 20 ms of tremor: (2 pi 12)^2 0.012 mm (20 ms)^2 / 8, peaks five times that,
+    # and a 110 mm lever with 0.016 deg of tremor.
+    assert np.abs(error.translation).max() < 0.1
+    late = replace(tracker, time_offset_s=0.0).world_from_image(FRAMES_S[10:])
+    assert np.abs(late.translation - tracker.world_from_image(FRAMES_S[10:]).translation).mean() > 0.02
+
+
+def test_dropouts_leave_gaps(trajectory):
+    full, gappy = (
+        simulate_tracker(trajectory, SPAN_S, TrackerModel(dropouts=d), np.random.default_rng(1))
+        for d in (0.0, 0.3)
+    )
+    assert len(gappy.readings) == pytest.approx(0.7 * len(full.readings), rel=0.1)
+
+
+def test_exact_sensor_gives_the_true_orientation(trajectory):
+    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
+    true = trajectory.world_from_image(FRAMES_S).rotation
+    error = (true.inv() * sensor.world_from_image(FRAMES_S)).magnitude()
+    # Slerp over 10 ms of tremor: (2 pi 12)^2 0.016 deg (10 ms)^2 / 8 times a peak factor of five.
+    assert np.rad2deg(error).max() < 0.01
+
+
+def test_orientation_error_over_a_sweep_is_an_mt9s(trajectory):
+    drifts = []
+    for seed in range(40):
+        sensor = simulate_orientation(trajectory, SPAN_S, OrientationModel(), np.random.default_rng(seed))
+        error = sensor.world_from_image([1.0, 7.0]) * trajectory.world_from_image([1.0, 7.0]).rotation.inv()
+        drifts.append(np.diff(error.as_rotvec(degrees=True), axis=0)[0])
+    roll, pitch, heading = np.std(drifts, axis=0)
+    # sigma sqrt(2 (1 - exp(-6 / 40))): 0.08 and 0.26 deg, and 0.04 of white noise; 40 draws give 11 %.
+    assert 0.05 < roll < 0.13
+    assert 0.05 < pitch < 0.13
+    assert 0.17 < heading < 0.37
+
+
+def test_gyroscope_integrates_to_the_orientation(trajectory):
+    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
+    readings = sensor.readings
+    rates = sensor.gyroscope_rad_s
+    steps = (readings.world_from_sensor[:-1].inv() * readings.world_from_sensor[1:]).as_rotvec()
+    dt = np.diff(readings.time_s)[:, None]
+    # The trapezoidal rule on 12 Hz over 10 ms: (2 pi 12 0.01)^2 / 12 of the largest step.
+    worst = np.abs(steps).max()
+    np.testing.assert_allclose(dt * (rates[1:] + rates[:-1]) / 2, steps, atol=0.06 * worst)
+
+
+def test_accelerometer_feels_gravity_and_the_sweep(trajectory):
+    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
+    force = sensor.readings.world_from_sensor.apply(sensor.accelerometer_m_s2)
+    assert force.mean(axis=0) == pytest.approx([0.0, 0.0, 9.81], abs=0.01)
+    # Integrated twice, the specific force less gravity is the sensor's own path.
+    dt = np.diff(sensor.readings.time_s).mean()
+    path = 1e3 * np.cumsum(np.cumsum(force - [0, 0, 9.81], axis=0), axis=0) * dt**2
+    times = sensor.readings.time_s + sensor.time_offset_s
+    true = trajectory.world_from_image(times).apply(np.array(EXACT.lever_mm))
+    line = np.stack([np.ones_like(times), times], axis=1)
+    rest = (true - path) - line @ np.linalg.lstsq(line, true - path, rcond=None)[0]
+    # Half a percent of the 20 mm travelled: sums of 100 Hz samples are no integrals.
+    assert np.abs(rest).max() < 0.1
+
+
+def test_magnetometer_points_north_and_down(trajectory):
+    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
+    field = sensor.readings.world_from_sensor.apply(sensor.magnetometer_au)
+    dip = np.deg2rad(66.0)
+    np.testing.assert_allclose(field, np.tile([np.cos(dip), 0, -np.sin(dip)], (len(field), 1)), atol=1e-9)
+
+
+def test_raw_noise_is_that_of_the_model(trajectory):
+    noisy, exact = (
+        simulate_orientation(trajectory, SPAN_S, m, np.random.default_rng(3))
+        for m in (OrientationModel(clock_jitter_s=0.0), EXACT)
+    )
+    rate = np.rad2deg(noisy.gyroscope_rad_s - exact.gyroscope_rad_s)
+    force = noisy.accelerometer_m_s2 - exact.accelerometer_m_s2
+    # 2000 samples: 1.6 % standard error; five of them. Bands measured on static MT9-B logs.
+    assert rate.std(axis=0) == pytest.approx([0.6] * 3, rel=0.08)
+    assert force.std(axis=0) == pytest.approx([0.015] * 3, rel=0.08)
