@@ -203,7 +203,11 @@ def _fit_motion(
     covariance = np.zeros((3, 3))
     covariance[0, 0] = lateral_covariance[0, 0]
     covariance[1:, 1:] = axial_covariance[:2, :2]
-    motion = InPlaneMotion(-float(lateral[0]), -float(axial[0]), -float(axial[1]), covariance)
+    # The centre's shift is seen in the second image's axes; its displacement is told in the first's.
+    roll = -float(axial[1])
+    c, s = np.cos(roll), np.sin(roll)
+    x, y = s * axial[0] - c * lateral[0], -s * lateral[0] - c * axial[0]
+    motion = InPlaneMotion(float(x), float(y), roll, covariance)
     return motion, np.stack([design @ lateral, design @ axial], axis=1)
 
 

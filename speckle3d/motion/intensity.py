@@ -147,9 +147,9 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
 
 
 def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:
-    """One inside the band, raised-cosine edges outside it."""
-    outside = np.maximum(low - frequency, frequency - high)
-    return np.asarray(np.where(outside < edge, np.cos(np.pi / 2 * np.clip(outside / edge, 0, 1)) ** 2, 0.0))
+    """One inside the band, raised-cosine edges outside it; the lower edge ends before zero frequency."""
+    outside = np.maximum((low - frequency) / min(edge, low), (frequency - high) / edge)
+    return np.asarray(np.where(outside < 1, np.cos(np.pi / 2 * np.clip(outside, 0, 1)) ** 2, 0.0))
 
 
 def _resample(frame: npt.NDArray[Any], plan: _Resampling, samples: int) -> Complex64Array:
