@@ -1,12 +1,44 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+# As the command line does, and before NumPy is loaded: a team of threads slows small factorisations down.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
 def realdata() -> Path:
     """Folder of third-party recordings, beside the project."""
-    folder = Path(__file__).resolve().parents[2] / "shared" / "realdata"
+    folder = ROOT.parent / "shared" / "realdata"
     if not folder.is_dir():
         pytest.skip(f"needs third-party recordings in {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def project() -> Path:
+    """The project's folder."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def shipped() -> Path:
+    """Folder of the sweep and the curves that come with the project."""
+    return ROOT / "data"
+
+
+@pytest.fixture(scope="session")
+def python():
+    """Run a few lines in a fresh interpreter and return what it prints."""
+
+    def run(code: str) -> str:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
