@@ -7,7 +7,8 @@ the Fourier domain on a fine periodic grid, read at any point by quintic splines
 import numpy as np
 from scipy import fft, ndimage
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.curves import CurveKey, DecorrelationCurves
+from speckle3d.core.sweep import ImageGrid, RFSettings
 
 LATERAL_MM, AXIAL_MM = 0.35, 0.12
 GRID = ImageGrid(
@@ -75,3 +76,24 @@ def intensity(amplitude):
 def decorrelated(amplitude, other, rho):
     """`amplitude` mixed with independent speckle so that intensities correlate by `rho`."""
     return np.sqrt(rho) * amplitude + np.sqrt(1.0 - rho) * other
+
+
+RF = RFSettings(
+    sampling_rate_hz=40e6, speed_of_sound_m_s=1540.0, centre_frequency_hz=7e6, bandwidth_hz=(4e6, 10e6)
+)
+KEY = CurveKey(RF, GRID.vector_pitch_mm, 3.6, 3.0, 2.0)
+
+
+def gaussian_correlation(d, sigma_mm):
+    """Correlation of intensity that belongs to `gaussian`."""
+    return np.exp(-(np.asarray(d) ** 2) / (2 * sigma_mm**2))
+
+
+def curves(correlation=gaussian_correlation, sigma_mm=0.45, cells=25.0, depth_mm=(5.0, 30.0), largest_mm=2.0):
+    """Decorrelation curves of a known law, its width the same (or given) at each depth."""
+    distance = np.linspace(0.0, largest_mm, 201)
+    widths = np.broadcast_to(sigma_mm, (len(depth_mm),))
+    rho = np.minimum.accumulate(np.maximum([correlation(distance, width) for width in widths], 1e-9), axis=1)
+    return DecorrelationCurves(
+        KEY, np.array(depth_mm), distance, rho, np.full(len(depth_mm), float(cells)), 100
+    )

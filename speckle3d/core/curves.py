@@ -37,7 +37,7 @@ class DecorrelationCurves:
     depth_mm : ndarray, shape (r,)
         Increasing.
     distance_mm : ndarray, shape (k,)
-        Increasing from zero.
+        Equal steps from zero.
     correlation : ndarray, shape (r, k)
         Decreasing along k.
     cells : ndarray, shape (r,)
@@ -57,6 +57,11 @@ class DecorrelationCurves:
                 f"correlation: expected shape ({self.depth_mm.size}, {self.distance_mm.size}), "
                 f"got {self.correlation.shape}"
             )
+        steps = np.diff(self.distance_mm)
+        if not steps.size or self.distance_mm[0] != 0 or not steps[0] > 0 or not np.allclose(steps, steps[0]):
+            raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
+        if self.cells.shape != self.depth_mm.shape or not (np.isfinite(self.cells) & (self.cells > 0)).all():
+            raise InvalidInputError("cells: expected a number above zero for each depth, got others")
         if not ((self.correlation > 0) & (self.correlation <= 1)).all():
             raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
         if (np.diff(self.correlation, axis=1) > 0).any():

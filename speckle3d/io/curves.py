@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import h5py
+import numpy as np
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.hdf5 import (
     PathLike,
@@ -45,6 +47,9 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         depth = read_checked(file, "depth_mm", ("r",))
+        require_finite(depth, "/depth_mm")
+        if not depth.size or (np.diff(depth) <= 0).any():
+            raise InvalidInputError("/depth_mm: expected depths that increase, got others")
         distance = read_checked(file, "distance_mm", ("k",))
         correlation = read_checked(file, "correlation", (depth.size, distance.size))
         cells = read_checked(file, "cells", (depth.size,))

@@ -37,6 +37,8 @@ class DistanceEstimator:
         self._cells = here.cells
         self._grid = curves.distance_mm
         self._rho = here.correlation
+        self._slope = -np.gradient(here.correlation, self._grid[1], axis=1)
+        self._slope[:, 0] = 0.0
         root = np.sqrt(-np.log(here.correlation))
         self._root_step = root.max() / (TABLE_STEPS - 1)
         roots = np.arange(TABLE_STEPS) * self._root_step
@@ -61,13 +63,15 @@ class DistanceEstimator:
         vanishes; there it is the squared distance whose deviation stays finite.
         """
         step = self._grid[1]
-        position = np.clip(np.abs(np.nan_to_num(distance_mm)) / step, 0, self._grid.size - 2.001)
+        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3)
+        position = np.clip(d / step, 0, self._grid.size - 2.001)
         cell = position.astype(int)
-        patch = np.arange(cell.size)
-        low, high = self._rho[patch, cell], self._rho[patch, cell + 1]
-        rho = low + (position - cell) * (high - low)
-        slope = (low - high) / step
+        patch, part = np.arange(cell.size), position - cell
+        rho, slope = (
+            (1 - part) * table[patch, cell] + part * table[patch, cell + 1]
+            for table in (self._rho, self._slope)
+        )
         sigma_rho = (1 - rho**2) / np.sqrt(self._cells)
-        d = np.maximum(position * step, 1e-3)
+        d = np.minimum(d, self._grid[-1])
         direct = sigma_rho / np.maximum(slope, 1e-9)
         return np.asarray(np.minimum(direct, np.sqrt(2 * d * direct)))

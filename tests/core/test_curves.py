@@ -1,0 +1,112 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import speckle
+
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.sweep import BModeSettings
+
+BMODE = BModeSettings(60.0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("sampling_rate_hz", 50e6),
+        ("speed_of_sound_m_s", 1580.0),
+        ("centre_frequency_hz", 6e6),
+        ("bandwidth_hz", (4e6, 9e6)),
+    ],
+)
+def test_curves_of_another_signal_are_refused_and_the_setting_named(setting, value):
+    other = replace(speckle.KEY, signal=replace(speckle.RF, **{setting: value}))
+    with pytest.raises(MismatchError, match=f"{setting} is ") as error:
+        speckle.KEY.require_same(other, "curves c.h5 and sweep s.h5")
+    assert str(error.value).startswith("curves c.h5 and sweep s.h5: ")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("setting", ["vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm"])
+def test_curves_of_another_geometry_are_refused_and_both_values_told(setting):
+    other = replace(speckle.KEY, **{setting: 1.25})
+    with pytest.raises(MismatchError, match=rf"{setting} is {getattr(speckle.KEY, setting)} and 1\.25"):
+        speckle.KEY.require_same(other)
+
+
+def test_rf_and_bmode_are_never_the_same():
+    for a, b in ((speckle.RF, BMODE), (BMODE, speckle.RF)):
+        with pytest.raises(MismatchError, match="signal is"):
+            replace(speckle.KEY, signal=a).require_same(replace(speckle.KEY, signal=b))
+    with pytest.raises(MismatchError, match=r"dynamic_range_db is 60\.0 and 70\.0"):
+        replace(speckle.KEY, signal=BMODE).require_same(replace(speckle.KEY, signal=BModeSettings(70.0)))
+
+
+def test_rounding_of_a_header_is_no_difference():
+    rounded = replace(
+        speckle.KEY,
+        vector_pitch_mm=0.30001,
+        signal=replace(speckle.RF, sampling_rate_hz=40.0001e6, bandwidth_hz=(4.0001e6, 10e6)),
+    )
+    speckle.KEY.require_same(rounded)
+    replace(speckle.KEY, equalise_mm=0.0).require_same(replace(speckle.KEY, equalise_mm=0.0))
+    with pytest.raises(MismatchError, match="equalise_mm"):
+        replace(speckle.KEY, equalise_mm=0.0).require_same(speckle.KEY)
+
+
+def test_between_two_depths_the_width_lies_between():
+    made = speckle.curves(sigma_mm=[0.3, 0.6], depth_mm=(10.0, 20.0))
+    between = made.at(np.array([10.0, 15.0, 20.0, 15.0]))
+    d = made.distance_mm[:60]
+    for row, width in zip(between.correlation, (0.3, 0.4, 0.6, 0.4), strict=True):
+        # sqrt(-ln rho) = d / (sigma sqrt 2) is linear in 1 / sigma: halfway lies 2 / (1/.3 + 1/.6) = 0.4.
+        np.testing.assert_allclose(row[:60], speckle.gaussian_correlation(d, width), rtol=1e-9)
+    assert between.key == made.key
+    assert between.pairs_used == made.pairs_used
+
+
+def test_cells_are_interpolated_too():
+    made = replace(speckle.curves(depth_mm=(10.0, 20.0)), cells=np.array([20.0, 40.0]))
+    assert made.at(np.array([12.5])).cells.tolist() == [25.0]
+
+
+def spoiled(**changes):
+    made = speckle.curves()
+    arrays = {
+        name: getattr(made, name).copy() for name in ("depth_mm", "distance_mm", "correlation", "cells")
+    }
+    for name, change in changes.items():
+        arrays[name] = change(arrays[name])
+    return lambda: DecorrelationCurves(made.key, **arrays)
+
+
+def put(index, value):
+    def change(array):
+        array[index] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"correlation": lambda a: a[:, 1:]}, r"correlation: expected shape \(2, 201\), got \(2, 200\)"),
+        ({"correlation": lambda a: a[:1]}, r"correlation: expected shape \(2, 201\), got \(1, 201\)"),
+        ({"correlation": put((1, 5), np.nan)}, r"correlation: expected values in \(0, 1\]"),
+        ({"correlation": put((0, 0), 1.01)}, r"correlation: expected values in \(0, 1\]"),
+        ({"correlation": put((1, -1), 0.0)}, r"correlation: expected values in \(0, 1\]"),
+        ({"correlation": put((1, 30), 0.999)}, "expected curves that fall with distance, got one that rises"),
+        ({"distance_mm": lambda a: a + 0.1}, "distance_mm: expected equal steps from zero"),
+        ({"distance_mm": lambda a: a[::-1]}, "distance_mm: expected equal steps from zero"),
+        ({"distance_mm": put(3, np.nan)}, "distance_mm: expected equal steps from zero"),
+        ({"distance_mm": lambda a: a**1.1}, "distance_mm: expected equal steps from zero"),
+        ({"cells": put(0, 0.0)}, "cells: expected a number above zero for each depth"),
+        ({"cells": put(1, np.nan)}, "cells: expected a number above zero for each depth"),
+        ({"cells": lambda a: a[:1]}, "cells: expected a number above zero for each depth"),
+    ],
+)
+def test_curves_that_cannot_be_are_refused(changes, message):
+    with pytest.raises(InvalidInputError, match=message):
+        spoiled(**changes)()

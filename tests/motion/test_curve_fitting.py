@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+import speckle
+
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples, fit_curves
+from speckle3d.motion.distances import DistanceEstimator
+from speckle3d.motion.patches import PatchGrid
+
+DEPTHS_MM = (8.0, 16.0, 24.0)
+WIDTHS_MM = (0.33, 0.5, 0.42)
+
+
+def seen_off_focus(d, sigma_mm):
+    """A curve that starts steeper than a Gaussian and ends flatter, as two widths mixed do."""
+    narrow, wide = (
+        speckle.gaussian_correlation(d, 0.8 * sigma_mm),
+        speckle.gaussian_correlation(d, 1.4 * sigma_mm),
+    )
+    return (0.6 * np.sqrt(narrow) + 0.4 * np.sqrt(wide)) ** 2
+
+
+LAWS = [speckle.gaussian_correlation, speckle.triangle_correlation, seen_off_focus]
+
+
+def samples(law, distances, noise_floor=1.0, cells=np.inf, repeats=1, seed=0, depths=DEPTHS_MM):
+    """Every distance at every depth, `repeats` times, with the scatter that so many cells leave."""
+    rng = np.random.default_rng(seed)
+    depth = np.repeat(depths, len(distances) * repeats)
+    distance = np.tile(np.repeat(distances, repeats), len(depths))
+    width = np.interp(depth, DEPTHS_MM, WIDTHS_MM)
+    rho = noise_floor * law(distance, width)
+    scatter = 0.0 if np.isinf(cells) else (1 - rho**2) / np.sqrt(cells)
+    return PhantomSamples(
+        depth, distance, rho + scatter * rng.normal(size=rho.size), len(distances) * repeats
+    )
+
+
+def read_distance(curves, correlation, depths=DEPTHS_MM):
+    """Distance at each depth for each correlation, shape (depth, correlation)."""
+    centres = np.array([(10.0, depth) for depth in depths])
+    patches = PatchGrid(np.zeros((len(depths), 2), int), np.array([12, 50]), centres, np.array([0.3, 0.06]))
+    estimator = DistanceEstimator(curves, patches)
+    return np.array([estimator.distances(row).distance_mm for row in np.transpose(correlation)]).T
+
+
+STEPPED = np.arange(0.0, 2.5, 0.1)
+FREEHAND = np.sort(np.random.default_rng(3).uniform(0.0, 2.5, 400))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("distances", [STEPPED, FREEHAND], ids=["stepped", "freehand"])
+def test_exact_samples_of_any_curve_give_its_distances_back(law, distances):
+    curves = fit_curves(speckle.KEY, [samples(law, distances)])
+    d = np.linspace(0.0, 2.5, 1001)
+    for depth, width in enumerate(WIDTHS_MM):
+        rho = law(d, width)
+        useful = (rho < 0.9) & (rho > 0.15) & (d < d[np.argmin(rho > 0.1)])
+        asked = np.broadcast_to(rho[useful], (len(DEPTHS_MM), useful.sum()))
+        found = read_distance(curves, asked)[depth]
+        assert np.abs(found / d[useful] - 1).max() < 0.02
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_many_noisy_pairs_give_the_distances_back(law):
+    curves = fit_curves(speckle.KEY, [samples(law, STEPPED, cells=60, repeats=80)])
+    d = np.array([0.15, 0.3, 0.45])
+    for depth, width in enumerate(WIDTHS_MM):
+        asked = np.broadcast_to(law(d, width), (len(DEPTHS_MM), d.size))
+        # A distance is known to 0.02 mm from 80 samples, and a polynomial is fitted through a dozen.
+        np.testing.assert_allclose(read_distance(curves, asked)[depth], d, atol=0.015)
+
+
+def test_sweeps_are_pooled_whatever_part_of_the_curve_each_of_them_holds():
+    near = samples(speckle.gaussian_correlation, np.arange(0.0, 0.5, 0.1))
+    far = samples(speckle.gaussian_correlation, np.arange(0.5, 2.5, 0.1))
+    pooled = fit_curves(speckle.KEY, [near, far])
+    whole = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED)])
+    np.testing.assert_allclose(pooled.correlation, whole.correlation, atol=1e-3)
+    assert pooled.pairs_used == near.pairs + far.pairs
+    assert pooled.depth_mm.tolist() == list(DEPTHS_MM)
+    assert pooled.key == speckle.KEY
+
+
+def test_what_noise_costs_is_no_distance():
+    """Electronic noise at 14 dB takes 4 % of every coefficient; the curve begins there."""
+    curves = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED, noise_floor=0.96)])
+    np.testing.assert_allclose(curves.correlation[:, 0], 0.96, atol=0.003)
+    asked = np.broadcast_to([0.99, 0.9605], (len(DEPTHS_MM), 2))
+    assert read_distance(curves, asked).max() < 0.03
+    d = np.array([0.2, 0.4, 0.6])
+    for depth, width in enumerate(WIDTHS_MM):
+        asked = np.broadcast_to(0.96 * speckle.gaussian_correlation(d, width), (len(DEPTHS_MM), d.size))
+        np.testing.assert_allclose(read_distance(curves, asked)[depth], d, rtol=0.02)
+
+
+@pytest.mark.parametrize("cells", [25, 100])
+def test_cells_are_those_that_explain_the_scatter(cells):
+    curves = fit_curves(
+        speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED[1:], cells=cells, repeats=100)]
+    )
+    # From the median of some 1000 deviations, itself known to 4 %, and squared; what is cut at the curve's
+    # end adds as much again.
+    np.testing.assert_allclose(curves.cells, cells, rtol=0.2)
+
+
+def test_patches_without_a_correlation_are_passed_over():
+    good = samples(speckle.gaussian_correlation, STEPPED)
+    rho = good.correlation.copy()
+    rho[::7] = np.nan
+    curves = fit_curves(speckle.KEY, [PhantomSamples(good.depth_mm, good.distance_mm, rho, good.pairs)])
+    np.testing.assert_allclose(
+        curves.correlation[:, :60], fit_curves(speckle.KEY, [good]).correlation[:, :60], atol=0.002
+    )
+
+
+@pytest.mark.parametrize(
+    ("distances", "message"),
+    [
+        ([0.0, 0.5], "got 2 down to"),
+        (np.arange(0.0, 0.2, 0.02), r"got \d down to 0\.\d\d"),
+    ],
+)
+def test_too_few_distances_or_too_little_of_the_curve_are_refused(distances, message):
+    with pytest.raises(InsufficientDataError, match=message) as error:
+        fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, distances)])
+    assert "\n" not in str(error.value)
+
+
+def test_the_depth_that_lacks_samples_is_named():
+    whole = samples(speckle.gaussian_correlation, STEPPED)
+    rho = np.where(whole.depth_mm == 16.0, np.nan, whole.correlation)
+    with pytest.raises(InsufficientDataError, match=r"curves at 16\.0 mm depth: .* got 0"):
+        fit_curves(speckle.KEY, [PhantomSamples(whole.depth_mm, whole.distance_mm, rho, 1)])
+
+
+def test_curves_never_rise_however_noisy_the_samples():
+    for seed in range(5):
+        noisy = samples(speckle.triangle_correlation, FREEHAND, cells=12, seed=seed)
+        curves = fit_curves(speckle.KEY, [noisy], CurveSettings(terms=5))
+        assert (np.diff(curves.correlation, axis=1) <= 0).all()
