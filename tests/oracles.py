@@ -151,3 +151,23 @@ def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius)
             if np.ptp(a) > 0 and np.ptp(b) > 0:
                 out[p, n] = np.corrcoef(a, b)[0, 1]
     return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
+
+
+def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
+    """Twin of `speckle3d.motion.planes.consistent_subset`: every plane, every patch, one after the other."""
+    n = len(distance_mm)
+    best, best_key = np.zeros(n, bool), None
+    for i in range(n):
+        for sign in (1.0, -1.0):
+            offset = sign * distance_mm[i] - at_mm[i] @ slopes
+            support, misfit = np.zeros(n, bool), 0.0
+            for j in range(n):
+                error = abs(abs(offset + at_mm[j] @ slopes) - distance_mm[j]) / sigma_mm[j]
+                if error <= support_sigma:
+                    support[j], misfit = True, misfit + error
+            if np.isnan(distance_mm[i]):
+                continue
+            key = (support.sum(), -misfit)
+            if best_key is None or key > best_key:
+                best, best_key = support, key
+    return best
