@@ -77,8 +77,9 @@ class CoarseMatcher:
     """Whole-frame cross-correlation by FFT: the shift to the nearest sample, without a first guess."""
 
     def __init__(self, grid: ImageGrid, search_mm: float) -> None:
-        # Axial samples are pooled to about a third of the speckle's length: faster, and no peak is lost.
-        self._pool = max(1, int(0.1 / grid.sample_spacing_mm))
+        # Intensity comes with two to four samples in a speckle: two may be pooled, and the peak is still
+        # found to the sample from which the matching goes on.
+        self._pool = 2 if grid.sample_spacing_mm < 0.05 else 1
         self._reach = (
             int(np.ceil(search_mm / grid.vector_pitch_mm)),
             int(np.ceil(search_mm / (grid.sample_spacing_mm * self._pool))),
@@ -174,9 +175,14 @@ def _patch_peaks(
 
 
 def _logarithm_or_self(rho: FloatArray) -> FloatArray:
-    """ln(rho) of patches whose every lag is well above zero; else rho itself."""
-    sound = np.nanmin(np.where(np.isnan(rho), np.inf, rho), axis=(1, 2)) > LEAST_CORRELATION
-    return np.where(sound[:, None, None], np.log(np.maximum(rho, LEAST_CORRELATION)), rho)
+    """ln(rho) of patches whose lags along both axes are well above zero; else rho itself."""
+    return np.where(_sound(rho)[:, None, None], np.log(np.maximum(rho, LEAST_CORRELATION)), rho)
+
+
+def _sound(rho: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which patches' logarithms carry: the corners, which weigh little, may be lower."""
+    cross = np.concatenate([rho[:, 1, :], rho[:, ::2, 1]], axis=1)
+    return np.asarray(np.nan_to_num(cross, nan=1.0).min(axis=1) > LEAST_CORRELATION)
 
 
 def _vertex(before: FloatArray, at: FloatArray, after: FloatArray) -> FloatArray:
@@ -219,7 +225,7 @@ def _robust_fit(
     for _ in range(rounds):
         w = weight * robust
         normal = design.T @ (design * w[:, None])
-        inverse = np.linalg.pinv(normal, hermitian=True)
+        inverse = np.linalg.inv(normal)
         solution = inverse @ (design.T @ (w * data))
         size = np.abs(data - design @ solution) * np.sqrt(weight)
         scale = 1.4826 * np.median(size) + 1e-12
@@ -230,7 +236,7 @@ def _robust_fit(
 def _read_at(rho: FloatArray, offset: FloatArray) -> FloatArray:
     """Correlation a fraction of a lag off the centre, by quadratics through ln(rho) in both directions."""
     lateral, axial = (_quadratic_weights(np.clip(offset[:, k], -1.0, 1.0)) for k in range(2))
-    sound = np.nan_to_num(rho, nan=1.0).min(axis=(1, 2)) > LEAST_CORRELATION
+    sound = _sound(rho)
     log_value = np.einsum("pi,pj,pij->p", lateral, axial, np.log(np.maximum(rho, LEAST_CORRELATION)))
     value = np.einsum("pi,pj,pij->p", lateral, axial, rho)
     return np.asarray(np.where(sound, np.exp(log_value), value))

@@ -129,4 +129,5 @@ def test_a_damaged_file_is_an_error_of_one_line_or_harmless(path, tmp_path, data
     try:
         read_curves(tmp_path / "damaged.h5")
     except Speckle3DError as error:
-        assert "\n" not in str(error)
+        message = str(error)
+        assert "\n" not in message

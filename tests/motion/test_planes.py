@@ -47,12 +47,13 @@ def test_distances_on_a_plane_give_it_back(estimator, plane):
     assert found.used.all()
 
 
-def test_a_plane_seen_from_behind_is_told_with_its_offset_positive(estimator):
-    """Distances have no sign: frames 0.3 mm behind and before one another read alike."""
-    for plane in PLANES:
-        found = fit_plane(measured(estimator, np.abs(-on_plane(plane))), estimator, AT)
-        np.testing.assert_allclose(found.coefficients, plane, atol=1e-9)
-        assert found.offset_mm >= 0
+def test_the_offset_is_told_positive_though_the_patches_lie_beyond_the_crossing(estimator):
+    """Frames that cross above all the patches used: seen from either side, the centre is 0.05 mm away."""
+    truth = np.array([-0.05, 0.0, 0.03])
+    beyond = AT[:, 1] > 3.0
+    d = np.where(beyond, on_plane(truth), np.nan)
+    found = fit_plane(measured(estimator, d), estimator, AT)
+    np.testing.assert_allclose(found.coefficients, -truth, atol=1e-9)
 
 
 @pytest.mark.parametrize("plane", PLANES)

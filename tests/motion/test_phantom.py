@@ -1,0 +1,107 @@
+"""From a phantom sweep with known positions to its decorrelation curve, on speckle whose curve is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import speckle
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.motion.decorrelation import CurveSettings, fit_curves
+from speckle3d.motion.inplane import InPlaneSettings
+from speckle3d.motion.intensity import IntensitySettings
+from speckle3d.motion.matching import FrameMatcher
+from speckle3d.motion.patches import PatchSettings
+from speckle3d.motion.phantom import known_positions, phantom_samples
+
+SIGMA_MM, FRAMES = 0.3, 44
+GRID = ImageGrid(48, 260, 0.3, 0.06)
+SETTINGS = CurveSettings(largest_mm=1.2, pairs=400)
+
+
+@pytest.fixture(scope="module")
+def phantom():
+    """Planes of independent speckle blended over elevation; the blend's width makes the curve's."""
+    rng = np.random.default_rng(2)
+    z = 0.08 * np.arange(FRAMES) * (1 + 0.3 * np.sin(np.arange(FRAMES) / 9))
+    planes = np.arange(z.min() - 3 * SIGMA_MM, z.max() + 3 * SIGMA_MM, SIGMA_MM / 2)
+    fields = np.array([speckle.Speckle(rng, grid=GRID, margin_mm=2.0).seen() for _ in planes])
+    blend = np.exp(-((z[:, None] - planes) ** 2) / (2 * SIGMA_MM**2))
+    levels = np.abs(np.einsum("fp,pvs->fvs", blend, fields)) ** 2
+    grey = 255 + 255 / 8 * np.log10(np.maximum(levels / levels.max(), 1e-8))
+    poses = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z]))
+    place = RigidTransform.from_components([30.0, -80.0, 5.0], Rotation.from_rotvec([0.3, 1.0, -0.4]))
+    time = 0.04 * np.arange(FRAMES)
+    return Sweep(
+        grey.astype(np.float32), GRID, BModeSettings(80.0), time, truth=place * poses, name="phantom"
+    )
+
+
+def matcher_of(sweep):
+    return FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+
+
+def test_the_curve_comes_back(phantom):
+    done = []
+    samples = phantom_samples(phantom, matcher_of(phantom), SETTINGS, lambda n, of: done.append((n, of)))
+    curves = fit_curves(speckle.KEY, [samples], SETTINGS)
+    assert done == [(n + 1, FRAMES) for n in range(FRAMES)]
+    d = curves.distance_mm
+    widths = [np.interp(-0.6, -row, d) / np.sqrt(-2 * np.log(0.6)) for row in curves.correlation]
+    # Some eight independent separations, four patches to a row: 4 % of the width in a row, 2 % in the mean.
+    assert abs(np.mean(widths) / SIGMA_MM - 1) < 0.06
+    assert np.abs(np.array(widths) / SIGMA_MM - 1).max() < 0.15
+
+
+def test_pairs_are_within_reach_and_about_as_many_as_asked(phantom):
+    samples = phantom_samples(phantom, matcher_of(phantom), CurveSettings(largest_mm=0.5, pairs=60))
+    assert samples.pairs == 60
+    assert samples.distance_mm.max() <= 0.5 + 1e-9
+    every = phantom_samples(phantom, matcher_of(phantom), CurveSettings(largest_mm=0.5, pairs=3000))
+    # Thinned, they are spread over separation as all of them are, to half a step.
+    quantiles = [0.1, 0.3, 0.5, 0.7, 0.9]
+    spread = [np.quantile(one.distance_mm, quantiles) for one in (samples, every)]
+    np.testing.assert_allclose(*spread, atol=0.05)
+    assert every.pairs > 60
+    assert set(samples.depth_mm) == set(matcher_of(phantom).patches.centre_mm[:, 1])
+
+
+def test_distances_are_those_of_the_patches_when_frames_are_tipped(phantom):
+    tilt = 0.01
+    about = RigidTransform.from_translation(GRID.centre_mm)
+    turn = about * RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [tilt, 0, 0]])) * about.inv()
+    step = RigidTransform.from_translation([[0, 0, 0], [0, 0, 0.3]])
+    two = replace(
+        phantom, frames=phantom.frames[:2], frame_time_s=phantom.frame_time_s[:2], truth=step * turn
+    )
+    samples = phantom_samples(two, matcher_of(two), SETTINGS)
+    expected = 0.3 + np.sin(tilt) * (samples.depth_mm - GRID.centre_mm[1])
+    np.testing.assert_allclose(samples.distance_mm, expected, atol=1e-3)
+
+
+def test_frames_too_far_apart_or_without_positions_are_refused(phantom):
+    z = 5.0 * np.arange(FRAMES)
+    far = replace(phantom, truth=RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z])))
+    with pytest.raises(InsufficientDataError, match=r"phantom: expected phantom frames closer than 1\.2 mm"):
+        phantom_samples(far, matcher_of(far), SETTINGS)
+    with pytest.raises(InsufficientDataError, match=r"known positions \(/truth or /tracker\), got neither"):
+        phantom_samples(replace(phantom, truth=None), matcher_of(phantom), SETTINGS)
+
+
+def test_a_trackers_jitter_is_smoothed_away(phantom):
+    rng = np.random.default_rng(4)
+    jitter = RigidTransform.from_components(
+        rng.normal(0, 0.05, (FRAMES, 3)), Rotation.from_rotvec(rng.normal(0, 2e-4, (FRAMES, 3)))
+    )
+    tracker = Tracker(TimedPoses(phantom.frame_time_s, phantom.truth * jitter), RigidTransform.identity())
+    poses, source = known_positions(replace(phantom, truth=None, tracker=tracker))
+    assert source == "tracker"
+    assert known_positions(replace(phantom, tracker=tracker))[1] == "truth"
+    rough, smooth = (
+        np.std((phantom.truth.inv() * p).translation[:, 2]) for p in (phantom.truth * jitter, poses)
+    )
+    # A curve of some five degrees of freedom through 44 samples: a third of the jitter.
+    assert smooth < 0.5 * rough
