@@ -32,6 +32,9 @@ ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML with settings to change; see `speckle3d config`.")
 ]
 
+_STOPPED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
 
 def main() -> None:
     """Run the command line: a wrong input is one line on stderr and exit code 2."""
@@ -39,8 +42,8 @@ def main() -> None:
         code = app(standalone_mode=False)
     except Speckle3DError as error:
         _fail(str(error))
-    except KeyboardInterrupt:
-        _fail("stopped", 130)
+    except (KeyboardInterrupt, typer.Abort):
+        _fail("stopped", _STOPPED)
     except typer.Exit as leave:
         sys.exit(leave.exit_code)
     except Exception as error:
@@ -48,6 +51,9 @@ def main() -> None:
         if not hasattr(error, "format_message"):
             raise
         _fail(error.format_message())
+    # Typer turns Ctrl-C into this exit code without a word.
+    if code == _STOPPED:
+        _fail("stopped", _STOPPED)
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -1,0 +1,63 @@
+"""Simulated sweeps for the benchmarks, kept by what determines them: their settings and the simulator."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import speckle3d
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.io.load import load_sweep
+from speckle3d.io.sweep_writer import SweepWriter, write_sweep
+from speckle3d.simulation.presets import SimulationSettings, simulate
+
+DEFAULT = Path(__file__).resolve().parents[2] / ".cache" / "sweeps"
+_SIMULATOR = ("simulation/*.py", "kernels/scatter.py", "kernels/field.py", "core/geometry.py")
+
+
+def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
+    """The sweep of `settings` as a file, simulated once; streamed, so that its size does not matter."""
+    path = folder / f"{settings.preset}-{settings.seed}-{_key(settings.model_dump_json())}.h5"
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_sweep(path, simulate(settings)[0].sweep)
+    return path
+
+
+def to_and_fro(source: Path, frames: int, folder: Path = DEFAULT) -> Path:
+    """A long sweep made of a short one run forward and back, so that neighbours always share speckle."""
+    path = folder / f"{source.stem}-{frames}.h5"
+    if path.is_file():
+        return path
+    sweep = load_sweep(source)
+    there = np.arange(len(sweep))
+    index = np.resize(np.concatenate([there, there[-2:0:-1]]), frames)
+    with SweepWriter(path, sweep.grid, sweep.signal) as writer:
+        for number, each in enumerate(index):
+            writer.append(sweep.frames[each], 0.04 * number)
+        writer.write_truth(sweep.truth[index])
+        for sensor in _sensors(sweep, index):
+            (writer.write_tracker if isinstance(sensor, Tracker) else writer.write_orientation)(sensor)
+    return path
+
+
+def _sensors(sweep: Sweep, index: np.ndarray) -> tuple[Tracker, OrientationSensor]:
+    """Exact sensors, fixed to the image, that read once per frame."""
+    time_s = 0.04 * np.arange(index.size)
+    poses = sweep.truth[index]
+    one = poses[0].inv() * poses[0]
+    return (
+        Tracker(TimedPoses(time_s, poses), one),
+        OrientationSensor(TimedRotations(time_s, poses.rotation), Rotation.identity()),
+    )
+
+
+def _key(settings: str) -> str:
+    package = Path(speckle3d.__file__).parent
+    digest = hashlib.sha256(settings.encode())
+    for pattern in _SIMULATOR:
+        for source in sorted(package.glob(pattern)):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:12]

@@ -1,0 +1,405 @@
+"""The command line from end to end, on a sweep of 24 small frames."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from speckle3d import cli
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.volumes import read_volume
+
+SMALL = ("--vectors", "26", "--samples", "1800", "--seed", "5")
+RESULTS = {"reconstruction.h5", "summary.json", "table.txt", "table.csv", "drift.png", "reslice.png"}
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture
+def run(monkeypatch, capfd):
+    """Run the command in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        capfd.readouterr()
+        monkeypatch.setattr(sys, "argv", ["speckle3d", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leave:
+            cli.main()
+        out, err = capfd.readouterr()
+        return leave.value.code, out, err
+
+    return call
+
+
+@pytest.fixture
+def refused(run, tmp_path):
+    """Run the command, which must refuse its input in one line and leave no file behind; returns the line."""
+
+    def call(*arguments, folder=tmp_path):
+        before = sorted(folder.rglob("*"))
+        code, out, err = run(*arguments)
+        # The bar's line, if frames were already being read, is not part of the message.
+        lines = [line for line in err.splitlines() if line.startswith("speckle3d: ")]
+        assert code == 2, err
+        assert len(lines) == 1, err
+        assert "Traceback" not in err
+        assert out == ""
+        left = [path for path in sorted(folder.rglob("*")) if path not in before and path.is_file()]
+        assert left == []
+        return lines[0]
+
+    return call
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "speckle3d.cli", *map(str, arguments)]
+
+
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory):
+    """A folder with a small sweep and the curves for it, made by the command in a process of its own."""
+    folder = tmp_path_factory.mktemp("bench")
+    steps = ("--preset", "stepped", "--steps", "15", "--step-mm", "0.06", "--blocks", "2")
+    for arguments in (
+        ("simulate", folder / "sweep.h5", *SMALL, "--length-mm", "3", "--frames", "24"),
+        ("simulate", folder / "stepped.h5", *SMALL, *steps),
+        ("calibrate", "curves", folder / "stepped.h5", "-o", folder / "curves.h5"),
+    ):
+        done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="session")
+def reconstructed(bench):
+    """The folder of the small sweep's results."""
+    folder = bench / "out"
+    modes = ("--drift", "orientation", "--drift", "pose")
+    done = subprocess.run(
+        command("reconstruct", bench / "sweep.h5", "-o", folder, *modes),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[2] for line in done.stdout.splitlines()[2:]] == ["image", "orientation", "pose"]
+    return folder
+
+
+@pytest.fixture
+def changed(bench, tmp_path):
+    """The small sweep with something changed in it."""
+
+    def change(edit, name="sweep.h5"):
+        path = tmp_path / name
+        shutil.copy(bench / name, path)
+        if name == "sweep.h5":
+            shutil.copy(bench / "curves.h5", tmp_path / "curves.h5")
+        with h5py.File(path, "r+") as file:
+            edit(file)
+        return path
+
+    return change
+
+
+def test_info_tells_what_a_sweep_holds(run, bench):
+    code, out, _ = run("info", bench / "sweep.h5", "--json")
+    rows = {row["description"]: row["value"] for row in json.loads(out)}
+    assert code == 0
+    assert rows["frames"] == "24"
+    assert rows["vectors x samples"] == "26 x 1800"
+    assert rows["orientation sensor calibrated"] == rows["tracker calibrated"] == rows["truth"] == "yes"
+    code, out, _ = run("info", bench / "sweep.h5")
+    assert code == 0
+    assert "26 x 1800" in out
+
+
+def test_a_simulation_is_told_in_the_file_and_comes_again(run, bench, tmp_path):
+    again = tmp_path / "again.h5"
+    assert run("simulate", again, *SMALL, "--length-mm", "3", "--frames", "24")[0] == 0
+    first, second = load_sweep(bench / "sweep.h5"), load_sweep(again)
+    np.testing.assert_array_equal(first.frames[7], second.frames[7])
+    with h5py.File(again) as file:
+        assert file["simulation"].attrs["preset"] == "phantom"
+        assert file["simulation"].attrs["seed"] == 5
+
+
+def test_a_reconstruction_holds_every_mode_and_where_it_came_from(reconstructed, bench):
+    assert {path.name for path in reconstructed.iterdir()} == RESULTS
+    found = read_reconstruction(reconstructed / "reconstruction.h5")
+    assert set(found.poses) == {"image", "orientation", "pose"}
+    assert all(len(poses) == 24 for poses in found.poses.values())
+    np.testing.assert_allclose(found.poses["image"][0].as_matrix(), np.eye(4), atol=1e-12)
+    assert found.provenance.input_path == str(bench / "sweep.h5")
+    assert "[trajectory]" in found.config_toml
+    assert len(found.pairs) >= 23
+    assert all((reconstructed / name).read_bytes().startswith(PNG) for name in ("drift.png", "reslice.png"))
+
+
+def test_the_errors_against_truth_are_in_every_table(reconstructed):
+    summary = json.loads((reconstructed / "summary.json").read_text())["sweeps"][0]
+    rows = {row["mode"]: row for row in summary["rows"]}
+    assert summary["reference"] == "truth"
+    # Three millimetres of a narrow image and a tracker's jitter of 0.15 mm at both ends: loose bounds, which
+    # a wrong sign, unit or axis still breaks.
+    assert all(abs(row["length_error_percent"]) < 30 for row in rows.values())
+    assert abs(rows["orientation"]["tilt_error_deg"]) < 1
+    assert len((reconstructed / "table.csv").read_text().splitlines()) == 4
+    assert len((reconstructed / "table.txt").read_text().splitlines()) == 5
+
+
+def test_json_is_the_summary_and_nothing_else(run, bench, reconstructed, tmp_path):
+    modes = ("--drift", "orientation", "--drift", "pose")
+    code, out, _ = run("reconstruct", bench / "sweep.h5", "-o", tmp_path, *modes, "--json")
+    got, before = (
+        json.loads(text)["sweeps"][0] for text in (out, (reconstructed / "summary.json").read_text())
+    )
+    assert code == 0
+    assert got["rows"] == before["rows"]
+
+
+def test_curves_as_json(run, bench, tmp_path):
+    code, out, _ = run("calibrate", "curves", bench / "stepped.h5", "-o", tmp_path / "c.h5", "--json")
+    table = json.loads(out)
+    assert code == 0
+    assert table["pairs"] > 50
+    # Half the correlation is gone within the beam's width everywhere.
+    assert all(0.05 < half < 1.0 for half in table["half_mm"])
+    assert (tmp_path / "c.h5").is_file()
+
+
+def test_a_reference_can_be_chosen(run, bench, tmp_path):
+    code, out, _ = run("reconstruct", bench / "sweep.h5", "-o", tmp_path, "--reference", "tracker", "--json")
+    assert code == 0
+    assert json.loads(out)["sweeps"][0]["reference"] == "tracker"
+
+
+def test_settings_are_used_and_saved(run, bench, tmp_path):
+    (tmp_path / "c.toml").write_text("[trajectory]\nkey_frames = 2\n")
+    options = ("--config", tmp_path / "c.toml", "--drift", "orientation", "--drift-curves", "distance")
+    code, out, _ = run("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *options, "--json")
+    saved = read_reconstruction(tmp_path / "o" / "reconstruction.h5").config_toml
+    assert code == 0
+    assert "key_frames = 2" in saved
+    assert json.loads(out)["sweeps"][0]["details"]["corrections"]["orientation"]["curves"] == "distance"
+
+
+def test_the_default_configuration_can_be_given_back(run, bench, tmp_path):
+    code, out, _ = run("config")
+    (tmp_path / "all.toml").write_text(out)
+    assert code == 0
+    code, _, err = run(
+        "reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", "--config", tmp_path / "all.toml"
+    )
+    assert code == 0, err
+
+
+def test_without_a_sensor_the_sign_is_said_to_be_assumed(run, changed, tmp_path):
+    def forget(file):
+        del file["tracker"], file["orientation"], file["truth"]
+
+    code, _, err = run("reconstruct", changed(forget), "-o", tmp_path / "o")
+    assert code == 0
+    assert "taken as positive" in err
+
+
+@pytest.mark.parametrize("name", ["v.nrrd", "v.mha", "v.nii.gz"])
+def test_volume(run, reconstructed, tmp_path, name):
+    options = ("--mode", "pose", "--voxel-mm", "0.5")
+    code, _, err = run("volume", reconstructed / "reconstruction.h5", "-o", tmp_path / name, *options)
+    assert code == 0, err
+    voxels = read_volume(tmp_path / name).voxels
+    # 7.5 x 3 x 21 mm of frames, which are filled: a good part of the box is not zero.
+    assert sorted(voxels.shape)[0] >= 6
+    assert (voxels > 0).mean() > 0.3
+
+
+@pytest.mark.parametrize("options", [(), ("--lateral-mm", "2"), ("--depth-mm", "10")])
+def test_reslice(run, reconstructed, tmp_path, options):
+    code, _, err = run("reslice", reconstructed / "reconstruction.h5", "-o", tmp_path / "r.png", *options)
+    assert code == 0, err
+    assert (tmp_path / "r.png").read_bytes().startswith(PNG)
+
+
+def test_convert_copies_a_sweep(run, bench, tmp_path):
+    code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5")
+    assert code == 0, err
+    first, second = load_sweep(bench / "sweep.h5"), load_sweep(tmp_path / "copy.h5")
+    np.testing.assert_array_equal(first.frames[3], second.frames[3])
+    np.testing.assert_allclose(first.truth.as_matrix(), second.truth.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("reconstruct", "--help"), ("calibrate", "--help")])
+def test_help_is_no_error_and_needs_nothing_heavy(arguments):
+    code = "import sys; from speckle3d.cli import main\ntry: main()\nexcept SystemExit: pass\n"
+    code += "print(sorted({'numba', 'h5py', 'scipy', 'numpy', 'matplotlib'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    assert "Usage" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "Traceback" not in done.stderr
+
+
+def test_usage_errors_are_one_line(refused):
+    assert "--no-such" in refused("info", "x.h5", "--no-such")
+    assert "No such command" in refused("reconstuct")
+    assert "--preset" not in refused("simulate")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--preset", "phantm"), "--preset"),
+        (("--vectors", "0"), "--vectors"),
+        (("--length-mm", "-3"), "--length-mm"),
+    ],
+)
+def test_a_simulation_that_makes_no_sense(refused, tmp_path, options, message):
+    assert message in refused("simulate", tmp_path / "s.h5", *options)
+
+
+def test_files_that_are_not_there_or_not_sweeps(refused, bench, tmp_path):
+    out = tmp_path / "o"
+    assert "none.h5: expected a file, got none" in refused("reconstruct", bench / "none.h5", "-o", out)
+    (tmp_path / "text.h5").write_text("not a sweep")
+    assert "got something else" in refused("info", tmp_path / "text.h5")
+    curves = bench / "curves.h5"
+    assert "speckle3d.sweep" in refused("reconstruct", curves, "--curves", curves, "-o", out)
+
+
+def test_a_truncated_sweep(refused, bench, tmp_path):
+    whole = (bench / "sweep.h5").read_bytes()
+    (tmp_path / "half.h5").write_bytes(whole[: len(whole) // 2])
+    message = refused(
+        "reconstruct", tmp_path / "half.h5", "--curves", bench / "curves.h5", "-o", tmp_path / "o"
+    )
+    assert "half.h5" in message
+
+
+def test_no_curves(refused, bench, tmp_path):
+    shutil.copy(bench / "sweep.h5", tmp_path / "sweep.h5")
+    message = refused("reconstruct", tmp_path / "sweep.h5", "-o", tmp_path / "o")
+    assert "expected decorrelation curves" in message
+
+
+def test_curves_of_another_probe(refused, changed, bench, tmp_path):
+    other = changed(lambda file: file.attrs.modify("vector_pitch_mm", 0.2), "curves.h5")
+    message = refused("reconstruct", bench / "sweep.h5", "--curves", other, "-o", tmp_path / "o")
+    assert "vector_pitch_mm is 0.2 and 0.3" in message
+
+
+def test_an_unknown_mode_or_reference(refused, bench, tmp_path):
+    sweep, out = bench / "sweep.h5", tmp_path / "o"
+    assert "got 'magic'" in refused("reconstruct", sweep, "-o", out, "--drift", "magic")
+    assert "got 'memory'" in refused("reconstruct", sweep, "-o", out, "--reference", "memory")
+
+
+@pytest.mark.parametrize(
+    ("mode", "group", "message"),
+    [
+        ("orientation", ("orientation", "tracker"), "/orientation, got none"),
+        ("pose", ("tracker",), "/tracker"),
+    ],
+)
+def test_a_mode_without_its_sensor(refused, changed, tmp_path, mode, group, message):
+    def forget(file):
+        for name in group:
+            del file[name]
+
+    sweep = changed(forget)
+    assert message in refused("reconstruct", sweep, "-o", tmp_path / "o", "--drift", mode)
+
+
+@pytest.mark.parametrize(
+    ("mode", "group", "attribute"),
+    [
+        ("orientation", "orientation", "sensor_from_image_wxyz"),
+        ("pose", "tracker", "sensor_from_image"),
+    ],
+)
+def test_a_sensor_that_is_not_calibrated(refused, changed, tmp_path, mode, group, attribute):
+    sweep = changed(lambda file: file[group].attrs.__delitem__(attribute))
+    message = refused("reconstruct", sweep, "-o", tmp_path / "o", "--drift", mode)
+    assert "not calibrated" in message
+    assert attribute in message
+
+
+@pytest.mark.parametrize(("mode", "group"), [("orientation", "orientation"), ("pose", "tracker")])
+def test_a_sensor_that_covers_half_the_sweep(refused, changed, tmp_path, mode, group):
+    def stop_early(file):
+        middle = file["frame_time_s"][12]
+        node = file[group]
+        keep = node["time_s"][()] < middle
+        for name in list(node):
+            values = node[name][()][keep]
+            del node[name]
+            node[name] = values
+
+    message = refused("reconstruct", changed(stop_early), "-o", tmp_path / "o", "--drift", mode)
+    assert "got 11" in message or "got 12" in message
+
+
+def test_an_unknown_setting(refused, bench, tmp_path):
+    (tmp_path / "c.toml").write_text("[trajectory]\nkeyframes = 2\n")
+    config = ("--config", tmp_path / "c.toml")
+    message = refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *config)
+    assert "trajectory.keyframes" in message
+    message = refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", "--drift-curves", "magic")
+    assert "magic" in message
+
+
+def test_folders_that_cannot_be_written(refused, bench, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "file" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "file" / "o")
+    assert "file" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "file")
+    assert "folder" in refused("simulate", tmp_path / "none" / "s.h5", *SMALL)
+
+
+def test_a_volume_of_a_sweep_that_is_gone_or_another(refused, reconstructed, bench, tmp_path):
+    path, out = reconstructed / "reconstruction.h5", tmp_path / "v.nrrd"
+    assert "SHA-256" in refused("volume", path, "-o", out, "--sweep", bench / "stepped.h5")
+    assert "--sweep" in refused("volume", path, "-o", out, "--sweep", tmp_path / "none.h5")
+    assert "got 'crossed'" in refused("volume", path, "-o", out, "--mode", "crossed")
+    both = ("--lateral-mm", "2", "--depth-mm", "3")
+    assert "got both" in refused("reslice", path, "-o", tmp_path / "r.png", *both)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
+def test_ctrl_c_leaves_nothing_half_done_and_the_next_run_works(bench, tmp_path):
+    arguments = command("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o")
+    first = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Its temporary sibling tells that the reconstruction has begun; it has most of a second to go.
+    _wait_for(lambda: list((tmp_path / "o").glob(".part-*")), first)
+    first.send_signal(signal.SIGINT)
+    _, err = first.communicate(timeout=60)
+    assert first.returncode == 130, err
+    assert err.splitlines()[-1] == "speckle3d: stopped"
+    assert "Traceback" not in err
+    assert list((tmp_path / "o").iterdir()) == []
+    again = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
+    assert again.returncode == 0, again.stderr
+    assert {path.name for path in (tmp_path / "o").iterdir()} == RESULTS
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
+def test_ctrl_c_while_simulating(tmp_path):
+    arguments = command("simulate", tmp_path / "s.h5", *SMALL, "--frames", "200")
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    _wait_for(lambda: list(tmp_path.glob(".part-*")), process)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert list(tmp_path.iterdir()) == []
+
+
+def _wait_for(condition, process, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, "ended before it could be stopped"
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
