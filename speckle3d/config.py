@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.correction.curves import Curves
 from speckle3d.correction.drift import DriftSettings
+from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.inplane import InPlaneSettings
 from speckle3d.motion.intensity import IntensitySettings
@@ -51,6 +52,7 @@ class Config(BaseModel):
     patches: PatchSettings = PatchSettings()
     inplane: InPlaneSettings = InPlaneSettings()
     curves: CurveSettings = CurveSettings()
+    coherence: CoherenceSettings = CoherenceSettings()
     planes: PlaneSettings = PlaneSettings()
     trajectory: TrajectorySettings = TrajectorySettings()
     sensors: SensorSettings = SensorSettings()

@@ -22,13 +22,16 @@ from speckle3d.core.geometry import FloatArray
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.motion.coherence import Coherence, estimate_coherence
 from speckle3d.motion.decorrelation import fit_curves
-from speckle3d.motion.distances import DistanceEstimator, PatchDistances
-from speckle3d.motion.inplane import InPlaneMotion
+from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
+from speckle3d.motion.inplane import InPlaneMotion, PatchMatch
 from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.motion.patches import IntArray
 from speckle3d.motion.phantom import phantom_samples
 from speckle3d.motion.planes import PairPlane, consistent_subset, fit_plane
+from speckle3d.motion.table import CorrelationTable
 from speckle3d.motion.trajectory import (
     PairMeasurement,
     PairSchedule,
@@ -75,6 +78,8 @@ class Tracked:
         Frames that no reliable pair joins to an earlier one.
     direction_from : str
         What settled the sign of the elevational motion.
+    coherence : Coherence or None
+        Coherent share and gain of the patches; None if not adapted to.
     """
 
     image: RigidTransform
@@ -84,17 +89,8 @@ class Tracked:
     pairs: int
     direction: int
     direction_from: str
+    coherence: Coherence | None
     times: StageTimes
-
-
-@dataclass(frozen=True)
-class _MeasuredPair:
-    """One pair with everything later stages and the file want of it."""
-
-    pair: PairMeasurement
-    distances: PatchDistances
-    subset_plane: PairPlane | None
-    reliable: bool
 
 
 def track(
@@ -115,16 +111,16 @@ def track(
         If frames have no speckle in common.
     """
     settings = config or Config()
+    if len(sweep) < 2:
+        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
     matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane)
     curves.key.require_same(matcher.key)
     walk = _Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
     for frame, ready in enumerate(_prefetch(sweep, matcher, walk.times, images)):
-        measured = walk.advance(frame, ready)
-        if sink and measured:
-            sink(walk.table(measured))
+        walk.advance(frame, ready)
         if progress:
             progress(frame + 1, len(sweep))
-    return walk.finish()
+    return _Solution(walk, curves).solve(sink)
 
 
 def calibrate_curves(
@@ -158,52 +154,35 @@ def _shifted(progress: Progress | None, before: int, total: int) -> Progress | N
 
 
 class _Walk:
-    """The state carried from frame to frame."""
+    """First reading of the sweep: which pairs to match, what they share, where frames roughly lie."""
 
     def __init__(
         self, sweep: Sweep, matcher: FrameMatcher, estimator: DistanceEstimator, config: Config
     ) -> None:
         self.sweep, self.matcher, self.estimator, self.config = sweep, matcher, estimator, config
         self.times = StageTimes()
+        self.table = CorrelationTable(len(matcher.patches))
+        self.position_mm = np.zeros(len(sweep))
+        self.unreliable: list[int] = []
         self._schedule = PairSchedule(config.trajectory)
         self._signs = SignResolver()
         self._ready: dict[int, ReadyFrame] = {}
         self._motion: dict[int, InPlaneMotion] = {0: InPlaneMotion()}
-        self._sensed = sensed_orientation(sweep, config)
-        self._image_pairs: list[SignedPair] = []
-        self._subset_pairs: list[SignedPair] = []
-        self._counted, self._rejected = 0, 0
-        self._unreliable: list[int] = []
-        self._latest_signs = np.ones(0)
 
-    def advance(self, frame: int, ready: ReadyFrame) -> list[_MeasuredPair]:
-        """Measure a frame against its references, place it, and let go of what is no longer needed."""
+    def advance(self, frame: int, ready: ReadyFrame) -> None:
+        """Match a frame with its references, place it, and let go of what is no longer needed."""
         self._ready[frame] = ready
-        references = self._schedule.references(frame)
-        measured = [self._measure(first, frame) for first in references]
-        usable = self._usable(frame, [m for m in measured if m is not None])
-        self._schedule.settle(frame, {m.pair.first: m.pair.correlation for m in measured if m is not None})
-        if usable:
-            self._join(usable)
+        matches = {first: self._match(first, frame) for first in self._schedule.references(frame)}
+        correlations = {first: _median(match.correlation) for first, match in matches.items()}
+        if frame:
+            self._place(frame, matches, correlations)
+        self._schedule.settle(frame, correlations)
         keep = self._schedule.needed(frame)
         self._signs.forget(keep)
         self._ready = {k: v for k, v in self._ready.items() if k in keep}
         self._motion = {k: v for k, v in self._motion.items() if k in keep}
-        return usable
 
-    def _usable(self, frame: int, measured: list[_MeasuredPair]) -> list[_MeasuredPair]:
-        reliable = [m for m in measured if m.reliable]
-        if reliable or frame == 0:
-            return reliable
-        if not measured:
-            raise InsufficientDataError(
-                f"{self.sweep.name}: frame {frame}: expected speckle in common with frame {frame - 1}, "
-                "found none"
-            )
-        self._unreliable.append(frame)
-        return [max(measured, key=lambda m: m.pair.correlation)]
-
-    def _measure(self, first: int, second: int) -> _MeasuredPair | None:
+    def _match(self, first: int, second: int) -> PatchMatch:
         then = time.perf_counter()
         fixed, moving = self._ready[first], self._ready[second]
         if second not in self._motion:
@@ -212,80 +191,171 @@ class _Walk:
         match = self.matcher.match(fixed, moving, start)
         if second - first == 1:
             self._motion[second] = compose(self._motion[first], match.motion)
-        then = self.times.add("in-plane motion and correlation", then)
-        distances = self.estimator.distances(match.correlation)
-        plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes)
-        subset = self._subset(first, second, distances)
+        self.times.add("in-plane motion and correlation", then)
+        return match
+
+    def _place(self, frame: int, matches: dict[int, PatchMatch], correlations: dict[int, float]) -> None:
+        then = time.perf_counter()
+        least = self.config.trajectory.least_correlation
+        near = [first for first, rho in correlations.items() if rho >= least]
+        if not near:
+            near = [max(correlations, key=lambda first: correlations[first])]
+            self.unreliable.append(frame)
+        pairs = []
+        for first in near:
+            distances = self.estimator.distances(matches[first].correlation)
+            plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes)
+            if plane is not None:
+                pairs.append(PairMeasurement(first, frame, matches[first].motion, plane, correlations[first]))
+        if not pairs:
+            raise InsufficientDataError(
+                f"{self.sweep.name}: frame {frame}: expected speckle in common with frame {frame - 1}, "
+                "found none"
+            )
+        self._signs.place(pairs)
+        self.position_mm[frame] = self._signs.position(frame)
+        for first, match in sorted(matches.items()):
+            self.table.append(first, frame, match)
         self.times.add("distances and planes", then)
-        if plane is None:
-            return None
-        correlation = float(np.nanmedian(match.correlation))
-        reliable = correlation >= self.config.trajectory.least_correlation
-        pair = PairMeasurement(first, second, match.motion, plane, correlation)
-        return _MeasuredPair(pair, distances, subset, reliable)
 
-    def _subset(self, first: int, second: int, distances: PatchDistances) -> PairPlane | None:
-        if self._sensed is None:
-            return None
-        relative = (self._sensed[first].inv() * self._sensed[second]).as_matrix()
-        support = consistent_subset(distances, self.matcher.at_mm, relative[2, :2], self.config.planes)
-        plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes, support)
-        known = np.isfinite(distances.distance_mm)
-        if plane is not None:
-            self._counted += int(known.sum())
-            self._rejected += int((known & ~support).sum())
-        return plane
 
-    def _join(self, usable: list[_MeasuredPair]) -> None:
+class _Solution:
+    """Second reading, of the correlations alone: distances, planes, trajectories."""
+
+    def __init__(self, walk: _Walk, curves: DecorrelationCurves) -> None:
+        self._walk, self._config = walk, walk.config
+        self._estimator, self._matcher = walk.estimator, walk.matcher
+        self._sensed = sensed_orientation(walk.sweep, walk.config)
+        self._coherence: Coherence | None = None
+        self._position = walk.position_mm
+        self._counted = self._rejected = 0
+        table, settings = walk.table, walk.config.coherence
+        if settings.adapt:
+            then = time.perf_counter()
+            self._coherence, self._position = estimate_coherence(
+                table.first,
+                table.second,
+                table.correlation,
+                self._position,
+                curves,
+                self._matcher.patches,
+                settings,
+            )
+            walk.times.add("coherence", then)
+
+    def solve(self, sink: PairSink | None) -> Tracked:
+        """Trajectories from all usable pairs."""
+        walk, frames = self._walk, len(self._walk.sweep)
         then = time.perf_counter()
-        signs = self._signs.place([m.pair for m in usable])
-        self._latest_signs = signs
-        for m, sign in zip(usable, signs, strict=True):
-            self._image_pairs.append(sign_pair(m.pair, m.pair.plane, sign))
-            if self._sensed is not None:
-                self._subset_pairs.append(sign_pair(m.pair, m.subset_plane or m.pair.plane, sign))
-        self.times.add("trajectory", then)
-
-    def table(self, measured: list[_MeasuredPair]) -> FramePairs:
-        """Rows for the reconstruction file, of the pairs joined last."""
-        signed = self._image_pairs[-len(measured) :]
-        centre = RigidTransform.from_translation(self.matcher.centre_mm)
-        poses = [(centre * s.pose * centre.inv()).as_matrix() for s in signed]
-        planes = [m.subset_plane or m.pair.plane for m in measured]
-        return FramePairs(
-            first=np.array([s.first for s in signed]),
-            second=np.array([s.second for s in signed]),
-            first_from_second=np.array(poses),
-            covariance=np.array([s.covariance for s in signed]),
-            distance_mm=np.array([m.distances.distance_mm for m in measured], dtype=np.float32),
-            sigma_mm=np.array([m.distances.sigma_mm for m in measured], dtype=np.float32),
-            used=np.array([plane.used for plane in planes]),
-            patch_centre_mm=self.matcher.patches.centre_mm,
+        chosen = self._choose()
+        models = self._models(chosen)
+        measured = [self._measure(row, model) for row, model in zip(chosen, models, strict=True)]
+        then = walk.times.add("distances and planes", then)
+        centre = self._matcher.centre_mm
+        joined = [m for m in measured if m.plane is not None]
+        image = solve_trajectory(
+            [self._signed(m, m.plane) for m in joined], frames, centre, self._config.trajectory
         )
-
-    def finish(self) -> Tracked:
-        """Solve the trajectory over all pairs and settle the overall sign."""
-        then = time.perf_counter()
-        frames, centre = len(self.sweep), self.matcher.centre_mm
-        image = solve_trajectory(self._image_pairs, frames, centre, self.config.trajectory)
         subset = None
         if self._sensed is not None:
-            subset = solve_trajectory(self._subset_pairs, frames, centre, self.config.trajectory)
-        direction, source = settle_direction(self.sweep, image, self.config)
+            pairs = [self._signed(m, m.subset or m.plane) for m in joined]
+            subset = solve_trajectory(pairs, frames, centre, self._config.trajectory)
+        direction, source = settle_direction(walk.sweep, image, self._config)
         if direction < 0:
             image, subset = mirrored(image), mirrored(subset) if subset is not None else None
-        self.times.add("trajectory", then)
-        share = self._rejected / self._counted if self._counted else float("nan")
+        if sink:
+            sink(self._rows(joined, direction))
+        walk.times.add("trajectory", then)
         return Tracked(
             image,
             subset,
-            share,
-            tuple(self._unreliable),
-            len(self._image_pairs),
+            self._rejected / self._counted if self._counted else float("nan"),
+            tuple(walk.unreliable),
+            len(joined),
             direction,
             source,
-            self.times,
+            self._coherence,
+            walk.times,
         )
+
+    def _choose(self) -> IntArray:
+        """Pairs near enough to tell a distance: what would be left of fully developed speckle is enough."""
+        table, least = self._walk.table, self._config.trajectory.least_correlation
+        distance = np.abs(self._position[table.second] - self._position[table.first])
+        left = np.array([np.median(self._estimator.fully_developed(d)) for d in distance])
+        near = left >= least
+        # Every frame keeps its nearest pair, however little it tells.
+        for frame in np.setdiff1d(np.arange(1, len(self._position)), table.second[near]):
+            rows = np.flatnonzero(table.second == frame)
+            near[rows[np.argmax(left[rows])]] = True
+        return np.flatnonzero(near)
+
+    def _models(self, chosen: IntArray) -> Iterator[EchoModel | None]:
+        if self._coherence is None:
+            yield from (None for _ in chosen)
+            return
+        table = self._walk.table
+        first, second = table.first[chosen], table.second[chosen]
+        shares, gains = self._coherence.at((first + second) / 2)
+        distance = np.abs(self._position[second] - self._position[first])
+        left = np.exp(-distance / self._coherence.structure_mm)
+        for share, gain, h in zip(shares, gains, left, strict=True):
+            yield EchoModel(share * h, 1 - share, gain)
+
+    def _measure(self, row: int, model: EchoModel | None) -> _Measured:
+        table, at, settings = self._walk.table, self._matcher.at_mm, self._config.planes
+        first, second = int(table.first[row]), int(table.second[row])
+        distances = self._estimator.distances(table.correlation[row].astype(float), model)
+        plane = fit_plane(distances, self._estimator, at, settings, model=model)
+        subset = None
+        if self._sensed is not None and plane is not None:
+            relative = (self._sensed[first].inv() * self._sensed[second]).as_matrix()
+            support = consistent_subset(distances, at, relative[2, :2], settings)
+            subset = fit_plane(distances, self._estimator, at, settings, support, model)
+            known = np.isfinite(distances.distance_mm)
+            self._counted += int(known.sum())
+            self._rejected += int((known & ~support).sum())
+        return _Measured(row, distances, plane, subset)
+
+    def _signed(self, measured: _Measured, plane: PairPlane | None) -> SignedPair:
+        assert plane is not None
+        table = self._walk.table
+        first, second = int(table.first[measured.row]), int(table.second[measured.row])
+        sign = 1.0 if self._position[second] >= self._position[first] else -1.0
+        pair = PairMeasurement(first, second, table.motion(measured.row), plane, 1.0)
+        return sign_pair(pair, plane, sign)
+
+    def _rows(self, measured: list[_Measured], direction: int) -> FramePairs:
+        """Rows for the reconstruction file."""
+        signed = [self._signed(m, m.plane) for m in measured]
+        centre = RigidTransform.from_translation(self._matcher.centre_mm)
+        poses = RigidTransform.concatenate([centre * s.pose * centre.inv() for s in signed])
+        turn = np.diag([1.0, 1.0, direction, direction, direction, 1.0])
+        return FramePairs(
+            first=np.array([s.first for s in signed]),
+            second=np.array([s.second for s in signed]),
+            first_from_second=(mirrored(poses) if direction < 0 else poses).as_matrix(),
+            covariance=np.array([turn @ s.covariance @ turn for s in signed]),
+            distance_mm=np.array([m.distances.distance_mm for m in measured], dtype=np.float32),
+            sigma_mm=np.array([m.distances.sigma_mm for m in measured], dtype=np.float32),
+            used=np.array([(m.subset or m.plane).used for m in measured]),  # type: ignore[union-attr]
+            patch_centre_mm=self._matcher.patches.centre_mm,
+        )
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """One pair of the second reading."""
+
+    row: int
+    distances: PatchDistances
+    plane: PairPlane | None
+    subset: PairPlane | None
+
+
+def _median(correlation: FloatArray) -> float:
+    known = correlation[np.isfinite(correlation)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def correct(

@@ -115,19 +115,6 @@ class ReconstructionWriter:
         for name in _PAIR_FIELDS:
             _extend(group[name], getattr(pairs, name))
 
-    def mirror_pairs(self) -> None:
-        """Turn round the sign of all elevational motion written so far: that of z, tilt and yaw."""
-        group = self._file.get("pairs")
-        if group is None:
-            return
-        flip = np.array([1.0, 1.0, -1.0, 1.0])
-        turn = np.array([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
-        for name, signs in (("first_from_second", flip), ("covariance", turn)):
-            node = group[name]
-            rows = node.chunks[0]
-            for start in range(0, node.shape[0], rows):
-                node[start : start + rows] *= np.outer(signs, signs)
-
     def finish(
         self, poses: Mapping[str, RigidTransform], provenance: Provenance, config_toml: str = ""
     ) -> None:

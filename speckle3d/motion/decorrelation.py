@@ -64,6 +64,8 @@ def fit_curves(
     """
     s = settings or CurveSettings()
     every = list(samples)
+    if not every:
+        raise InsufficientDataError("expected samples of at least one phantom sweep, got none")
     depth, distance, rho = (
         np.concatenate([getattr(one, name) for one in every])
         for name in ("depth_mm", "distance_mm", "correlation")
@@ -87,30 +89,48 @@ def _fit_row(
 ) -> tuple[FloatArray, float]:
     """Curve of one depth on `grid`, and the number of cells that explains the scatter about it."""
     centre, mean = _bin_means(distance, rho)
-    # A curve that levels out is past its use: keep what lies before the first bin under the least rho.
-    below = np.flatnonzero(mean < LEAST_RHO)
+    floor = _floor(centre, mean)
+    excess = (mean - floor) / (1 - floor)
+    # A curve that levels out is past its use: fit what lies before the first bin under the least rho.
+    below = np.flatnonzero(excess < LEAST_RHO)
     keep = slice(0, int(below[0]) if below.size else mean.size)
-    centre, mean = centre[keep], mean[keep]
-    if centre.size < terms + 2 or mean.min() > 0.6:
+    centre, excess = centre[keep], excess[keep]
+    if centre.size < 3 or excess.min() > 0.6:
         raise InsufficientDataError(
-            f"curves at {depth_mm:.1f} mm depth: expected phantom frames at {terms + 2} or more distances "
+            f"curves at {depth_mm:.1f} mm depth: expected phantom frames at 3 or more distances "
             f"over which the correlation falls below 0.6, got {centre.size} "
-            f"down to {mean.min() if mean.size else 1:.2f}"
+            f"down to {excess.min() if excess.size else 1:.2f}"
         )
+    curve = floor + (1 - floor) * np.exp(-_fitted_fall(grid, centre, excess, min(terms, centre.size - 2)))
+    used = distance <= centre[-1]
+    expected = np.interp(distance[used], grid, curve)
+    spread = np.median(np.abs(rho[used] - expected) / (1 - expected**2 + 1e-3)) * 1.4826
+    return curve, float(1.0 / spread**2)
+
+
+def _floor(centre: FloatArray, mean: FloatArray) -> float:
+    """Correlation that stays however far apart the frames are.
+
+    Fitting the in-plane motion of frames that share nothing finds a little correlation all the same; the
+    curves hold it, so that it is not taken for coherent scattering in a sweep.
+    """
+    below = np.flatnonzero(mean < LEAST_RHO)
+    far = mean[centre > 1.5 * centre[below[0]]] if below.size else mean[:0]
+    return float(np.clip(far.mean(), 0.0, LEAST_RHO / 2)) if far.size >= 3 else 0.0
+
+
+def _fitted_fall(grid: FloatArray, centre: FloatArray, rho: FloatArray, terms: int) -> FloatArray:
+    """Rise of -ln(rho) with distance on `grid`: a polynomial in squared distance, then a straight line."""
     reach = centre[-1]
     design = (centre[:, None] / reach) ** (2 * np.arange(terms + 1))
-    weight = mean / (1 - mean**2 + 0.01)
-    coefficients = np.linalg.lstsq(design * weight[:, None], -np.log(mean) * weight, rcond=None)[0]
+    weight = rho / (1 - rho**2 + 0.01)
+    coefficients = np.linalg.lstsq(design * weight[:, None], -np.log(rho) * weight, rcond=None)[0]
     coefficients[0] = max(coefficients[0], 1e-6)
     inside = grid <= reach
     fall = (grid[inside, None] / reach) ** (2 * np.arange(terms + 1)) @ coefficients
     slope = max((fall[-1] - fall[-6]) / (grid[1] * 5), 1e-3)
     fall = np.concatenate([fall, fall[-1] + slope * (grid[~inside] - grid[inside][-1])])
-    curve = np.exp(-np.maximum.accumulate(fall + 1e-9 * np.arange(fall.size)))
-    used = distance <= reach
-    expected = np.interp(distance[used], grid, curve)
-    spread = np.median(np.abs(rho[used] - expected) / (1 - expected**2 + 1e-3)) * 1.4826
-    return curve, float(1.0 / spread**2)
+    return np.asarray(np.maximum.accumulate(fall + 1e-9 * np.arange(fall.size)))
 
 
 def _bin_means(distance: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray]:

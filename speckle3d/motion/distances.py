@@ -13,6 +13,8 @@ from speckle3d.motion.patches import PatchGrid
 LEAST_CORRELATION = 0.03
 """A patch that correlates less than this holds no distance at all."""
 TABLE_STEPS = 400
+SHARE_ERROR = 0.3
+"""Relative error of a coherent share: structure is neither quite frozen nor quite Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,22 @@ class PatchDistances:
 
     distance_mm: FloatArray
     sigma_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class EchoModel:
+    """How a patch's correlation departs from fully developed speckle's, rho_F, in one pair.
+
+    rho = gain (staying + moving sqrt(rho_F))^2; see `speckle3d.motion.coherence`.
+
+    Attributes
+    ----------
+    staying, moving, gain : ndarray, shape (p,)
+    """
+
+    staying: FloatArray
+    moving: FloatArray
+    gain: FloatArray
 
 
 class DistanceEstimator:
@@ -45,8 +63,11 @@ class DistanceEstimator:
         # sqrt(-ln rho) is nearly straight in distance, so a uniform table of it inverts well.
         self._distance = np.stack([np.interp(roots, row, self._grid) for row in root])
 
-    def distances(self, correlation: FloatArray) -> PatchDistances:
+    def distances(self, correlation: FloatArray, model: EchoModel | None = None) -> PatchDistances:
         """Distance and standard deviation for one correlation per patch, shape (p,)."""
+        if model is not None:
+            echo = np.sqrt(np.maximum(correlation, 0.0) / model.gain)
+            correlation = np.maximum((echo - model.staying) / model.moving, 0.0) ** 2
         rho = np.where(correlation > LEAST_CORRELATION, np.minimum(correlation, 0.9999), np.nan)
         with np.errstate(invalid="ignore"):
             position = np.sqrt(-np.log(rho)) / self._root_step
@@ -54,9 +75,14 @@ class DistanceEstimator:
         patch = np.arange(rho.size)
         low, high = self._distance[patch, cell], self._distance[patch, cell + 1]
         distance = low + np.clip(position - cell, 0, 1) * (high - low)
-        return PatchDistances(distance, np.where(np.isnan(rho), np.nan, self.sigma(distance)))
+        return PatchDistances(distance, np.where(np.isnan(rho), np.nan, self.sigma(distance, model)))
 
-    def sigma(self, distance_mm: FloatArray) -> FloatArray:
+    def fully_developed(self, distance_mm: float) -> FloatArray:
+        """Correlation that fully developed speckle would have at one distance, shape (p,)."""
+        cell = min(round(distance_mm / self._grid[1]), self._grid.size - 1)
+        return np.asarray(self._rho[:, cell])
+
+    def sigma(self, distance_mm: FloatArray, model: EchoModel | None = None) -> FloatArray:
         """Standard deviation of a distance estimate where the true distance is `distance_mm`, shape (p,).
 
         From Var(rho) = (1 - rho^2)^2 / N for N independent cells and the curve's slope. Near zero the slope
@@ -72,6 +98,13 @@ class DistanceEstimator:
             for table in (self._rho, self._slope)
         )
         sigma_rho = (1 - rho**2) / np.sqrt(self._cells)
+        if model is not None:
+            g = np.sqrt(rho)
+            echo = model.staying + model.moving * g
+            measured = np.minimum(model.gain * echo**2, 0.999)
+            noise = (1 - measured**2) / np.sqrt(self._cells)
+            misfit = SHARE_ERROR * model.staying * (1 - g) * 2 * echo * model.gain
+            sigma_rho = np.hypot(noise, misfit) * g / np.maximum(model.gain * echo * model.moving, 1e-6)
         d = np.minimum(d, self._grid[-1])
         direct = sigma_rho / np.maximum(slope, 1e-9)
         return np.asarray(np.minimum(direct, np.sqrt(2 * d * direct)))

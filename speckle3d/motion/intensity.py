@@ -130,8 +130,9 @@ class IntensityExtractor:
 def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> _Resampling:
     low, high = signal.bandwidth_hz
     edge = edge_fraction * (high - low)
-    # Intensity holds frequencies up to the whole pass-band's width on either side of zero.
-    decimation = max(1, int(signal.sampling_rate_hz / (2 * (high - low + 2 * edge))))
+    # Intensity holds frequencies up to the whole pass-band's width on either side of zero; half as many
+    # samples again let a parabola through its correlation at neighbouring samples be read between them.
+    decimation = max(1, int(signal.sampling_rate_hz / (3 * (high - low + 2 * edge))))
     padding = int(2 * signal.sampling_rate_hz / edge)
     short = fft.next_fast_len(-(-(samples + padding) // decimation))
     length = short * decimation

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.geometry import FloatArray
-from speckle3d.motion.distances import DistanceEstimator, PatchDistances
+from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -68,6 +68,7 @@ def fit_plane(
     at_mm: FloatArray,
     settings: PlaneSettings | None = None,
     subset: BoolArray | None = None,
+    model: EchoModel | None = None,
 ) -> PairPlane | None:
     """Robust weighted least squares; None if fewer than six patches can take part.
 
@@ -80,6 +81,8 @@ def fit_plane(
         Patch centres less the image's centre.
     subset : ndarray of bool, shape (p,), optional
         Patches allowed to take part.
+    model : EchoModel, optional
+        With which the distances were made.
     """
     s = settings or PlaneSettings()
     d = distances.distance_mm
@@ -91,9 +94,9 @@ def fit_plane(
     robust = np.ones(len(d))
     data = np.nan_to_num(d)
     for _ in range(5):
-        sigma = estimator.sigma(predicted)
+        sigma = estimator.sigma(predicted, model)
         weight = used * robust / sigma**2
-        inverse = np.linalg.pinv(design.T @ (design * weight[:, None]), hermitian=True)
+        inverse = _inverse(design.T @ (design * weight[:, None]))
         plane = inverse @ (design.T @ (weight * data))
         predicted = design @ plane
         size = np.abs(data - predicted) / sigma
@@ -141,3 +144,9 @@ def consistent_subset(
     )
     support[known] = agree[int(np.argmax(score))]
     return support
+
+
+def _inverse(normal: FloatArray) -> FloatArray:
+    """Inverse of a 3 x 3 normal matrix; slopes that the patches do not determine get a huge variance."""
+    slack = 1e-9 * np.diag(normal).max() * np.array([1e-6, 1.0, 1.0])
+    return np.asarray(np.linalg.inv(normal + np.diag(slack)))

@@ -28,6 +28,9 @@ class TrajectorySettings(BaseModel):
 
     recent: int = Field(2, ge=1, description="Frames just before each frame that it is measured against.")
     key_frames: int = Field(4, ge=1, description="Key frames before each frame that it is measured against.")
+    far_key_frames: int = Field(
+        4, ge=0, description="Older key frames that every other frame is measured against, to see what stays."
+    )
     key_correlation: float = Field(
         0.9,
         gt=0,
@@ -72,13 +75,14 @@ class PairSchedule:
     def references(self, frame: int) -> list[int]:
         """Earlier frames to measure `frame` against, latest first."""
         recent = range(max(0, frame - self.settings.recent), frame)
-        return sorted({*recent, *self._keys}, reverse=True)
+        keys = self._keys if frame % 2 else self._keys[-self.settings.key_frames :]
+        return sorted({*recent, *keys}, reverse=True)
 
     def settle(self, frame: int, correlations: dict[int, float]) -> None:
         """Take note of the median correlations of `frame` with its references."""
         last = self._keys[-1] if self._keys else None
         if last is None or correlations.get(last, 0.0) < self.settings.key_correlation:
-            self._keys = [*self._keys, frame][-self.settings.key_frames :]
+            self._keys = [*self._keys, frame][-(self.settings.key_frames + self.settings.far_key_frames) :]
 
     def needed(self, frame: int) -> set[int]:
         """Frames up to `frame` that later ones may be measured against."""
@@ -108,6 +112,10 @@ class SignResolver:
         self._position[frame] = position
         return np.where(position >= here, 1.0, -1.0)
 
+    def position(self, frame: int) -> float:
+        """Elevational position at which a frame was placed, mm."""
+        return self._position[frame]
+
     def forget(self, keep: set[int]) -> None:
         """Drop the positions of frames that no later one will be measured against."""
         self._position = {frame: z for frame, z in self._position.items() if frame in keep}
@@ -115,7 +123,8 @@ class SignResolver:
 
 def _best_position(here: FloatArray, pairs: Sequence[PairMeasurement], trend: float) -> float:
     d = np.array([p.plane.offset_mm for p in pairs])
-    sigma = np.sqrt([p.plane.covariance[0, 0] for p in pairs])
+    # Coherent tissue makes long distances too short: a misfit of a quarter is no sign of turning back.
+    sigma = np.sqrt([p.plane.covariance[0, 0] + (0.25 * p.plane.offset_mm) ** 2 for p in pairs])
     candidates = np.concatenate([here + d, here - d])
     misfit = (np.abs(candidates[:, None] - here) - d) / sigma
     cost = np.minimum(misfit**2, 9.0).sum(axis=1)

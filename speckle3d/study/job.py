@@ -84,8 +84,6 @@ def run_job(
     path = directory / "reconstruction.h5"
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
         tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep)
-        if tracked.direction < 0:
-            writer.mirror_pairs()
         corrections = correct(tracked, sweep, drift, settings)
         poses = {"image": tracked.image} | {mode: c.poses for mode, c in corrections.items()}
         provenance = Provenance(str(source), sha256_of(source), version("speckle3d"))
