@@ -103,7 +103,7 @@ class CoarseMatcher:
         """Vectors and samples by which `moving` is displaced, shape (2,)."""
         product = fft.irfft2(np.conj(fixed) * moving, self._shape)
         rows, columns = self._reach
-        near = np.roll(product, (rows, columns), axis=(0, 1))[: 2 * rows + 1, : 2 * columns + 1]
+        near = product[np.arange(-rows, rows + 1)[:, None], np.arange(-columns, columns + 1)]
         peak = np.unravel_index(np.argmax(near), near.shape)
         return np.array([peak[0] - rows, (peak[1] - columns) * self._pool], dtype=np.int64)
 
@@ -144,6 +144,8 @@ def match_patches(
         patch_correlations(fixed, moving, patches.first, patches.size, lag, s.least_overlap, rho)
         shift, weight = _patch_peaks(rho, lag, patches)
         motion, predicted = _fit_motion(shift, weight, at, start, predicted)
+        if np.array_equal(np.rint(predicted / patches.spacing_mm), lag):
+            break
     correlation = _read_at(rho, predicted / patches.spacing_mm - lag)
     return PatchMatch(correlation, shift, motion)
 
@@ -228,7 +230,7 @@ def _robust_fit(
         inverse = np.linalg.inv(normal)
         solution = inverse @ (design.T @ (w * data))
         size = np.abs(data - design @ solution) * np.sqrt(weight)
-        scale = 1.4826 * np.median(size) + 1e-12
+        scale = 1.4826 * np.partition(size, size.size // 2)[size.size // 2] + 1e-12
         robust = np.minimum(1.0, 1.5 * scale / np.maximum(size, 1e-12))
     return solution, inverse * scale**2
 
