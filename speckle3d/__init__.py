@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.io.volumes import read_volume, write_volume
-    from speckle3d.pipeline import Tracked, calibrate_curves, correct, track
+    from speckle3d.pipeline import calibrate_curves, correct, track
     from speckle3d.simulation.presets import SimulationSettings, simulate
+    from speckle3d.solution import Tracked
     from speckle3d.study.images import grey_images
     from speckle3d.study.job import JobResult, run_job
     from speckle3d.study.metrics import ModeError, compare_modes
@@ -38,7 +39,7 @@ _HOME = {
     "SimulationSettings": "simulation.presets",
     "Speckle3DError": "core.errors",
     "Sweep": "core.sweep",
-    "Tracked": "pipeline",
+    "Tracked": "solution",
     "calibrate_curves": "pipeline",
     "compare_modes": "study.metrics",
     "compound": "imaging.volume",

@@ -24,7 +24,8 @@ from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor
-from speckle3d.pipeline import Progress, Tracked, correct, track
+from speckle3d.pipeline import Progress, correct, track
+from speckle3d.solution import Tracked
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.metrics import ModeError, align_sign, compare_modes
 from speckle3d.study.summary import Summary, table_text, write_summary

@@ -1,0 +1,138 @@
+"""First reading of a sweep: frames in, the correlations of its frame pairs and a rough path out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from speckle3d.config import Config
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import Sweep
+from speckle3d.motion.distances import DistanceEstimator
+from speckle3d.motion.inplane import InPlaneMotion, PatchMatch
+from speckle3d.motion.intensity import Float32Array
+from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.motion.planes import fit_plane
+from speckle3d.motion.table import CorrelationTable
+from speckle3d.motion.trajectory import PairMeasurement, PairSchedule, SignResolver
+
+ImageSink = Callable[[int, Float32Array], None]
+"""Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
+
+
+@dataclass
+class StageTimes:
+    """Seconds spent in each stage; reading and intensity overlap with the rest on another core."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def add(self, stage: str, since: float) -> float:
+        """Book the time since `since` on `stage`; returns now."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - since
+        return now
+
+
+class Walk:
+    """First reading of the sweep: which pairs to match, what they share, where frames roughly lie."""
+
+    def __init__(
+        self, sweep: Sweep, matcher: FrameMatcher, estimator: DistanceEstimator, config: Config
+    ) -> None:
+        self.sweep, self.matcher, self.estimator, self.config = sweep, matcher, estimator, config
+        self.times = StageTimes()
+        self.table = CorrelationTable(len(matcher.patches))
+        self.position_mm = np.zeros(len(sweep))
+        self.unreliable: list[int] = []
+        self._schedule = PairSchedule(config.trajectory)
+        self._signs = SignResolver()
+        self._ready: dict[int, ReadyFrame] = {}
+        self._motion: dict[int, InPlaneMotion] = {0: InPlaneMotion()}
+
+    def advance(self, frame: int, ready: ReadyFrame) -> None:
+        """Match a frame with its references, place it, and let go of what is no longer needed."""
+        self._ready[frame] = ready
+        matches = {first: self._match(first, frame) for first in self._schedule.references(frame)}
+        correlations = {first: _median(match.correlation) for first, match in matches.items()}
+        if frame:
+            self._place(frame, matches, correlations)
+        self._schedule.settle(frame, correlations)
+        keep = self._schedule.needed(frame)
+        self._signs.forget(keep)
+        self._ready = {k: v for k, v in self._ready.items() if k in keep}
+        self._motion = {k: v for k, v in self._motion.items() if k in keep}
+
+    def _match(self, first: int, second: int) -> PatchMatch:
+        then = time.perf_counter()
+        fixed, moving = self._ready[first], self._ready[second]
+        if second not in self._motion:
+            self._motion[second] = compose(self._motion[first], self.matcher.search(fixed, moving))
+        start = compose(inverse(self._motion[first]), self._motion[second])
+        match = self.matcher.match(fixed, moving, start)
+        if second - first == 1:
+            self._motion[second] = compose(self._motion[first], match.motion)
+        self.times.add("in-plane motion and correlation", then)
+        return match
+
+    def _place(self, frame: int, matches: dict[int, PatchMatch], correlations: dict[int, float]) -> None:
+        then = time.perf_counter()
+        least = self.config.trajectory.least_correlation
+        near = [first for first, rho in correlations.items() if rho >= least]
+        if not near:
+            near = [max(correlations, key=lambda first: correlations[first])]
+            self.unreliable.append(frame)
+        pairs = []
+        for first in near:
+            distances = self.estimator.distances(matches[first].correlation)
+            plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes)
+            if plane is not None:
+                pairs.append(PairMeasurement(first, frame, matches[first].motion, plane, correlations[first]))
+        if not pairs:
+            raise InsufficientDataError(
+                f"{self.sweep.name}: frame {frame}: expected speckle in common with frame {frame - 1}, "
+                "found none"
+            )
+        self._signs.place(pairs)
+        self.position_mm[frame] = self._signs.position(frame)
+        for first, match in sorted(matches.items()):
+            self.table.append(first, frame, match)
+        self.times.add("distances and planes", then)
+
+
+def prefetch(
+    sweep: Sweep, matcher: FrameMatcher, times: StageTimes, images: ImageSink | None, ahead: int = 3
+) -> Iterator[ReadyFrame]:
+    """Frames made ready, a few ahead of their use, on a thread of their own."""
+
+    def make(index: int) -> ReadyFrame:
+        then = time.perf_counter()
+        frame = sweep.frames[index]
+        then = times.add("reading", then)
+        intensity = matcher.intensity(frame)
+        if images:
+            images(index, intensity)
+        ready = matcher.prepare(intensity)
+        times.add("intensity", then)
+        return ready
+
+    with ThreadPoolExecutor(1) as worker:
+        waiting: list[Future[ReadyFrame]] = []
+        try:
+            for index in range(len(sweep)):
+                waiting.append(worker.submit(make, index))
+                if len(waiting) > ahead:
+                    yield waiting.pop(0).result()
+            for future in waiting:
+                yield future.result()
+        finally:
+            worker.shutdown(wait=True, cancel_futures=True)
+
+
+def _median(correlation: FloatArray) -> float:
+    known = correlation[np.isfinite(correlation)]
+    return float(np.median(known)) if known.size else 0.0
