@@ -1,0 +1,86 @@
+"""What holds for the project as a whole: imports that cost nothing, public names, README, shipped data."""
+
+import importlib
+import json
+import re
+
+import pytest
+
+import speckle3d
+
+HEAVY = ("numba", "llvmlite", "h5py", "numpy", "scipy", "SimpleITK", "matplotlib", "pydantic")
+
+
+def loaded_after(python, code, names):
+    return json.loads(
+        python(f"{code}\nimport sys, json; print(json.dumps(sorted(set({names!r}) & set(sys.modules))))")
+    )
+
+
+@pytest.mark.parametrize(
+    "code", ["import speckle3d", "import speckle3d; dir(speckle3d); speckle3d.__all__", "import xsens"]
+)
+def test_importing_a_package_loads_nothing_heavy(python, code):
+    assert loaded_after(python, code, HEAVY) == []
+
+
+def test_the_errors_load_nothing_heavy_and_the_core_only_numpy_and_scipy(python):
+    assert loaded_after(python, "from speckle3d import Speckle3DError", HEAVY) == []
+    found = loaded_after(python, "from speckle3d import Sweep", HEAVY)
+    assert set(found) <= {"numpy", "scipy"}
+
+
+def test_every_module_of_the_sensor_package_stays_clear_of_numba_and_h5py(python, project):
+    names = [f"xsens.{path.stem}" for path in (project / "xsens").glob("[a-z]*.py")]
+    code = "\n".join(f"import {name}" for name in ["xsens", *names])
+    assert loaded_after(python, code, ("numba", "h5py")) == []
+
+
+@pytest.mark.parametrize("name", speckle3d.__all__)
+def test_public_names_are_there_and_documented(name):
+    assert getattr(speckle3d, name).__doc__
+    assert name in dir(speckle3d)
+
+
+def test_public_names_are_listed_once_and_for_the_type_checker_too(project):
+    source = (project / "speckle3d" / "__init__.py").read_text(encoding="utf-8")
+    for_checker = source[source.index("if TYPE_CHECKING") : source.index("_HOME")]
+    assert list(speckle3d.__all__) == sorted(set(speckle3d.__all__))
+    assert set(speckle3d._HOME) == set(speckle3d.__all__)
+    for name in speckle3d.__all__:
+        assert re.search(rf"\b{name}\b", for_checker), name
+
+
+def test_the_version_is_the_distributions_and_a_misspelt_name_an_attribute_error():
+    assert speckle3d.__version__ == importlib.metadata.version("speckle3d")
+    with pytest.raises(AttributeError, match="'speckle3d' has no attribute 'trak'"):
+        _ = speckle3d.trak
+
+
+def test_the_readmes_python_example_runs(project, monkeypatch, capsys):
+    readme = (project / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 8
+    monkeypatch.chdir(project)
+    exec(compile(example, "README.md", "exec"), {})
+    assert "mm" in capsys.readouterr().out
+
+
+def test_the_readmes_test_command_is_what_ci_runs(project):
+    readme = (project / "README.md").read_text(encoding="utf-8")
+    ci = (project / ".ci" / "run").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^pip install .*pytest$", readme, re.MULTILINE)
+    assert command in ci.replace(" --quiet", "")
+
+
+def test_every_shipped_file_is_small_and_its_making_told(project):
+    files = [path for path in (project / "data").iterdir() if path.is_file()]
+    told = (project / "data" / "README.md").read_text(encoding="utf-8")
+    assert sum(path.stat().st_size for path in files) < 40e6
+    assert all(f"`{path.name}`" in told for path in files if path.name != "README.md")
+
+
+def test_links_between_the_projects_pages_lead_somewhere(project):
+    for page in (project / "README.md", project / "data" / "README.md"):
+        for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), (page.name, target)
