@@ -206,7 +206,10 @@ def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
 def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) -> None:
     """Refuse a truncated file before the image library does so in its own words."""
     if header.fields["ElementDataFile"].upper() != "LOCAL":
-        data = Path(path).with_name(header.fields["ElementDataFile"])
+        name = header.fields["ElementDataFile"]
+        data = Path(path).parent / name
+        if not name or not data.is_file():
+            raise FileError(f"{path}: ElementDataFile: expected LOCAL or a file beside it, got {name!r}")
         found = data.stat().st_size
     else:
         found = Path(path).stat().st_size - stream.tell()
