@@ -154,10 +154,13 @@ def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius)
 
 
 def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
-    """Twin of `speckle3d.motion.planes.consistent_subset`: every plane, every patch, one after the other."""
+    """Twin of `speckle3d.motion.planes.consistent_subset`: every plane, every patch, one after the other.
+
+    Returns all best subsets: placements may tie but for rounding.
+    """
     n = len(distance_mm)
-    best, best_key = np.zeros(n, bool), None
-    for i in range(n):
+    tried = []
+    for i in np.flatnonzero(np.isfinite(distance_mm)):
         for sign in (1.0, -1.0):
             offset = sign * distance_mm[i] - at_mm[i] @ slopes
             support, misfit = np.zeros(n, bool), 0.0
@@ -165,9 +168,9 @@ def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
                 error = abs(abs(offset + at_mm[j] @ slopes) - distance_mm[j]) / sigma_mm[j]
                 if error <= support_sigma:
                     support[j], misfit = True, misfit + error
-            if np.isnan(distance_mm[i]):
-                continue
-            key = (support.sum(), -misfit)
-            if best_key is None or key > best_key:
-                best, best_key = support, key
-    return best
+            tried.append((support.sum(), misfit, support))
+    if not tried:
+        return [np.zeros(n, bool)]
+    most = max(count for count, _, _ in tried)
+    closest = min(misfit for count, misfit, _ in tried if count == most)
+    return [s for count, misfit, s in tried if count == most and misfit <= closest + 1e-9]

@@ -152,7 +152,7 @@ def test_subset_is_that_of_trying_every_plane(seed, patches, support):
     d[rng.uniform(size=patches) < 0.1] = np.nan
     got = consistent_subset(PatchDistances(d, sigma), at, slopes, PlaneSettings(support_sigma=support))
     expected = oracles.consistent_patches(d, sigma, at, slopes, support)
-    assert np.array_equal(got, expected)
+    assert any(np.array_equal(got, each) for each in expected)
 
 
 @pytest.mark.parametrize("side", [1, -1])
