@@ -76,6 +76,9 @@ def _turn_agreement(sweep: Sweep, image: RigidTransform) -> int | None:
     t = np.linspace(-1, 1, covered.size)
     trend = np.vander(t, 3)
     left = [v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen)]
-    correlation = float(np.sum(left[0] * left[1]) / np.sqrt(np.sum(left[0] ** 2) * np.sum(left[1] ** 2)))
+    power = float(np.sum(left[0] ** 2) * np.sum(left[1] ** 2))
+    if power == 0:
+        return None
+    correlation = float(np.sum(left[0] * left[1])) / power**0.5
     # Slow turns have some ten independent values in a sweep: 0.5 is about two standard deviations.
     return None if abs(correlation) < 0.5 else int(np.sign(correlation))

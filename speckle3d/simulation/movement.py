@@ -166,8 +166,10 @@ def _progress(
     """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
     duration = float(time[inside][-1])
     speed = 1.0 + motion.speed_variation * np.tanh(_band_noise(time, (0.0, 0.8), rng))
+    # In a very short sweep a whole pause would leave no motion at all.
+    pause_s = min(motion.pause_s, 0.2 * duration)
     for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:
-        speed *= 1.0 - _window((time - centre) / motion.pause_s)
+        speed *= 1.0 - _window((time - centre) / pause_s)
     speed = np.where(inside, speed, 0.0)
     if motion.reverse:
         speed *= np.tanh((duration / 2.0 - time) / 0.25)

@@ -58,6 +58,10 @@ CASES = (
         {"length_mm": 20.0},
         {"image": (3.0, 1.0), "orientation": ("image", 0.2), "pose": (1.0, 0.1)},
     ),
+    Case("phantom, turned 5 deg in yaw", "rotation", {"length_mm": 20.0, "turn_axis": "yaw"}),
+    Case("phantom, turned 5 deg in tilt", "rotation", {"length_mm": 20.0}),
+    Case("tissue, 20 mm one way", "tissue", {"length_mm": 20.0}),
+    Case("tissue, forward and back", "reversal", {"length_mm": 20.0}),
 )
 
 
