@@ -47,8 +47,34 @@ class _Clock:
         return t
 
 
+class _Timed:
+    """What samples on a clock have in common, whatever they are."""
+
+    time_s: FloatArray
+    max_gap_s: float
+    _clock: _Clock
+
+    def _settle(self, samples: int) -> None:
+        """Validate once, when made."""
+        object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
+        if self.time_s.size != samples:
+            raise InvalidInputError(
+                f"expected as many samples as times, got {samples} and {self.time_s.size}"
+            )
+        if samples == 0:
+            raise InvalidInputError("expected at least one sensor sample, got none")
+        object.__setattr__(self, "_clock", _Clock(self.time_s, self.max_gap_s))
+
+    def __len__(self) -> int:
+        return int(self.time_s.size)
+
+    def covers(self, times_s: npt.ArrayLike) -> BoolArray:
+        """Whether each of `times_s` lies on a sample or between two that are close enough."""
+        return self._clock.covers(times_s)
+
+
 @dataclass(frozen=True)
-class TimedRotations:
+class TimedRotations(_Timed):
     """Orientation samples of one sensor.
 
     Parameters
@@ -66,16 +92,7 @@ class TimedRotations:
     _clock: _Clock = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
-        _require_same_length(self.time_s, len(self.world_from_sensor))
-        object.__setattr__(self, "_clock", _Clock(self.time_s, self.max_gap_s))
-
-    def __len__(self) -> int:
-        return int(self.time_s.size)
-
-    def covers(self, times_s: npt.ArrayLike) -> BoolArray:
-        """Whether each of `times_s` lies on a sample or between two that are close enough."""
-        return self._clock.covers(times_s)
+        self._settle(len(self.world_from_sensor))
 
     def at(self, times_s: npt.ArrayLike) -> Rotation:
         """Orientation at `times_s` by spherical linear interpolation.
@@ -92,7 +109,7 @@ class TimedRotations:
 
 
 @dataclass(frozen=True)
-class TimedPoses:
+class TimedPoses(_Timed):
     """Position and orientation samples of one sensor.
 
     Parameters
@@ -111,16 +128,7 @@ class TimedPoses:
     _clock: _Clock = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
-        _require_same_length(self.time_s, len(self.world_from_sensor))
-        object.__setattr__(self, "_clock", _Clock(self.time_s, self.max_gap_s))
-
-    def __len__(self) -> int:
-        return int(self.time_s.size)
-
-    def covers(self, times_s: npt.ArrayLike) -> BoolArray:
-        """Whether each of `times_s` lies on a sample or between two that are close enough."""
-        return self._clock.covers(times_s)
+        self._settle(len(self.world_from_sensor))
 
     def at(self, times_s: npt.ArrayLike) -> RigidTransform:
         """Pose at `times_s`: slerp of the rotation, linear interpolation of the translation.
@@ -136,10 +144,3 @@ class TimedPoses:
         translation, rotation = self.world_from_sensor.as_components()
         moved = np.stack([np.interp(t, self.time_s, column) for column in translation.T], axis=-1)
         return RigidTransform.from_components(moved, Slerp(self.time_s, rotation)(t))
-
-
-def _require_same_length(time_s: FloatArray, samples: int) -> None:
-    if time_s.size != samples:
-        raise InvalidInputError(f"expected as many samples as times, got {samples} and {time_s.size}")
-    if samples == 0:
-        raise InvalidInputError("expected at least one sensor sample, got none")

@@ -56,6 +56,20 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def make_folder(path: PathLike) -> None:
+    """Make a folder for results, and those above it, unless it is there.
+
+    Raises
+    ------
+    FileError
+        If a file of the name is in the way, or the system refuses.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be made a folder: {one_line(error)}") from error
+
+
 @contextmanager
 def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
     """Open an HDF5 file of the family for writing; `path` appears whole or not at all (`atomic_path`)."""

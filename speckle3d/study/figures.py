@@ -14,8 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import FloatArray
+from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.study.metrics import JITTER_FRAMES, accumulated
 
 DOTS_PER_INCH = 150
@@ -128,13 +129,9 @@ def save_figure(figure: Figure, path: Path) -> Path:
     FileError
         If the file cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(partial, dpi=DOTS_PER_INCH, format="png")
-        partial.replace(path)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
+    make_folder(path.parent)
+    with atomic_path(path) as part:
+        figure.savefig(part, dpi=DOTS_PER_INCH, format="png")
     return path
 
 

@@ -15,13 +15,13 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
-from speckle3d.io.hdf5 import sha256_of
+from speckle3d.io.hdf5 import make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor
 from speckle3d.pipeline import Progress, correct, track
@@ -117,14 +117,6 @@ def find_reference(sweep: Sweep, wanted: str | None) -> Reference | None:
     if wanted == "tracker":
         raise InsufficientDataError(f"{sweep.name}: expected a calibrated tracker over the frames, got none")
     return None
-
-
-def make_folder(directory: Path) -> None:
-    """Make the results' folder, or raise `FileError`."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{directory}: cannot be made a folder: {error.strerror}") from error
 
 
 def _summarise(

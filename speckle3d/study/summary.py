@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.study.metrics import ModeError
 
 _COLUMNS = (
@@ -123,11 +124,7 @@ def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _write_whole(path: Path, text: str) -> Path:
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
+    make_folder(path.parent)
+    with atomic_path(path) as part:
+        part.write_text(text, encoding="utf-8")
     return path
