@@ -8,18 +8,29 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.config import Config
 from speckle3d.core.geometry import FloatArray
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+
+
+def orientation_sensor(sweep: Sweep) -> OrientationSensor | Tracker | None:
+    """Return what knows the sweep's orientation: its orientation sensor, or else its tracker."""
+    return sweep.orientation or sweep.tracker
+
+
+def orientation_at(sensor: OrientationSensor | Tracker, time_s: FloatArray) -> Rotation:
+    """Orientation of the image from either kind of sensor."""
+    measured = sensor.world_from_image(time_s)
+    return measured.rotation if isinstance(measured, RigidTransform) else measured
 
 
 def sensed_orientation(sweep: Sweep, config: Config) -> Rotation | None:
     """Smoothed orientation of every frame for the consistent subset; None if off or not known throughout."""
-    sensor = sweep.orientation
+    sensor = orientation_sensor(sweep)
     if not config.sensors.consistent_subset or sensor is None or sensor.sensor_from_image is None:
         return None
     if not sensor.covers(sweep.frame_time_s).all():
         return None
     return smooth_rotations(
-        sensor.world_from_image(sweep.frame_time_s), sweep.frame_time_s, config.sensors.smooth_s
+        orientation_at(sensor, sweep.frame_time_s), sweep.frame_time_s, config.sensors.smooth_s
     )
 
 
@@ -31,12 +42,6 @@ def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) ->
     vectors = (mean.inv() * rotations).as_rotvec()
     sigma = sigma_s / float(np.median(np.diff(time_s)))
     return mean * Rotation.from_rotvec(gaussian_filter1d(vectors, sigma, axis=0, mode="nearest"))
-
-
-def mirrored(world_from_image: RigidTransform) -> RigidTransform:
-    """The same motion seen in a mirror in the image plane: elevation, tilt and yaw change sign."""
-    flip = np.diag([1.0, 1.0, -1.0, 1.0])
-    return RigidTransform.from_matrix(flip @ world_from_image.as_matrix() @ flip)
 
 
 def settle_direction(sweep: Sweep, image: RigidTransform, config: Config) -> tuple[int, str]:

@@ -15,6 +15,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.direction import orientation_at, orientation_sensor
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.distances import DistanceEstimator
 from speckle3d.motion.matching import FrameMatcher
@@ -122,17 +123,15 @@ def _correct_by_tracker(poses: RigidTransform, sweep: Sweep, config: Config) -> 
 
 
 def _correct_by_orientation(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
-    if sweep.orientation is None and sweep.tracker is None:
+    sensor = orientation_sensor(sweep)
+    if sensor is None:
         raise InsufficientDataError(
             f"{sweep.name}: drift mode orientation: expected an orientation sensor in /orientation, got none"
         )
-    sensor = sweep.orientation or sweep.tracker
-    assert sensor is not None
     covered = sensor.covers(sweep.frame_time_s)
     if not covered.any():
         raise InsufficientDataError(
             f"{sweep.name}: drift mode orientation: no orientation reading covers any frame"
         )
-    measured = sensor.world_from_image(sweep.frame_time_s[covered])
-    rotation = measured.rotation if isinstance(measured, RigidTransform) else measured
+    rotation = orientation_at(sensor, sweep.frame_time_s[covered])
     return correct_orientation(poses, rotation, covered, sweep.grid.centre_mm, config.drift)

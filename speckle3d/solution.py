@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.direction import mirrored, sensed_orientation, settle_direction
+from speckle3d.direction import sensed_orientation, settle_direction
 from speckle3d.motion.coherence import Coherence, estimate_coherence
 from speckle3d.motion.distances import EchoModel, PatchDistances
 from speckle3d.motion.patches import IntArray
@@ -20,7 +21,8 @@ from speckle3d.motion.trajectory import PairMeasurement, SignedPair, sign_pair, 
 from speckle3d.walk import StageTimes, Walk
 
 PairSink = Callable[[FramePairs], None]
-"""Called with the pairs of some frames at a time, in order."""
+"""Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
+SINK_PAIRS = 1024
 
 
 @dataclass(frozen=True)
@@ -86,29 +88,30 @@ class Solution:
         then = time.perf_counter()
         chosen = self._choose()
         models = self._models(chosen)
-        measured = [self._measure(row, model) for row, model in zip(chosen, models, strict=True)]
+        tried = [self._measure(row, model) for row, model in zip(chosen, models, strict=True)]
+        measured = [m for m in tried if m is not None]
         then = walk.times.add("distances and planes", then)
         centre = self._matcher.centre_mm
-        joined = [m for m in measured if m.plane is not None]
-        image = solve_trajectory(
-            [self._signed(m, m.plane) for m in joined], frames, centre, self._config.trajectory
-        )
+        pairs = [self._signed(m, m.plane) for m in measured]
+        image = solve_trajectory(pairs, frames, centre, self._config.trajectory)
         subset = None
         if self._sensed is not None:
-            pairs = [self._signed(m, m.subset or m.plane) for m in joined]
-            subset = solve_trajectory(pairs, frames, centre, self._config.trajectory)
+            kept = [self._signed(m, m.subset) for m in measured]
+            subset = solve_trajectory(kept, frames, centre, self._config.trajectory)
         direction, source = settle_direction(walk.sweep, image, self._config)
         if direction < 0:
             image, subset = mirrored(image), mirrored(subset) if subset is not None else None
         if sink:
-            sink(self._rows(joined, direction))
+            for start in range(0, len(pairs), SINK_PAIRS):
+                some = slice(start, start + SINK_PAIRS)
+                sink(self._rows(measured[some], pairs[some], direction))
         walk.times.add("trajectory", then)
         return Tracked(
             image,
             subset,
             self._rejected / self._counted if self._counted else float("nan"),
             tuple(walk.unreliable),
-            len(joined),
+            len(pairs),
             direction,
             source,
             self._coherence,
@@ -138,51 +141,51 @@ class Solution:
         for share, gain, h in zip(shares, gains, left, strict=True):
             yield EchoModel(share * h, 1 - share, gain)
 
-    def _measure(self, row: int, model: EchoModel | None) -> _Measured:
-        at, settings = self._matcher.at_mm, self._config.planes
+    def _measure(self, row: int, model: EchoModel | None) -> _Measured | None:
+        settings, motion = self._config.planes, self._walk.table.motion(row)
+        at = self._matcher.at_mm - [motion.x_mm, motion.y_mm]
         first, second = int(self._first[row]), int(self._second[row])
         distances = self._estimator.distances(self._rho[row].astype(float), model)
         plane = fit_plane(distances, self._estimator, at, settings, model=model)
         subset = None
         if self._sensed is not None and plane is not None:
             relative = (self._sensed[first].inv() * self._sensed[second]).as_matrix()
-            support = consistent_subset(distances, at, relative[2, :2], settings)
-            subset = fit_plane(distances, self._estimator, at, settings, support, model)
+            agreed = consistent_subset(distances, at, relative[2, :2], settings)
+            subset = fit_plane(distances, self._estimator, at, settings, agreed.support, model, agreed.side)
             known = np.isfinite(distances.distance_mm)
             self._counted += int(known.sum())
-            self._rejected += int((known & ~support).sum())
-        return _Measured(row, distances, plane, subset)
+            self._rejected += int((known & ~agreed.support).sum())
+        return None if plane is None else _Measured(row, distances, plane, subset or plane)
 
-    def _signed(self, measured: _Measured, plane: PairPlane | None) -> SignedPair:
-        assert plane is not None
+    def _signed(self, measured: _Measured, plane: PairPlane) -> SignedPair:
         first, second = int(self._first[measured.row]), int(self._second[measured.row])
         sign = 1.0 if self._position[second] >= self._position[first] else -1.0
-        pair = PairMeasurement(first, second, self._walk.table.motion(measured.row), plane, 1.0)
+        pair = PairMeasurement(first, second, self._walk.table.motion(measured.row), plane)
         return sign_pair(pair, plane, sign)
 
-    def _rows(self, measured: list[_Measured], direction: int) -> FramePairs:
+    def _rows(self, measured: list[_Measured], signed: list[SignedPair], direction: int) -> FramePairs:
         """Rows for the reconstruction file."""
-        signed = [self._signed(m, m.plane) for m in measured]
         centre = RigidTransform.from_translation(self._matcher.centre_mm)
         poses = RigidTransform.concatenate([centre * s.pose * centre.inv() for s in signed])
         turn = np.diag([1.0, 1.0, direction, direction, direction, 1.0])
+        flip = np.diag([1.0, 1.0, direction, 1.0])
         return FramePairs(
             first=np.array([s.first for s in signed]),
             second=np.array([s.second for s in signed]),
-            first_from_second=(mirrored(poses) if direction < 0 else poses).as_matrix(),
+            first_from_second=flip @ poses.as_matrix() @ flip,
             covariance=np.array([turn @ s.covariance @ turn for s in signed]),
             distance_mm=np.array([m.distances.distance_mm for m in measured], dtype=np.float32),
             sigma_mm=np.array([m.distances.sigma_mm for m in measured], dtype=np.float32),
-            used=np.array([(m.subset or m.plane).used for m in measured]),  # type: ignore[union-attr]
+            used=np.array([m.subset.used for m in measured]),
             patch_centre_mm=self._matcher.patches.centre_mm,
         )
 
 
 @dataclass(frozen=True)
 class _Measured:
-    """One pair of the second reading."""
+    """One pair of the second reading; without a sensed orientation the subset's plane is that of all."""
 
     row: int
     distances: PatchDistances
-    plane: PairPlane | None
-    subset: PairPlane | None
+    plane: PairPlane
+    subset: PairPlane

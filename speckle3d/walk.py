@@ -89,12 +89,14 @@ class Walk:
         pairs = []
         for first in near:
             distances = self.estimator.distances(matches[first].correlation)
-            plane = fit_plane(distances, self.estimator, self.matcher.at_mm, self.config.planes)
+            motion = matches[first].motion
+            at = self.matcher.at_mm - [motion.x_mm, motion.y_mm]
+            plane = fit_plane(distances, self.estimator, at, self.config.planes)
             if plane is not None:
-                pairs.append(PairMeasurement(first, frame, matches[first].motion, plane, correlations[first]))
+                pairs.append(PairMeasurement(first, frame, motion, plane))
         if not pairs:
             raise InsufficientDataError(
-                f"{self.sweep.name}: frame {frame}: expected speckle in common with frame {frame - 1}, "
+                f"{self.sweep.name}: frame {frame}: expected speckle in common with an earlier frame, "
                 "found none"
             )
         self._signs.place(pairs)

@@ -9,9 +9,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
-from speckle3d.direction import mirrored, settle_direction, smooth_rotations
+from speckle3d.direction import settle_direction, smooth_rotations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.matching import FrameMatcher

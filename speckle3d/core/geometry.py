@@ -52,6 +52,25 @@ def relative_poses(world_from_image: RigidTransform) -> RigidTransform:
     return world_from_image[:-1].inv() * world_from_image[1:]
 
 
+def mirrored(world_from_image: RigidTransform) -> RigidTransform:
+    """The same motion seen in a mirror in the first image's plane: elevation, tilt and yaw change sign.
+
+    Images cannot tell a sweep from its mirror image: distances from decorrelation have no sign. The first
+    pose stays as it is.
+    """
+    flip = np.diag([1.0, 1.0, -1.0, 1.0])
+    first_from_image = (world_from_image[0].inv() * world_from_image).as_matrix()
+    return world_from_image[0] * RigidTransform.from_matrix(flip @ first_from_image @ flip)
+
+
+def skew(vectors: FloatArray) -> FloatArray:
+    """Matrices of the cross product ``v x``, shape (..., 3) to (..., 3, 3)."""
+    matrices = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
+    return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
+
+
 def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
     """Validate scalar-first unit quaternions, shape (m, 4), read from `where`.
 

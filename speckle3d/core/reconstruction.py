@@ -28,13 +28,14 @@ class FramePairs:
     first, second : ndarray, shape (e,)
         Frame indices, first < second.
     first_from_second : ndarray, shape (e, 4, 4)
-        Pose of the second frame in the first, mm.
+        Pose of the second frame in the first, from all patches, mm.
     covariance : ndarray, shape (e, 6, 6)
         Of (x, y, z, tilt, yaw, roll) of that pose at the image centre, mm and rad.
     distance_mm, sigma_mm : ndarray, shape (e, p)
         Unsigned elevational distance of each patch and its standard deviation; NaN where there is none.
     used : ndarray of bool, shape (e, p)
-        Whether the patch took part in the plane fit.
+        Whether the patch is in the orientation-consistent subset; without a sensed orientation, whether it
+        took part in the plane.
     patch_centre_mm : ndarray, shape (p, 2)
         Lateral and axial position of each patch.
     """

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray, relative_poses, rotation_from_fixed_angles
+from speckle3d.core.geometry import FloatArray, relative_poses, rotation_from_fixed_angles, skew
 
 Curves = Literal["time", "distance"]
 
@@ -163,14 +163,6 @@ def angle_axes(roll: FloatArray, yaw: FloatArray) -> FloatArray:
     axes[:, 0, 1], axes[:, 1, 1] = -np.sin(roll), np.cos(roll)
     axes[:, 2, 2] = 1.0
     return axes
-
-
-def skew(vectors: FloatArray) -> FloatArray:
-    """Matrices of the cross product ``v x``, shape (..., 3) to (..., 3, 3)."""
-    matrices = np.zeros((*vectors.shape, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
-    return matrices - np.swapaxes(matrices, -1, -2)
 
 
 def _world_axes(poses: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:

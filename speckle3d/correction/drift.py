@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, roll_yaw_tilt
+from speckle3d.core.geometry import FloatArray, roll_yaw_tilt, skew
 from speckle3d.core.leastsquares import Fit, levenberg_marquardt
 from speckle3d.core.streams import BoolArray
 from speckle3d.correction.curves import (
@@ -24,7 +24,6 @@ from speckle3d.correction.curves import (
     angle_axes,
     curve_basis,
     elevational_steps,
-    skew,
 )
 
 

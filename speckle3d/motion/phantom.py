@@ -74,7 +74,7 @@ def phantom_samples(
         for first in wanted[wanted[:, 1] == frame, 0]:
             start = compose(inverse(motion[first]), motion[frame])
             match = matcher.match(kept[first], kept[frame], start)
-            distance = _patch_distances(poses[first].inv() * poses[frame], matcher, start)
+            distance = _patch_distances(poses[first].inv() * poses[frame], matcher, match.motion)
             rows.append(np.column_stack([matcher.patches.centre_mm[:, 1], distance, match.correlation]))
         needed = wanted[wanted[:, 1] > frame, 0]
         kept = {k: v for k, v in kept.items() if k == frame or k in needed}

@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import BoolArray
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 class PlaneSettings(BaseModel):
@@ -72,6 +70,7 @@ def fit_plane(
     settings: PlaneSettings | None = None,
     subset: BoolArray | None = None,
     model: EchoModel | None = None,
+    side: FloatArray | None = None,
 ) -> PairPlane | None:
     """Robust weighted least squares; None if fewer than six patches can take part.
 
@@ -86,6 +85,8 @@ def fit_plane(
         Patches allowed to take part.
     model : EchoModel, optional
         With which the distances were made.
+    side : ndarray of +1 and -1, shape (p,), optional
+        On which side of the first frame each patch lies, where that is known; without it all on one.
     """
     s = settings or PlaneSettings()
     d = distances.distance_mm
@@ -93,11 +94,11 @@ def fit_plane(
     if used.sum() < 6:
         return None
     design = np.column_stack([np.ones(len(d)), at_mm])
-    predicted = np.full(len(d), np.median(d[used]))
+    predicted = np.full(len(d), np.median(d[used]))  # only its size matters
     robust = np.ones(len(d))
-    data = np.nan_to_num(d)
+    data = np.nan_to_num(d) if side is None else np.nan_to_num(d) * side
     for _ in range(5):
-        sigma = estimator.sigma(predicted, model)
+        sigma = estimator.sigma(np.abs(predicted), model)
         weight = used * robust / sigma**2
         inverse = _inverse(design.T @ (design * weight[:, None]))
         plane = inverse @ (design.T @ (weight * data))
@@ -112,9 +113,23 @@ def fit_plane(
     return PairPlane(float(plane[0]), float(plane[1]), float(plane[2]), covariance, used)
 
 
+@dataclass(frozen=True)
+class ConsistentSubset:
+    """Patches that agree on an oriented plane, and on which side of the first frame it has them.
+
+    Attributes
+    ----------
+    support : ndarray of bool, shape (p,)
+    side : ndarray of +1 and -1, shape (p,)
+    """
+
+    support: BoolArray
+    side: FloatArray
+
+
 def consistent_subset(
     distances: PatchDistances, at_mm: FloatArray, slopes: FloatArray, settings: PlaneSettings | None = None
-) -> BoolArray:
+) -> ConsistentSubset:
     """Patches whose distances agree on one plane of the orientation that the sensor measured.
 
     Every patch in turn places the plane, through +d and through -d; the placement that most others agree
@@ -135,7 +150,7 @@ def consistent_subset(
     known = np.flatnonzero(np.isfinite(d))
     support = np.zeros(len(d), dtype=bool)
     if known.size == 0:
-        return support
+        return ConsistentSubset(support, np.ones(len(d)))
     tilt = at_mm[known] @ slopes
     offsets = np.concatenate([d[known] - tilt, -d[known] - tilt])
     distance = np.abs(offsets[:, None] + tilt)
@@ -145,8 +160,9 @@ def consistent_subset(
     score = agree.sum(axis=1) - np.where(agree, error, 0.0).sum(axis=1) / (
         agree.shape[1] * s.support_sigma + 1
     )
-    support[known] = agree[int(np.argmax(score))]
-    return support
+    best = int(np.argmax(score))
+    support[known] = agree[best]
+    return ConsistentSubset(support, np.where(offsets[best] + at_mm @ slopes < 0, -1.0, 1.0))
 
 
 def _inverse(normal: FloatArray) -> FloatArray:

@@ -13,10 +13,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import sparse
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles, skew
 from speckle3d.motion.inplane import InPlaneMotion
 from speckle3d.motion.planes import PairPlane
 
@@ -38,20 +38,23 @@ class TrajectorySettings(BaseModel):
         description="A frame becomes a key frame when its median correlation with the last is less.",
     )
     least_correlation: float = Field(
-        0.2, gt=0, lt=1, description="Pairs whose median correlation is less are not used."
+        0.2,
+        gt=0,
+        lt=1,
+        description="Least median correlation that a pair must have, and that speckle at its distance would, "
+        "to be used.",
     )
     huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
 
 
 @dataclass(frozen=True)
 class PairMeasurement:
-    """One frame pair: in-plane motion, unsigned plane, and the median correlation of its patches."""
+    """One frame pair: in-plane motion and unsigned plane."""
 
     first: int
     second: int
     motion: InPlaneMotion
     plane: PairPlane
-    correlation: float
 
 
 @dataclass(frozen=True)
@@ -143,9 +146,8 @@ def sign_pair(pair: PairMeasurement, plane: PairPlane, sign: float) -> SignedPai
     yaw = -np.arcsin(np.clip(b, -1, 1))
     tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
     m = pair.motion
-    pose = RigidTransform.from_components(
-        [m.x_mm, m.y_mm, a], Rotation.from_euler("ZYX", [m.roll_rad, yaw, tilt])
-    )
+    rotation = rotation_from_fixed_angles(m.roll_rad, yaw, tilt)
+    pose = RigidTransform.from_components([m.x_mm, m.y_mm, a], rotation)
     covariance = np.zeros((6, 6))
     inplane = m.covariance if m.covariance is not None else np.eye(3)
     covariance[np.ix_([0, 1, 5], [0, 1, 5])] = inplane + np.diag([1e-6, 1e-6, 1e-9])
@@ -187,8 +189,7 @@ def solve_trajectory(
         if np.abs(step).max() < 1e-7:
             break
     centre = RigidTransform.from_translation(centre_mm)
-    anchored = poses[0].inv() * poses
-    return centre * anchored * centre.inv()
+    return centre * poses * centre.inv()
 
 
 def _require_connected(second: FloatArray, frames: int) -> None:
@@ -263,9 +264,7 @@ def _adjoint(pose: RigidTransform) -> FloatArray:
     """Adjoint matrices for (rotation, translation) twists, shape (e, 6, 6)."""
     matrix = pose.as_matrix()
     r, t = matrix[:, :3, :3], matrix[:, :3, 3]
-    cross = np.zeros_like(r)
-    cross[:, [0, 1, 2], [1, 2, 0]] = -t[:, [2, 0, 1]]
-    cross[:, [1, 2, 0], [0, 1, 2]] = t[:, [2, 0, 1]]
+    cross = skew(t)
     adjoint = np.zeros((len(r), 6, 6))
     adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = r
     adjoint[:, 3:, :3] = cross @ r

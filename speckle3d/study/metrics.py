@@ -20,7 +20,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, relative_poses, require_finite, roll_yaw_tilt
+from speckle3d.core.geometry import FloatArray, mirrored, relative_poses, require_finite, roll_yaw_tilt
 
 JITTER_FRAMES = 9
 """Frames over which a sensor's jitter is averaged to find turning points: a third of a second."""
@@ -142,9 +142,7 @@ def align_sign(
     agreement = (found.length_mm - found.length_mm.mean()) @ (true.length_mm - true.length_mm.mean())
     if agreement >= 0.0:
         return world_from_image
-    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
-    first_from_image = (world_from_image[0].inv() * world_from_image).as_matrix()
-    return world_from_image[0] * RigidTransform.from_matrix(mirror @ first_from_image @ mirror)
+    return mirrored(world_from_image)
 
 
 def compare_modes(

@@ -25,7 +25,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.direction import mirrored, settle_direction
+from speckle3d.core.geometry import mirrored
+from speckle3d.direction import settle_direction
 from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import calibrate_curves, correct, track
 from speckle3d.simulation.presets import SimulationSettings

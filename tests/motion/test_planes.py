@@ -150,7 +150,8 @@ def test_subset_is_that_of_trying_every_plane(seed, patches, support):
     sigma = rng.uniform(0.02, 0.08, patches)
     d = np.abs(z + sigma * rng.normal(size=patches)) * rng.choice([1.0, 0.6], patches)
     d[rng.uniform(size=patches) < 0.1] = np.nan
-    got = consistent_subset(PatchDistances(d, sigma), at, slopes, PlaneSettings(support_sigma=support))
+    options = PlaneSettings(support_sigma=support)
+    got = consistent_subset(PatchDistances(d, sigma), at, slopes, options).support
     expected = oracles.consistent_patches(d, sigma, at, slopes, support)
     assert any(np.array_equal(got, each) for each in expected)
 
@@ -168,7 +169,7 @@ def test_patches_that_under_read_are_left_out_where_the_orientation_gives_them_a
         d = np.abs(d + 0.5 * estimator.sigma(d) * rng.normal(size=d.size))
         d[bottom] *= 0.6
         distances = measured(estimator, d)
-        subset = consistent_subset(distances, AT, truth[1:])
+        subset = consistent_subset(distances, AT, truth[1:]).support
         kept_good.append(subset[~bottom].mean())
         kept_bad.append(subset[bottom].mean())
         free_tilt.append(side * fit_plane(distances, estimator, AT).slope_y)
@@ -190,19 +191,25 @@ def test_a_third_is_left_out_where_nothing_is_wrong(estimator):
     for _ in range(40):
         d = on_plane(PLANES[2])
         d = np.abs(d + estimator.sigma(d) * rng.normal(size=d.size))
-        shares.append(consistent_subset(measured(estimator, d), AT, np.array(PLANES[2][1:])).mean())
+        shares.append(consistent_subset(measured(estimator, d), AT, np.array(PLANES[2][1:])).support.mean())
     # 68 % lie within one deviation of the truth; the best-supported placement keeps a few more.
     assert 0.6 < np.mean(shares) < 0.8
 
 
-def test_frames_that_cross_are_consistent_on_both_sides(estimator):
-    truth = np.array([0.05, 0.0, 0.02])
-    d = np.abs(on_plane(truth))
-    subset = consistent_subset(PatchDistances(d, np.full(d.size, 0.02)), AT, truth[1:])
-    assert subset.all()
-    assert (on_plane(truth) < 0).any()
+@pytest.mark.parametrize("truth", [(0.05, 0.0, 0.02), (0.1, 0.002, -0.02)])
+def test_frames_that_cross_are_fitted_on_both_sides(estimator, truth):
+    """The sensed orientation tells on which side each patch lies; without it the plane would be folded."""
+    z = on_plane(np.array(truth))
+    assert 0.1 < (z < 0).mean() < 0.9
+    distances = PatchDistances(np.abs(z), np.full(z.size, 0.02))
+    subset = consistent_subset(distances, AT, np.array(truth[1:]))
+    assert subset.support.all()
+    found = fit_plane(distances, estimator, AT, subset=subset.support, side=subset.side)
+    np.testing.assert_allclose(found.coefficients, truth, atol=1e-9)
+    folded = fit_plane(distances, estimator, AT)
+    assert abs(folded.offset_mm - truth[0]) > 0.3 * truth[0]
 
 
 def test_nothing_known_is_nothing_consistent():
     nothing = np.full(len(AT), np.nan)
-    assert not consistent_subset(PatchDistances(nothing, nothing), AT, np.zeros(2)).any()
+    assert not consistent_subset(PatchDistances(nothing, nothing), AT, np.zeros(2)).support.any()

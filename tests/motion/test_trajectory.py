@@ -49,7 +49,11 @@ def measure(poses, first, second, rng, relative_noise=0.03, noise_mm=0.004):
     variance = [(relative_noise * z) ** 2 + noise_mm**2 + 0.02**2, 4e-8, 4e-8]
     plane = PairPlane(side * a, *(side * slopes), np.diag(variance), STILL)
     motion = InPlaneMotion(x, y, roll, np.diag([1e-5, 1e-6, 1e-8]))
-    return PairMeasurement(first, second, motion, plane, float(np.exp(-(z**2) / (2 * SIGMA_MM**2))))
+    return PairMeasurement(first, second, motion, plane)
+
+
+def correlation(pair):
+    return float(np.exp(-(pair.plane.offset_mm**2) / (2 * SIGMA_MM**2)))
 
 
 def follow(poses, seed=1, settings=None, **noise):
@@ -59,8 +63,8 @@ def follow(poses, seed=1, settings=None, **noise):
     schedule, resolver, signed = PairSchedule(settings), SignResolver(), []
     for frame in range(len(poses)):
         every = [measure(poses, first, frame, rng, **noise) for first in schedule.references(frame)]
-        usable = [p for p in every if p.correlation >= settings.least_correlation]
-        schedule.settle(frame, {p.first: p.correlation for p in every})
+        usable = [p for p in every if correlation(p) >= settings.least_correlation]
+        schedule.settle(frame, {p.first: correlation(p) for p in every})
         if frame:
             assert usable, f"frame {frame} is out of reach"
             signs = resolver.place(usable)
@@ -182,7 +186,7 @@ def test_key_frames_are_farther_apart_where_the_probe_is_slow():
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_signed_pair_lies_on_its_plane(sign):
     plane = PairPlane(0.3, 0.011, -0.017, np.diag([1e-4, 1e-8, 2e-8]), STILL)
-    pair = PairMeasurement(3, 5, InPlaneMotion(0.2, -0.1, 0.03, np.eye(3) * 1e-6), plane, 0.7)
+    pair = PairMeasurement(3, 5, InPlaneMotion(0.2, -0.1, 0.03, np.eye(3) * 1e-6), plane)
     pose = sign_pair(pair, plane, sign).pose
     for x, y in ((0, 0), (10, -5), (-15, 15)):
         z = pose.apply([x, y, 0.0])[2]
@@ -193,7 +197,7 @@ def test_a_signed_pair_lies_on_its_plane(sign):
 
 def test_the_other_sign_is_the_mirror_image_in_the_first_frames_plane():
     plane = PairPlane(0.3, 0.011, -0.017, np.eye(3), STILL)
-    pair = PairMeasurement(0, 1, InPlaneMotion(0.2, -0.1, 0.03), plane, 0.7)
+    pair = PairMeasurement(0, 1, InPlaneMotion(0.2, -0.1, 0.03), plane)
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     plus, minus = (sign_pair(pair, plane, s).pose.as_matrix() for s in (1.0, -1.0))
     np.testing.assert_allclose(mirror @ plus @ mirror, minus, atol=1e-12)
@@ -203,7 +207,7 @@ def test_covariance_is_in_the_order_x_y_z_tilt_yaw_roll():
     inplane = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]) * 1e-4
     plane_cov = np.array([[4.0, 0.4, 0.5], [0.4, 5.0, 0.6], [0.5, 0.6, 6.0]]) * 1e-6
     plane = PairPlane(0.3, 0.0, 0.0, plane_cov, STILL)
-    signed = sign_pair(PairMeasurement(0, 1, InPlaneMotion(0, 0, 0, inplane), plane, 0.7), plane, 1.0)
+    signed = sign_pair(PairMeasurement(0, 1, InPlaneMotion(0, 0, 0, inplane), plane), plane, 1.0)
     x, y, z, tilt, yaw, roll = range(6)
     c = signed.covariance
     np.testing.assert_allclose(c, c.T)
