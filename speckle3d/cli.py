@@ -15,7 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 
 app = typer.Typer(
     name="speckle3d",
@@ -50,6 +50,9 @@ def main() -> None:
         # Typer's own usage errors carry an exit code; anything else is a bug and shows its traceback.
         if not hasattr(error, "format_message"):
             raise
+        # Called with no command at all, it has shown its help and has nothing to say.
+        if not error.format_message().strip():
+            sys.exit(2)
         _fail(error.format_message())
     # Typer turns Ctrl-C into this exit code without a word.
     if code == _STOPPED:
@@ -69,7 +72,7 @@ def _progress(what: str) -> Iterator[Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
@@ -79,7 +82,11 @@ def _note(text: str) -> None:
 
 
 def _emit(text: str) -> None:
-    sys.stdout.write(text if text.endswith("\n") else text + "\n")
+    try:
+        sys.stdout.write(text if text.endswith("\n") else text + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        raise FileError(f"standard output: cannot be written: {error.strerror}") from error
 
 
 @app.command()
@@ -162,7 +169,7 @@ def calibrate_curves(
     with _progress("correlating phantom frames") as progress:
         curves = measure([load_sweep(path) for path in phantoms], settings, progress)
     write_curves(out, curves)
-    half = [float(curves.distance_mm[(row < 0.5).argmax()]) for row in curves.correlation]
+    half = [_half_distance(curves.distance_mm, row) for row in curves.correlation]
     if as_json:
         table = {"depth_mm": curves.depth_mm.tolist(), "half_mm": half, "cells": curves.cells.tolist()}
         _emit(json.dumps(table | {"pairs": curves.pairs_used}, indent=2))
@@ -170,6 +177,11 @@ def calibrate_curves(
     _emit(f"{curves.pairs_used} frame pairs; correlation falls to one half at")
     for depth, distance, cells in zip(curves.depth_mm, half, curves.cells, strict=True):
         _emit(f"  {depth:5.1f} mm depth: {distance:.2f} mm  ({cells:.0f} independent cells in a patch)")
+
+
+def _half_distance(distance_mm: Any, correlation: Any) -> float:
+    first = int((correlation < 0.5).argmax())
+    return float(distance_mm[first]) if first else float("nan")
 
 
 @app.command()
@@ -211,8 +223,18 @@ def reconstruct(
         return
     _emit(result.table)
     details = result.summary.details
-    if details["unreliable_frames"]:
-        _note(f"{len(details['unreliable_frames'])} frames share too little speckle with any earlier one")
+    if bad := details["unreliable_frames"]:
+        listed = ", ".join(str(frame) for frame in bad[:8]) + (" ..." if len(bad) > 8 else "")
+        _note(
+            f"frames {listed} share too little speckle with any earlier one: lengths across them are guesses"
+        )
+    if 0 < result.summary.coverage < 1:
+        _note(f"compared over the {100 * result.summary.coverage:.0f} % of frames that have a reference")
+    rejected = details["rejected_patch_share"]
+    if rejected == rejected:
+        _note(f"{100 * rejected:.0f} % of patches contradict the sensed orientation and were left out")
+    if details["direction_from"] == "truth":
+        _note("the sign of the elevational motion was taken from the simulation's truth")
     if details["direction_from"] == "assumed":
         _note(
             "nothing tells the sign of the elevational motion: taken as positive (setting sensors.direction)"
@@ -251,7 +273,7 @@ def volume(
 
     reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
     with _progress(f"compounding {out.name}") as progress:
-        images = grey_images(sweep, dynamic_range_db, progress)
+        images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
         voxels = compound(images, images.grid, _poses(reconstruction, mode), voxel_mm, voxel_type="uint8")
     write_volume(out, voxels)
 
@@ -281,7 +303,7 @@ def reslice(
     reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
     poses = _poses(reconstruction, mode)
     with _progress(f"reslicing {out.name}") as progress:
-        images = grey_images(sweep, dynamic_range_db, progress)
+        images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
         if depth_mm is not None:
             plane = surface_plane(poses, images.grid, depth_mm)
             labels = ("elevational / mm", "lateral / mm")

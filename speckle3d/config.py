@@ -96,4 +96,6 @@ def load_config(path: Path) -> Config:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise FileError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
     return config_from_toml(text, str(path))

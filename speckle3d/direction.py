@@ -59,6 +59,9 @@ def settle_direction(sweep: Sweep, image: RigidTransform, config: Config) -> tup
         turned = _turn_agreement(sweep, image)
         if turned is not None:
             return turned, "orientation sensor"
+    if sweep.truth is not None:
+        agreement = float(np.sum(_travel(sweep.truth, centre) * _travel(image, centre)))
+        return (1 if agreement >= 0 else -1), "truth"
     return 1, "assumed"
 
 

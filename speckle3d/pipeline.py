@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
 from speckle3d.direction import orientation_at, orientation_sensor
@@ -87,6 +87,39 @@ def _shifted(progress: Progress | None, before: int, total: int) -> Progress | N
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
+def require_modes(sweep: Sweep, modes: Sequence[str]) -> None:
+    """Check that the sweep has what every drift mode needs, before any work is done.
+
+    Raises
+    ------
+    InvalidInputError
+        If a mode is unknown.
+    InsufficientDataError
+        If its sensor is missing, not calibrated to the image, or covers no frame.
+    """
+    sensors = {
+        "pose": (sweep.tracker, "a tracker in /tracker", "sensor_from_image"),
+        "orientation": (
+            orientation_sensor(sweep),
+            "an orientation sensor in /orientation",
+            "sensor_from_image_wxyz" if sweep.orientation else "sensor_from_image",
+        ),
+    }
+    for mode in modes:
+        if mode not in sensors:
+            raise InvalidInputError(f"expected a drift mode among orientation, pose; got {mode!r}")
+        sensor, wanted, attribute = sensors[mode]
+        where = f"{sweep.name}: drift mode {mode}"
+        if sensor is None:
+            raise InsufficientDataError(f"{where}: expected {wanted}, got none")
+        if sensor.sensor_from_image is None:
+            raise InsufficientDataError(
+                f"{where}: the sensor is not calibrated to the image: it lacks the attribute {attribute}"
+            )
+        if not sensor.covers(sweep.frame_time_s).any():
+            raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
+
+
 def correct(
     tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
 ) -> dict[str, DriftCorrection]:
@@ -98,40 +131,29 @@ def correct(
         If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
     """
     settings = config or Config()
+    require_modes(sweep, modes)
     done: dict[str, DriftCorrection] = {}
     for mode in modes:
         if mode == "pose":
             done[mode] = _correct_by_tracker(tracked.image, sweep, settings)
-        elif mode == "orientation":
+        else:
             start = tracked.subset if tracked.subset is not None else tracked.image
             done[mode] = _correct_by_orientation(start, sweep, settings)
-        else:
-            raise InvalidInputError(f"expected a drift mode among orientation, pose; got {mode!r}")
     return done
 
 
 def _correct_by_tracker(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
-    if sweep.tracker is None:
-        raise InsufficientDataError(
-            f"{sweep.name}: drift mode pose: expected a tracker in /tracker, got none"
-        )
+    assert sweep.tracker is not None
     covered = sweep.tracker.covers(sweep.frame_time_s)
-    if not covered.any():
-        raise InsufficientDataError(f"{sweep.name}: drift mode pose: no tracker reading covers any frame")
     measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
-    return correct_pose(poses, measured, covered, sweep.grid.corners_mm, config.drift)
+    with naming(sweep.name):
+        return correct_pose(poses, measured, covered, sweep.grid.corners_mm, config.drift)
 
 
 def _correct_by_orientation(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
     sensor = orientation_sensor(sweep)
-    if sensor is None:
-        raise InsufficientDataError(
-            f"{sweep.name}: drift mode orientation: expected an orientation sensor in /orientation, got none"
-        )
+    assert sensor is not None
     covered = sensor.covers(sweep.frame_time_s)
-    if not covered.any():
-        raise InsufficientDataError(
-            f"{sweep.name}: drift mode orientation: no orientation reading covers any frame"
-        )
     rotation = orientation_at(sensor, sweep.frame_time_s[covered])
-    return correct_orientation(poses, rotation, covered, sweep.grid.centre_mm, config.drift)
+    with naming(sweep.name):
+        return correct_orientation(poses, rotation, covered, sweep.grid.centre_mm, config.drift)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.direction import sensed_orientation, settle_direction
@@ -23,6 +24,8 @@ from speckle3d.walk import StageTimes, Walk
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 SINK_PAIRS = 1024
+MOST_UNRELIABLE = 0.3
+"""Share of frames that may lack a reliable neighbour; with more, lengths are mostly guesses."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +86,19 @@ class Solution:
             walk.times.add("coherence", then)
 
     def solve(self, sink: PairSink | None) -> Tracked:
-        """Trajectories from all usable pairs."""
+        """Trajectories from all usable pairs.
+
+        Raises
+        ------
+        InsufficientDataError
+            If most frames share too little speckle with any other.
+        """
         walk, frames = self._walk, len(self._walk.sweep)
+        if len(walk.unreliable) > MOST_UNRELIABLE * frames:
+            raise InsufficientDataError(
+                f"{walk.sweep.name}: expected neighbouring frames to share speckle, got "
+                f"{len(walk.unreliable)} of {frames} frames that share too little with any earlier one"
+            )
         then = time.perf_counter()
         chosen = self._choose()
         models = self._models(chosen)

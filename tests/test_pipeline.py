@@ -147,7 +147,7 @@ def test_the_user_settles_the_direction_before_any_sensor(sweep, tracked):
 
 
 def test_without_sensors_the_direction_is_assumed(sweep, tracked):
-    bare = replace(sweep, tracker=None, orientation=None)
+    bare = replace(sweep, tracker=None, orientation=None, truth=None)
     assert settle_direction(bare, mirrored(tracked.image), Config()) == (1, "assumed")
 
 
@@ -157,7 +157,7 @@ def test_turns_seen_by_the_orientation_sensor_settle_the_direction(sweep):
     turned = Rotation.from_rotvec(np.outer(tilt, [1.0, 0.3, 0.0]))
     image = RigidTransform.from_rotation(turned)
     sensor = OrientationSensor(TimedRotations(time_s, turned), Rotation.identity())
-    oriented = replace(sweep, tracker=None, orientation=sensor)
+    oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
     assert settle_direction(oriented, image, Config()) == (1, "orientation sensor")
     assert settle_direction(oriented, mirrored(image), Config()) == (-1, "orientation sensor")
 
@@ -166,7 +166,7 @@ def test_a_sensor_that_does_not_turn_with_the_image_settles_nothing(sweep):
     rng, n = np.random.default_rng(1), len(sweep)
     image, sensed = (Rotation.from_rotvec(rng.normal(0, np.deg2rad(0.1), (n, 3))) for _ in range(2))
     sensor = OrientationSensor(TimedRotations(sweep.frame_time_s, sensed), Rotation.identity())
-    oriented = replace(sweep, tracker=None, orientation=sensor)
+    oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
     assert settle_direction(oriented, RigidTransform.from_rotation(image), Config()) == (1, "assumed")
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class Speckle3DError(Exception):
     """Root of every error the package raises on purpose."""
@@ -21,3 +24,14 @@ class InsufficientDataError(Speckle3DError, ValueError):
 
 class FileError(Speckle3DError, OSError):
     """A file cannot be opened, read or written."""
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """Put `where` before the message of an error about data raised in the block, unless it is there."""
+    try:
+        yield
+    except (InvalidInputError, InsufficientDataError) as error:
+        if str(error).startswith(where):
+            raise
+        raise type(error)(f"{where}: {error}") from error

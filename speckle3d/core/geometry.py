@@ -55,12 +55,11 @@ def relative_poses(world_from_image: RigidTransform) -> RigidTransform:
 def mirrored(world_from_image: RigidTransform) -> RigidTransform:
     """The same motion seen in a mirror in the first image's plane: elevation, tilt and yaw change sign.
 
-    Images cannot tell a sweep from its mirror image: distances from decorrelation have no sign. The first
-    pose stays as it is.
+    Images cannot tell a sweep from its mirror image: distances from decorrelation have no sign. The world is
+    the first image, or in line with it.
     """
     flip = np.diag([1.0, 1.0, -1.0, 1.0])
-    first_from_image = (world_from_image[0].inv() * world_from_image).as_matrix()
-    return world_from_image[0] * RigidTransform.from_matrix(flip @ first_from_image @ flip)
+    return RigidTransform.from_matrix(flip @ world_from_image.as_matrix() @ flip)
 
 
 def skew(vectors: FloatArray) -> FloatArray:

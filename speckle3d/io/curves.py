@@ -6,13 +6,12 @@ import h5py
 import numpy as np
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
-    naming,
     opened,
     read_attribute,
     read_checked,

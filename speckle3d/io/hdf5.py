@@ -130,17 +130,6 @@ def file_format(file: h5py.File) -> str:
     return read_text(file, "format")
 
 
-@contextmanager
-def naming(where: str) -> Iterator[None]:
-    """Put `where` before the message of an `InvalidInputError` raised in the block, unless it is there."""
-    try:
-        yield
-    except InvalidInputError as error:
-        if str(error).startswith(where):
-            raise
-        raise type(error)(f"{where}: {error}") from error
-
-
 def locate(node: h5py.Group | h5py.Dataset, name: str = "") -> str:
     """Name a place in a file for a message: ``file: /group/name``."""
     inside = f"{node.name.rstrip('/')}/{name}".rstrip("/") or "/"

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.geometry import relative_poses
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.io import reconstructions, sweeps
@@ -162,9 +163,11 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
 
 
 def _length_mm(result: Reconstruction, mode: str) -> float:
-    """Distance from the first image's centre to the last one's."""
-    centres = result.poses[mode].apply(result.grid.centre_mm)
-    return float(np.linalg.norm(centres[-1] - centres[0])) if len(centres) else 0.0
+    """Elevational travel of the image's centre, summed from frame to frame."""
+    if result.frame_time_s.size < 2:
+        return 0.0
+    centre = result.grid.centre_mm
+    return float(abs((relative_poses(result.poses[mode]).apply(centre) - centre)[:, 2].sum()))
 
 
 def _describe_members(path: PathLike) -> list[Row]:
@@ -190,7 +193,7 @@ def _dataset_row(name: str, node: h5py.Dataset) -> Row:
     if node.shape == () and h5py.check_string_dtype(node.dtype) is None:
         return _row(name, node[()])
     shape = " x ".join(str(n) for n in node.shape or ()) or "text"
-    return (_spoken(name), shape, _unit(name))
+    return (_spoken(name), shape, "values" if node.shape else "")
 
 
 def _row(name: str, value: object) -> Row:

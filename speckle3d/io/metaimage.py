@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import FloatArray, require_increasing, transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, naming
+from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.headers import SequenceHeader, numbers, read_header
 from speckle3d.io.pixels import RF_TYPES, image_orientation, image_type, read_pixels, to_samples
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import (
     FloatArray,
     require_increasing,
@@ -25,7 +25,6 @@ from speckle3d.io.hdf5 import (
     atomic_hdf5,
     find_group,
     locate,
-    naming,
     opened,
     read_attribute,
     read_checked,

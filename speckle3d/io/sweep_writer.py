@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
 from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, atomic_hdf5, naming, open_hdf5
+from speckle3d.io.hdf5 import PathLike, atomic_hdf5, open_hdf5
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames
 
 Compression = Literal["gzip", "lzf"] | None

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import (
     FloatArray,
     require_finite,
@@ -28,7 +28,6 @@ from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
     locate,
-    naming,
     open_hdf5,
     opened,
     read_attribute,

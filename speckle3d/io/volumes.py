@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.volume import Volume
-from speckle3d.io.hdf5 import PathLike, atomic_path, naming, one_line
+from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
 from speckle3d.io.headers import is_metaimage, is_nrrd, read_header
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz")

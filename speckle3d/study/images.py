@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from speckle3d.config import config_from_toml
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.motion.intensity import Float32Array, IntensityExtractor
+from speckle3d.motion.intensity import Float32Array, IntensityExtractor, IntensitySettings
 
 
 class GreyImages:
@@ -26,11 +27,15 @@ class GreyImages:
     """
 
     def __init__(
-        self, sweep: Sweep, dynamic_range_db: float, progress: Callable[[int, int], None] | None = None
+        self,
+        sweep: Sweep,
+        dynamic_range_db: float,
+        progress: Callable[[int, int], None] | None = None,
+        settings: IntensitySettings | None = None,
     ) -> None:
         if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
-        self._extractor = IntensityExtractor.for_sweep(sweep)
+        self._extractor = IntensityExtractor.for_sweep(sweep, settings)
         self._sweep, self._range_db, self._progress = sweep, dynamic_range_db, progress
         self.grid: ImageGrid = self._extractor.grid
         middle = self._decibel(len(sweep) // 2)
@@ -54,10 +59,16 @@ class GreyImages:
 
 
 def grey_images(
-    sweep: Sweep, dynamic_range_db: float = 60.0, progress: Callable[[int, int], None] | None = None
+    sweep: Sweep,
+    dynamic_range_db: float = 60.0,
+    progress: Callable[[int, int], None] | None = None,
+    reconstruction: Reconstruction | None = None,
 ) -> GreyImages:
-    """Make a sweep's images for compounding and reslicing."""
-    return GreyImages(sweep, dynamic_range_db, progress)
+    """Make a sweep's images for compounding and reslicing, as its reconstruction was configured."""
+    settings = None
+    if reconstruction is not None and reconstruction.config_toml:
+        settings = config_from_toml(reconstruction.config_toml).intensity
+    return GreyImages(sweep, dynamic_range_db, progress, settings)
 
 
 def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Reconstruction, Sweep]:
@@ -69,7 +80,9 @@ def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Rec
         If the sweep's bytes are not those that were reconstructed.
     """
     reconstruction = read_reconstruction(path, with_pairs=False)
-    source = sweep_file or Path(reconstruction.provenance.input_path)
+    stored = Path(reconstruction.provenance.input_path)
+    # As given, or from where the reconstruction lies.
+    source = sweep_file or (stored if stored.is_file() else path.parent / stored)
     if not source.is_file():
         raise InvalidInputError(f"{path}: expected its sweep at {source}, got none; say where it is: --sweep")
     if sha256_of(source) != reconstruction.provenance.input_sha256:

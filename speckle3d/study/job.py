@@ -24,10 +24,10 @@ from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.hdf5 import make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor
-from speckle3d.pipeline import Progress, correct, track
+from speckle3d.pipeline import Progress, correct, require_modes, track
 from speckle3d.solution import Tracked
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
-from speckle3d.study.metrics import ModeError, align_sign, compare_modes
+from speckle3d.study.metrics import END_FRAMES, ModeError, accumulated, compare_modes
 from speckle3d.study.summary import Summary, table_text, write_summary
 
 REFERENCES = ("tracker", "truth")
@@ -79,6 +79,7 @@ def run_job(
     """
     settings = config or Config()
     began = time.perf_counter()
+    require_modes(sweep, drift)
     compared = find_reference(sweep, reference)
     make_folder(directory)
     strip = _Strip(sweep, settings)
@@ -127,22 +128,25 @@ def _summarise(
     reference: Reference | None,
     provenance: Provenance,
 ) -> Summary:
-    rows: list[ModeError] = []
+    estimates = _estimates(poses, sweep)
+    rows = [ModeError.of_estimate(mode, len(sweep), e["length_mm"]) for mode, e in estimates.items()]
     if reference is not None:
         rows = compare_modes(
-            _scored(poses, reference, sweep, tracked),
+            poses,
             reference.world_from_image,
             sweep.grid.centre_mm,
             reference.covered,
-            end_frames=1 if reference.name == "truth" else 25,
+            end_frames=1 if reference.name == "truth" else END_FRAMES,
         )
     details: dict[str, Any] = {
         "provenance": provenance,
+        "estimates": estimates,
         "pairs": tracked.pairs,
         "unreliable_frames": tracked.unreliable,
         "rejected_patch_share": tracked.rejected_share,
         "direction": tracked.direction,
         "direction_from": tracked.direction_from,
+        "coherence": _coherence_details(tracked),
         "seconds_by_stage": tracked.times.seconds,
         "corrections": {mode: _fit_details(c) for mode, c in corrections.items()},
     }
@@ -156,22 +160,31 @@ def _summarise(
     )
 
 
-def _scored(
-    poses: dict[str, RigidTransform], reference: Reference, sweep: Sweep, tracked: Tracked
-) -> dict[str, RigidTransform]:
-    """Poses to score; where nothing told the sign of the motion, the mirror image that fits is scored."""
-    if tracked.direction_from != "assumed" or "pose" in poses:
-        return poses
-    centre, used = sweep.grid.centre_mm, reference.covered
-    image = align_sign(poses["image"][used], reference.world_from_image, centre)
-    if np.allclose(image.as_matrix(), poses["image"][used].as_matrix()):
-        return poses
-    flip = np.diag([1.0, 1.0, -1.0, 1.0])
-    mirror = {}
-    for mode, each in poses.items():
-        first = (each[0].inv() * each).as_matrix()
-        mirror[mode] = each[0] * RigidTransform.from_matrix(flip @ first @ flip)
-    return mirror if set(poses) == {"image"} else {**poses, "image": mirror["image"]}
+def _estimates(poses: dict[str, RigidTransform], sweep: Sweep) -> dict[str, dict[str, float]]:
+    """Length and turns of the whole sweep in each mode."""
+    found = {mode: accumulated(each, sweep.grid.centre_mm) for mode, each in poses.items()}
+    return {
+        mode: {
+            "length_mm": float(motion.length_mm[-1]),
+            **{
+                f"{name}_deg": float(np.rad2deg(getattr(motion, f"{name}_rad")[-1]))
+                for name in ("tilt", "yaw", "roll")
+            },
+        }
+        for mode, motion in found.items()
+    }
+
+
+def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
+    found = tracked.coherence
+    if found is None:
+        return None
+    return {
+        "mean_share": float(found.share.mean()),
+        "mean_gain": float(found.gain.mean()),
+        "length_over_phantom_reading": float(found.scale.mean()),
+        "scale_sigma": found.scale_sigma,
+    }
 
 
 def _fit_details(correction: DriftCorrection) -> dict[str, Any]:

@@ -74,6 +74,12 @@ class ModeError:
     yaw_error_deg: float
     roll_error_deg: float
 
+    @classmethod
+    def of_estimate(cls, mode: str, frames: int, estimate_mm: float) -> ModeError:
+        """Row of a whole sweep without a reference: the estimate alone, errors NaN."""
+        nan = float("nan")
+        return cls("all", mode, frames, nan, abs(estimate_mm), nan, nan, nan, nan, nan)
+
 
 def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> Accumulated:
     """Sum the elevational travel of the image centre and the angles from frame to frame.
@@ -142,7 +148,8 @@ def align_sign(
     agreement = (found.length_mm - found.length_mm.mean()) @ (true.length_mm - true.length_mm.mean())
     if agreement >= 0.0:
         return world_from_image
-    return mirrored(world_from_image)
+    first = world_from_image[0]
+    return first * mirrored(first.inv() * world_from_image)
 
 
 def compare_modes(

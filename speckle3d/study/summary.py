@@ -92,7 +92,8 @@ def table_text(summaries: Sequence[Summary]) -> str:
     for summary in summaries:
         for row in summary.rows:
             values = {"sweep": summary.sweep, **asdict(row)}
-            lines.append([form.format(values[key]) for key, _, form in _COLUMNS])
+            cells = [form.format(values[key]) for key, _, form in _COLUMNS]
+            lines.append(["-" if cell.endswith("nan") else cell for cell in cells])
     widths = [max(len(line[i]) for line in lines) for i in range(len(_COLUMNS))]
     lines.insert(1, ["-" * width for width in widths])
     return "\n".join(_aligned(line, widths) for line in lines) + "\n"

@@ -104,7 +104,7 @@ def measure(case: Case, seed: int, curves: DecorrelationCurves, folder: Path) ->
 
 def _direction_without_tracker(sweep, image: RigidTransform, config: Config) -> str:
     """Whether a sweep without a tracker would have got its sign right; `image` has the true one."""
-    alone = replace(sweep, tracker=None)
+    alone = replace(sweep, tracker=None, truth=None)
     sign, source = settle_direction(alone, image, config)
     if source == "assumed":
         return "undecided"

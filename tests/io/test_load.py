@@ -70,7 +70,9 @@ def test_a_reconstruction_is_described(tmp_path):
         writer.finish({"image": sweep.truth}, Provenance("in.h5", "ab", "0.1.0"))
     rows = values(tmp_path / "r.h5")
     centres = sweep.truth.apply(sweep.grid.centre_mm)
-    assert rows["length, mode image"] == (f"{np.linalg.norm(centres[-1] - centres[0]):.2f}", "mm")
+    normals = sweep.truth.rotation[:-1].apply([0.0, 0.0, 1.0])
+    travel = abs(np.sum(np.diff(centres, axis=0) * normals))
+    assert rows["length, mode image"] == (f"{travel:.2f}", "mm")
     assert rows["frame pairs"] == ("0", "")
     assert rows["input"] == ("in.h5", "")
 
@@ -89,9 +91,9 @@ def test_the_smaller_files_of_the_family_are_listed(tmp_path, name):
         "version": ("1", ""),
         "patch width": ("5.0", "mm"),
         "signal": ("rf", ""),
-        "depth": ("3", "mm"),
+        "depth": ("3", "values"),
         "rms": ("0.25", "mm"),
-        "speed, at": ("2 x 2", "m/s"),
+        "speed, at": ("2 x 2", "values"),
         "speed centre frequency": ("6000000.0", "Hz"),
     }
 
