@@ -110,8 +110,7 @@ def test_correction_of_300_frames(benchmark, analytic, monkeypatch):
     benchmark(correct_pose, estimate, reference, np.ones(300, dtype=bool), CORNERS_MM)
 
 
-def main():
-    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+def main(seeds: int = 20) -> None:
     print(f"median (90th percentile) of {seeds} seeds")
     print(f"{'case':34} {'correction':15} {'length error %':>16} {'tilt error deg':>18}")
     for case, method, median, high in study(seeds):
@@ -121,4 +120,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:]))
