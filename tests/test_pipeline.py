@@ -194,3 +194,37 @@ def test_modes_that_cannot_be_are_refused(sweep, tracked):
         correct(tracked, sweep, ["magic"])
     with pytest.raises(InsufficientDataError, match="/tracker"):
         correct(tracked, replace(sweep, tracker=None), ["pose"])
+
+
+def test_a_simulation_without_sensors_takes_its_sign_from_the_truth_and_says_so(sweep, tracked):
+    alone = replace(sweep, tracker=None, orientation=None)
+    assert settle_direction(alone, tracked.image, Config()) == (1, "truth")
+    assert settle_direction(alone, mirrored(tracked.image), Config()) == (-1, "truth")
+
+
+class NoiseFrames:
+    """A sweep's frames, from some frame on replaced by independent noise."""
+
+    def __init__(self, frames, first):
+        self._frames, self._first, self.shape, self.dtype = frames, first, frames.shape, frames.dtype
+
+    def __getitem__(self, index):
+        frame = self._frames[index]
+        if index < self._first:
+            return frame
+        return np.random.default_rng(index).normal(0, 300, frame.shape).astype(frame.dtype)
+
+
+def test_frames_without_common_speckle_are_named_and_too_many_refused(sweep, curves):
+    short = head(sweep, 20)
+    # The last three share nothing with anything; with the last twelve it is no sweep any more.
+    found = track(replace(short, frames=NoiseFrames(short.frames, 17)), curves)
+    assert found.unreliable == (17, 18, 19)
+    with pytest.raises(InsufficientDataError, match="frames"):
+        track(replace(short, frames=NoiseFrames(short.frames, 8)), curves)
+
+
+def test_the_orientation_mode_stays_with_the_images_length(errors):
+    # The one-sigma subset makes phantom sweeps 0.3 % longer (PlaneSettings.support_sigma); thrice that here.
+    between = errors["orientation"].length_error_percent - errors["image"].length_error_percent
+    assert abs(between) < 1.0
