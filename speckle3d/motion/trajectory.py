@@ -20,6 +20,11 @@ from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles, skew
 from speckle3d.motion.inplane import InPlaneMotion
 from speckle3d.motion.planes import PairPlane
 
+TREND_MM = 0.3
+"""Travel over which a direction is remembered: a few frames of a hand-held sweep."""
+TURNING_COST = 2.0
+"""Squared deviations by which the distances must speak for turning back: hands turn back rarely."""
+
 
 class TrajectorySettings(BaseModel):
     """Which frame pairs are measured and how they are joined."""
@@ -109,9 +114,11 @@ class SignResolver:
         here = np.array([self._position[p.first] for p in pairs])
         position = _best_position(here, pairs, self._trend)
         latest = int(np.argmax([p.first for p in pairs]))
-        step = float(np.clip((position - here[latest]) / 0.05, -1, 1))
-        # A slow average of the direction settles the placements that the distances leave open.
-        self._trend = 0.8 * self._trend + 0.2 * step
+        step = position - here[latest]
+        # The direction travelled lately settles the placements that the distances leave open. It is averaged
+        # over travel and not over time, so that a pause, in which steps have random signs, keeps it.
+        share = 1.0 - np.exp(-abs(step) / TREND_MM)
+        self._trend += share * (np.sign(step) - self._trend)
         self._position[frame] = position
         return np.where(position >= here, 1.0, -1.0)
 
@@ -132,7 +139,7 @@ def _best_position(here: FloatArray, pairs: Sequence[PairMeasurement], trend: fl
     misfit = (np.abs(candidates[:, None] - here) - d) / sigma
     cost = np.minimum(misfit**2, 9.0).sum(axis=1)
     against = np.sign(candidates - here[0]) * np.sign(trend) < 0
-    best = int(np.argmin(cost + against))
+    best = int(np.argmin(cost + TURNING_COST * against))
     sign = np.where(candidates[best] >= here, 1.0, -1.0)
     near = np.abs(misfit[best]) < 3
     if not near.any():
