@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -203,10 +203,6 @@ class Sweep:
 
     def __len__(self) -> int:
         return int(self.frames.shape[0])
-
-    def with_orientation(self, sensor: OrientationSensor | None) -> Sweep:
-        """Return the same sweep with another orientation sensor."""
-        return replace(self, orientation=sensor)
 
 
 def _require_positive(settings: object, names: tuple[str, ...]) -> None:

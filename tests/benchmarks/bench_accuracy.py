@@ -1,6 +1,6 @@
 """Accuracy on simulated sweeps of seeds that were never used in development.
 
-Run: ``python tests/benchmarks/bench_accuracy.py [--seeds N] [--workers 2] [--case NAME] [--cache FOLDER]``.
+Run: ``python tests/benchmarks/bench_accuracy.py [--seeds N] [--workers 2] [--case NAME] [--plain]``.
 
 Each sweep is reconstructed with curves that were calibrated on stepped sweeps of other seeds, and scored
 against the truth as ``speckle3d reconstruct`` scores it. Simulated sweeps are kept in the cache (about 45 MB
@@ -87,10 +87,11 @@ class Result:
     direction: str
 
 
-def measure(case: Case, seed: int, curves: DecorrelationCurves, folder: Path) -> Result:
+def measure(case: Case, seed: int, curves: DecorrelationCurves, folder: Path, plain: bool) -> Result:
     """Reconstruct and score one sweep of a case."""
     settings = SimulationSettings(preset=case.preset, seed=seed, **{"vectors": VECTORS, **case.options})
-    sweep, config = load_sweep(simulated(settings, folder)), Config()
+    sweep = load_sweep(simulated(settings, folder))
+    config = Config.model_validate({"coherence": {"adapt": not plain}})
     tracked = track(sweep, curves, config)
     corrected = correct(tracked, sweep, MODES[1:], config)
     centre = sweep.grid.centre_mm
@@ -156,6 +157,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=8, help=f"how many, from {FIRST_SEED} on")
     parser.add_argument("--workers", type=int, default=2, help="sweeps at a time, a process each")
     parser.add_argument("--case", default="", help="only cases whose name holds this")
+    parser.add_argument("--plain", action="store_true", help="phantom curves alone, no adaptation to tissue")
     parser.add_argument("--cache", type=Path, default=DEFAULT)
     parser.add_argument("--json", type=Path, help="also write every score to this file")
     options = parser.parse_args()
@@ -167,7 +169,9 @@ def main() -> None:
     # Spawned, not forked: numba's threads do not survive a fork.
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         for case in [c for c in CASES if options.case in c.name]:
-            waiting = [pool.submit(measure, case, seed, curves, options.cache) for seed in seeds]
+            waiting = [
+                pool.submit(measure, case, seed, curves, options.cache, options.plain) for seed in seeds
+            ]
             results = []
             for future in waiting:
                 results.append(future.result())
