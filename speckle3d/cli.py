@@ -131,6 +131,8 @@ def simulate(
     blocks: Annotated[int | None, typer.Option(help="stepped: independent blocks.")] = None,
     turn_deg: Annotated[float | None, typer.Option(help="rotation: the deliberate turn.")] = None,
     turn_axis: Annotated[str | None, typer.Option(help="rotation: tilt or yaw.")] = None,
+    drift_mm: Annotated[float | None, typer.Option(help="Slow lateral and axial wander (0.5).")] = None,
+    snr_db: Annotated[float | None, typer.Option(help="Speckle over electronic noise (40).")] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
     from pydantic import ValidationError

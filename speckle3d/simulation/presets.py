@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,10 @@ class SimulationSettings(BaseModel):
         Of `stepped`: frames per block, their distance, and how many independent blocks.
     turn_deg : float
         Of `rotation`: the deliberate turn from first to last frame, about the axis `turn_axis`.
+    drift_mm : float
+        Of hand-held sweeps: slow lateral and axial wander, standard deviation.
+    snr_db : float
+        Speckle over electronic noise at the transmit focus.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -64,6 +68,8 @@ class SimulationSettings(BaseModel):
     turn_deg: float = Field(5.0, ge=-30, le=30)
     turn_axis: Literal["tilt", "yaw"] = "tilt"
     crossing_deg: float = Field(90.0, gt=0, lt=180)
+    drift_mm: float = Field(0.5, ge=0, le=20)
+    snr_db: float = Field(40.0, ge=-10, le=80)
 
 
 @dataclass(frozen=True)
@@ -110,12 +116,11 @@ def _image(settings: SimulationSettings, probe: Probe) -> ImageGrid:
 
 
 def _motion(settings: SimulationSettings) -> HandMotion:
-    if settings.preset == "reversal":
-        return HandMotion(reverse=True)
-    if settings.preset == "rotation":
-        turn = float(np.deg2rad(settings.turn_deg))
-        return HandMotion(turn_rad=(turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0))
-    return HandMotion()
+    motion = HandMotion(drift_mm=settings.drift_mm, reverse=settings.preset == "reversal")
+    if settings.preset != "rotation":
+        return motion
+    turn = float(np.deg2rad(settings.turn_deg))
+    return replace(motion, turn_rad=(turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0))
 
 
 def _hand_held(
@@ -149,7 +154,7 @@ def _hand_held(
     )
     poses = trajectory.medium_from_image(times)
     sweep = Sweep(
-        SimulatedFrames(beam, medium, poses, image, Receiver(), _entropy(noise_seed)),
+        SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(noise_seed)),
         image,
         beam.probe.signal,
         times,
@@ -173,7 +178,7 @@ def _stepped(
     poses = stepped_poses(settings.steps, settings.step_mm, settings.blocks, gap)
     times = np.arange(len(poses)) / settings.frame_rate_hz
     sweep = Sweep(
-        SimulatedFrames(beam, medium, poses, image, Receiver(), _entropy(seed)),
+        SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(seed)),
         image,
         beam.probe.signal,
         times,
