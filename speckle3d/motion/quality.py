@@ -94,7 +94,7 @@ class QualitySettings(BaseModel):
     halves_correlation: float = Field(
         0.5, gt=0, le=1, description="Correlation of a speckle patch's halves, either way, at most."
     )
-    # B-mode of bone and spine holds 0.41 or more, simulated tissue 0.65; wires and water floors up to 0.09, a
+    # B-mode of bone and spine holds 0.41 or more, simulated tissue 0.63; wires and water floors up to 0.09, a
     # lifted probe whose first 3 mm stay up to 0.08.
     speckle_share: float = Field(
         0.15, ge=0, le=1, description="Share of patches with speckle that a frame needs."
