@@ -17,6 +17,7 @@ from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.inplane import InPlaneSettings
 from speckle3d.motion.intensity import IntensitySettings
+from speckle3d.motion.matching import MatchingSettings
 from speckle3d.motion.patches import PatchSettings
 from speckle3d.motion.planes import PlaneSettings
 from speckle3d.motion.trajectory import TrajectorySettings
@@ -51,6 +52,7 @@ class Config(BaseModel):
     intensity: IntensitySettings = IntensitySettings()
     patches: PatchSettings = PatchSettings()
     inplane: InPlaneSettings = InPlaneSettings()
+    matching: MatchingSettings = MatchingSettings()
     curves: CurveSettings = CurveSettings()
     coherence: CoherenceSettings = CoherenceSettings()
     planes: PlaneSettings = PlaneSettings()

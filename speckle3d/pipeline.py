@@ -47,7 +47,7 @@ def track(
     settings = config or Config()
     if len(sweep) < 2:
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
-    matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane)
+    matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane, settings.matching)
     curves.key.require_same(matcher.key)
     walk = Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
     for frame, ready in enumerate(prefetch(sweep, matcher, walk.times, images)):
@@ -75,7 +75,7 @@ def calibrate_curves(
     samples, keys = [], []
     total, before = sum(len(sweep) for sweep in sweeps), 0
     for sweep in sweeps:
-        matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane)
+        matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane, settings.matching)
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
         samples.append(phantom_samples(sweep, matcher, settings.curves, _shifted(progress, before, total)))

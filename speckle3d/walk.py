@@ -17,9 +17,10 @@ from speckle3d.motion.distances import DistanceEstimator
 from speckle3d.motion.inplane import InPlaneMotion, PatchMatch
 from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
-from speckle3d.motion.planes import fit_plane
+from speckle3d.motion.planes import PlaneFitter
+from speckle3d.motion.signs import SignResolver
 from speckle3d.motion.table import CorrelationTable
-from speckle3d.motion.trajectory import PairMeasurement, PairSchedule, SignResolver
+from speckle3d.motion.trajectory import PairSchedule
 
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
@@ -47,12 +48,17 @@ class Walk:
         self.sweep, self.matcher, self.estimator, self.config = sweep, matcher, estimator, config
         self.times = StageTimes()
         self.table = CorrelationTable(len(matcher.patches))
-        self.position_mm = np.zeros(len(sweep))
+        self.fitter = PlaneFitter(estimator, matcher.at_mm, config.planes)
         self.unreliable: list[int] = []
         self._schedule = PairSchedule(config.trajectory)
-        self._signs = SignResolver()
+        self._signs = SignResolver(len(sweep))
         self._ready: dict[int, ReadyFrame] = {}
         self._motion: dict[int, InPlaneMotion] = {0: InPlaneMotion()}
+
+    @property
+    def path(self) -> FloatArray:
+        """Rough elevational position of each frame's centre and its slope along x, shape (n, 2)."""
+        return self._signs.path
 
     def advance(self, frame: int, ready: ReadyFrame) -> None:
         """Match a frame with its references, place it, and let go of what is no longer needed."""
@@ -63,7 +69,6 @@ class Walk:
             self._place(frame, matches, correlations)
         self._schedule.settle(frame, correlations)
         keep = self._schedule.needed(frame)
-        self._signs.forget(keep)
         self._ready = {k: v for k, v in self._ready.items() if k in keep}
         self._motion = {k: v for k, v in self._motion.items() if k in keep}
 
@@ -86,21 +91,18 @@ class Walk:
         if not near:
             near = [max(correlations, key=lambda first: correlations[first])]
             self.unreliable.append(frame)
-        pairs = []
+        planes = {}
         for first in near:
-            distances = self.estimator.distances(matches[first].correlation)
             motion = matches[first].motion
-            at = self.matcher.at_mm - [motion.x_mm, motion.y_mm]
-            plane = fit_plane(distances, self.estimator, at, self.config.planes)
+            plane = self.fitter.fit(matches[first].correlation, np.array([motion.x_mm, motion.y_mm]))
             if plane is not None:
-                pairs.append(PairMeasurement(first, frame, motion, plane))
-        if not pairs:
+                planes[first] = plane
+        if not planes:
             raise InsufficientDataError(
                 f"{self.sweep.name}: frame {frame}: expected speckle in common with an earlier frame, "
                 "found none"
             )
-        self._signs.place(pairs)
-        self.position_mm[frame] = self._signs.position(frame)
+        self._signs.place(frame, list(planes), list(planes.values()))
         for first, match in sorted(matches.items()):
             self.table.append(first, frame, match)
         self.times.add("distances and planes", then)
@@ -115,10 +117,10 @@ def prefetch(
         then = time.perf_counter()
         frame = sweep.frames[index]
         then = times.add("reading", then)
-        intensity = matcher.intensity(frame)
+        echo = matcher.echo(frame)
         if images:
-            images(index, intensity)
-        ready = matcher.prepare(intensity)
+            images(index, echo.intensity)
+        ready = matcher.prepare(echo)
         times.add("intensity", then)
         return ready
 

@@ -21,11 +21,35 @@ class CurveKey:
     patch_width_mm: float
     patch_height_mm: float
     equalise_mm: float
+    correlation_of: str = "intensity"
 
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         for name, mine, theirs in _differing(self, other):
             raise MismatchError(f"{what}: {name} is {mine} and {theirs}")
+
+
+@dataclass(frozen=True)
+class TiltResponse:
+    """What turning the probe about the image's lateral axis does to the correlation, by depth.
+
+    Speckle that is tilted by theta while its patch moves by z decorrelates as if it had moved by d, with
+    d^2 = (z - pivot theta)^2 + (spread theta)^2: a curved wavefront is moved least by turning about its
+    centre of curvature, and turning about that spreads the echo's phase over the beam.
+
+    Attributes
+    ----------
+    pivot_mm, spread_mm : ndarray, shape (r,)
+    """
+
+    pivot_mm: FloatArray
+    spread_mm: FloatArray
+
+    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> TiltResponse:
+        """Response at other depths than those known, by linear interpolation."""
+        return TiltResponse(
+            np.interp(depth_mm, known_mm, self.pivot_mm), np.interp(depth_mm, known_mm, self.spread_mm)
+        )
 
 
 @dataclass(frozen=True)
@@ -41,7 +65,9 @@ class DecorrelationCurves:
     correlation : ndarray, shape (r, k)
         Decreasing along k.
     cells : ndarray, shape (r,)
-        Independent speckle cells in a patch: Var(rho) = (1 - rho^2)^2 / cells.
+        Independent speckle cells in a patch; see `speckle3d.kernels.statistics`.
+    tilt : TiltResponse or None
+        None if the phantom sweeps did not turn.
     """
 
     key: CurveKey
@@ -50,6 +76,7 @@ class DecorrelationCurves:
     correlation: FloatArray
     cells: FloatArray
     pairs_used: int = 0
+    tilt: TiltResponse | None = None
 
     def __post_init__(self) -> None:
         if self.correlation.shape != (self.depth_mm.size, self.distance_mm.size):
@@ -62,6 +89,9 @@ class DecorrelationCurves:
             raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
         if self.cells.shape != self.depth_mm.shape or not (np.isfinite(self.cells) & (self.cells > 0)).all():
             raise InvalidInputError("cells: expected a number above zero for each depth, got others")
+        for name, values in vars(self.tilt).items() if self.tilt is not None else ():
+            if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
+                raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
         if not ((self.correlation > 0) & (self.correlation <= 1)).all():
             raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
         if (np.diff(self.correlation, axis=1) > 0).any():
@@ -80,12 +110,16 @@ class DecorrelationCurves:
             np.exp(-(np.stack(columns, axis=1) ** 2)),
             np.interp(depth_mm, self.depth_mm, self.cells),
             self.pairs_used,
+            None if self.tilt is None else self.tilt.at(np.asarray(depth_mm), self.depth_mm),
         )
 
 
 def _differing(a: CurveKey, b: CurveKey) -> Iterable[tuple[str, object, object]]:
     if type(a.signal) is not type(b.signal):
         yield "signal", type(a.signal).__name__, type(b.signal).__name__
+        return
+    if a.correlation_of != b.correlation_of:
+        yield "correlation_of", a.correlation_of, b.correlation_of
         return
     names = vars(a.signal).keys()
     pairs = [(name, getattr(a.signal, name), getattr(b.signal, name)) for name in names]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
-from speckle3d.core.curves import CurveKey, DecorrelationCurves
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import BModeSettings, RFSettings
@@ -28,9 +28,13 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     with atomic_hdf5(path, FORMAT) as file:
         for name in ("depth_mm", "distance_mm", "correlation", "cells"):
             file[name] = getattr(curves, name)
+        if curves.tilt is not None:
+            for name, values in vars(curves.tilt).items():
+                file[f"tilt/{name}"] = values
         file.attrs["pairs_used"] = curves.pairs_used
         for name in KEY_NUMBERS:
             file.attrs[name] = getattr(curves.key, name)
+        file.attrs["correlation_of"] = curves.key.correlation_of
         file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
         for name, value in vars(curves.key.signal).items():
             file.attrs[name] = value
@@ -52,9 +56,15 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         distance = read_checked(file, "distance_mm", ("k",))
         correlation = read_checked(file, "correlation", (depth.size, distance.size))
         cells = read_checked(file, "cells", (depth.size,))
-        key = CurveKey(_read_signal(file), *(read_attribute(file, name) for name in KEY_NUMBERS))
+        numbers = (read_attribute(file, name) for name in KEY_NUMBERS)
+        of = read_text(file, "correlation_of") if "correlation_of" in file.attrs else "intensity"
+        key = CurveKey(_read_signal(file), *numbers, of)
         pairs = int(read_attribute(file, "pairs_used", 0))
-        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs)
+        tilt = None
+        if "tilt" in file:
+            names = ("tilt/pivot_mm", "tilt/spread_mm")
+            tilt = TiltResponse(*(read_checked(file, name, (depth.size,)) for name in names))
+        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt)
 
 
 def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:

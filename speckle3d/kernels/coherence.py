@@ -1,4 +1,4 @@
-"""Fitting each patch's coherent share and gain to its correlations at many separations."""
+"""Fitting echo models to each patch's correlations at many separations."""
 
 from __future__ import annotations
 
@@ -6,99 +6,149 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from speckle3d.kernels.statistics import correlation_variance
+
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 
-_ROUNDS = 7
+_variance = njit(correlation_variance)
+
+NO_GAIN = -1.0
+"""In place of a length of coherent structure: neither structure nor noise, so that the gain is one."""
+_ROUNDS = 8
 _VARIANCE_FLOOR = 1e-3
 """Variance of a correlation that no number of cells removes: what the model itself leaves out."""
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
-def fit_coherent_shares(
+@njit(cache=True, nogil=True)
+def bin_by_distance(
     rho: Float32Array,
-    distance_mm: FloatArray,
-    scales: FloatArray,
-    amplitude: FloatArray,
-    step_mm: float,
-    cells: FloatArray,
-    structure_mm: float,
-    redundancy: float,
-    gain_precision: float,
+    offset_mm: FloatArray,
+    slope: FloatArray,
+    lateral_mm: FloatArray,
+    edges_mm: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Fit rho = gain (c h + (1 - c) g)^2 of each patch at each scale of the distances.
-
-    g is the square root of the fully developed curve, h = exp(-d / structure_mm).
+    """Sum correlations of each patch over pairs of like distance |offset + slope lateral|.
 
     Parameters
     ----------
     rho : float32, shape (e, p)
         NaN where there is none.
-    distance_mm : float64, shape (e,)
+    offset_mm, slope : float64, shape (e,)
+    lateral_mm : float64, shape (p,)
+    edges_mm : float64, shape (b + 1,)
+        Distances beyond the last count into the last bin.
+    out : float64, shape (p, b, 4)
+        Count, and sums of distance, correlation and its square.
+    """
+    out[:] = 0.0
+    last = edges_mm.size - 2
+    for e in range(rho.shape[0]):
+        for p in range(rho.shape[1]):
+            r = rho[e, p]
+            if not np.isfinite(r):
+                continue
+            d = abs(offset_mm[e] + slope[e] * lateral_mm[p])
+            b = min(np.searchsorted(edges_mm, d, side="right") - 1, last)
+            out[p, b, 0] += 1.0
+            out[p, b, 1] += d
+            out[p, b, 2] += r
+            out[p, b, 3] += r * r
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_echo_models(
+    bins: FloatArray,
+    scales: FloatArray,
+    stretches: FloatArray,
+    lengths_mm: FloatArray,
+    amplitude: FloatArray,
+    step_mm: float,
+    cells: FloatArray,
+    of_echo: bool,
+    redundancy: float,
+    gain_precision: float,
+    cost: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Fit rho = gain (c h + (1 - c) g)^2 of each patch, for each scale of distances and kind of model.
+
+    g(d) is the square root of the fully developed curve at d / stretch, h = exp(-d / length).
+
+    Parameters
+    ----------
+    bins : float64, shape (p, b, 4)
+        From `bin_by_distance`.
     scales : float64, shape (s,)
         What distances are multiplied by in turn.
-    amplitude : float64, shape (p, k)
-        g on a grid of `step_mm`.
+    stretches : float64, shape (k,)
+    lengths_mm : float64, shape (l,)
+        Of coherent structure; 0 for models without any, where c = 0; `NO_GAIN` for those with gain one, too.
+    amplitude : float64, shape (p, m)
+        sqrt(rho_F) on a grid of `step_mm`.
     cells : float64, shape (p,)
     redundancy : float
         How many of the pairs, which share frames, carry one independent piece of information.
     gain_precision : float
         Of the prior about gain one.
-    out : float64, shape (s, p, 6)
-        Share, gain and cost of the fit; gain and cost with no coherent share; cost with neither.
+    cost : float64, shape (s, p, k, l)
+        Twice the negative log-likelihood.
+    found : float64, shape (s, p, k, l, 2)
+        Share and gain.
     """
-    pairs, patches = rho.shape
+    count = bins.shape[1]
     last = amplitude.shape[1] - 1
-    g = np.empty(pairs)
-    h = np.empty(pairs)
-    for s in range(scales.size):
-        for p in range(patches):
-            for e in range(pairs):
-                d = distance_mm[e] * scales[s]
-                at = min(d / step_mm, last - 1e-6)
-                k = int(at)
-                g[e] = amplitude[p, k] + (at - k) * (amplitude[p, k + 1] - amplitude[p, k])
-                h[e] = np.exp(-d / structure_mm)
-            for with_share in range(2):
-                c = 0.1 if with_share else 0.0
-                gain = 1.0
-                cost = 0.0
-                for turn in range(_ROUNDS):
-                    cc, cg, gg, rc, rg = 0.1, 0.0, 0.0, 0.0, 0.0
-                    cost = 0.0
-                    for e in range(pairs):
-                        r = rho[e, p]
-                        if not np.isfinite(r):
-                            continue
-                        q = c * h[e] + (1.0 - c) * g[e]
-                        m = gain * q * q
-                        limited = min(m, 1.0)
-                        v = (1.0 - limited * limited) ** 2 / cells[p] + _VARIANCE_FLOOR
-                        left = r - m
-                        jc = 2.0 * gain * q * (h[e] - g[e])
-                        jg = q * q
-                        w = 1.0 / (v * redundancy)
-                        cc += w * jc * jc
-                        cg += w * jc * jg
-                        gg += w * jg * jg
-                        rc += w * jc * left
-                        rg += w * jg * left
-                        if turn in (0, _ROUNDS - 1):
-                            cost += (left * left / v + np.log(v)) / redundancy
-                    gg += gain_precision
-                    rg -= gain_precision * (gain - 1.0)
-                    cost += gain_precision * (gain - 1.0) ** 2
-                    if turn == 0 and not with_share:
-                        out[s, p, 5] = cost
-                    if with_share:
+    g, h = np.empty(count), np.empty(count)
+    n, d0, mean, spread = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    for p in range(bins.shape[0]):
+        size = 0
+        for b in range(count):
+            if bins[p, b, 0] > 0:
+                n[size] = bins[p, b, 0]
+                d0[size] = bins[p, b, 1] / n[size]
+                mean[size] = bins[p, b, 2] / n[size]
+                spread[size] = bins[p, b, 3] / n[size] - mean[size] ** 2
+                size += 1
+        for s in range(scales.size):
+            for k in range(stretches.size):
+                for b in range(size):
+                    at = min(d0[b] * scales[s] / stretches[k] / step_mm, last - 1e-6)
+                    q = int(at)
+                    g[b] = amplitude[p, q] + (at - q) * (amplitude[p, q + 1] - amplitude[p, q])
+                for j in range(lengths_mm.size):
+                    coherent = lengths_mm[j] > 0.0
+                    for b in range(size):
+                        h[b] = np.exp(-d0[b] * scales[s] / lengths_mm[j]) if coherent else 0.0
+                    share = 0.1 if coherent else 0.0
+                    gain, total = 1.0, 0.0
+                    for _ in range(_ROUNDS):
+                        cc, cg, gg, rc, rg, total = 0.1, 0.0, 0.0, 0.0, 0.0, 0.0
+                        for b in range(size):
+                            echo = share * h[b] + (1.0 - share) * g[b]
+                            model = gain * echo * echo
+                            limited = min(model, 1.0)
+                            v = _variance(limited, cells[p], of_echo) + _VARIANCE_FLOOR
+                            left = mean[b] - model
+                            w = n[b] / (v * redundancy)
+                            jc = 2.0 * gain * echo * (h[b] - g[b])
+                            jg = echo * echo
+                            cc += w * jc * jc
+                            cg += w * jc * jg
+                            gg += w * jg * jg
+                            rc += w * jc * left
+                            rg += w * jg * left
+                            total += w * (left * left + spread[b]) + n[b] * np.log(v) / redundancy
+                        if lengths_mm[j] == NO_GAIN:
+                            break
+                        total += gain_precision * (gain - 1.0) ** 2
+                        gg += gain_precision
+                        rg -= gain_precision * (gain - 1.0)
+                        if not coherent:
+                            cc, cg, rc = 1.0, 0.0, 0.0
                         determinant = cc * gg - cg * cg
-                        c = min(max(c + 0.8 * (gg * rc - cg * rg) / determinant, 0.0), 0.97)
+                        share = min(max(share + 0.8 * (gg * rc - cg * rg) / determinant, 0.0), 0.97)
                         gain = min(max(gain + 0.8 * (cc * rg - cg * rc) / determinant, 0.1), 1.03)
-                    else:
-                        gain = min(max(gain + rg / gg, 0.1), 1.03)
-                if with_share:
-                    out[s, p, 0], out[s, p, 1], out[s, p, 2] = c, gain, cost
-                else:
-                    out[s, p, 3], out[s, p, 4] = gain, cost
+                    cost[s, p, k, j] = total
+                    found[s, p, k, j, 0], found[s, p, k, j, 1] = share, gain

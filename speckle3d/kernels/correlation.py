@@ -1,4 +1,4 @@
-"""Correlation of matching patches of two images at neighbouring lags."""
+"""Correlation of matching patches of two images, or of their complex echoes, at neighbouring lags."""
 
 from __future__ import annotations
 
@@ -91,3 +91,80 @@ def patch_correlations(
                     out[p, i, j] = (ab_sum - a_sum * b_sum / n) / np.sqrt(a_var * b_var)
                 else:
                     out[p, i, j] = np.nan
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+def patch_coherences(
+    fixed: Float32Array,
+    moving: Float32Array,
+    first: IntArray,
+    size: IntArray,
+    shift: IntArray,
+    ramp_rad: FloatArray,
+    least_overlap: float,
+    out: FloatArray,
+) -> None:
+    """Fill ``out[p, i, j]`` with the squared coherence of patch p at lag ``shift[p] + (i, j) - radius``.
+
+    Parameters
+    ----------
+    fixed, moving : float32, shape (2, vector, sample)
+        Real and imaginary parts of the echo.
+    ramp_rad : float64, shape (2,)
+        By how much the phase of `moving` falls behind from vector to vector and from sample to sample.
+    first, size, shift, least_overlap, out
+        As for `patch_correlations`.
+    """
+    rows, columns = fixed.shape[1:]
+    lateral_radius = out.shape[1] // 2
+    axial_radius = out.shape[2] // 2
+    real, imaginary = np.empty(size[1], np.float32), np.empty(size[1], np.float32)
+    sums = np.empty((out.shape[1], out.shape[2], 3))
+    cosine, sine = np.empty(size[1], np.float32), np.empty(size[1], np.float32)
+    for k in range(size[1]):
+        cosine[k], sine[k] = np.cos(ramp_rad[1] * k), np.sin(ramp_rad[1] * k)
+    for p in range(first.shape[0]):
+        dv, ds = shift[p, 0], shift[p, 1]
+        v0 = max(first[p, 0], 0, lateral_radius - dv)
+        v1 = min(first[p, 0] + size[0], rows, rows - lateral_radius - dv)
+        s0 = max(first[p, 1], 0, axial_radius - ds)
+        s1 = min(first[p, 1] + size[1], columns, columns - axial_radius - ds)
+        if v1 <= v0 or s1 <= s0 or (v1 - v0) * (s1 - s0) < least_overlap * size[0] * size[1]:
+            out[p] = np.nan
+            continue
+        width = s1 - s0
+        sums[:] = 0.0
+        power = 0.0
+        for v in range(v0, v1):
+            a_real, a_imaginary = fixed[0, v, s0:s1], fixed[1, v, s0:s1]
+            c: Any = np.float32(np.cos(ramp_rad[0] * (v - v0)))
+            s: Any = np.float32(np.sin(ramp_rad[0] * (v - v0)))
+            row_power: Any = np.float32(0.0)
+            for k in range(width):
+                turn_real = c * cosine[k] - s * sine[k]
+                turn_imaginary = c * sine[k] + s * cosine[k]
+                real[k] = a_real[k] * turn_real + a_imaginary[k] * turn_imaginary
+                imaginary[k] = a_imaginary[k] * turn_real - a_real[k] * turn_imaginary
+                row_power += a_real[k] * a_real[k] + a_imaginary[k] * a_imaginary[k]
+            power += row_power
+            for i in range(out.shape[1]):
+                for j in range(out.shape[2]):
+                    start = s0 + ds + j - axial_radius
+                    row = v + dv + i - lateral_radius
+                    b_real = moving[0, row, start : start + width]
+                    b_imaginary = moving[1, row, start : start + width]
+                    in_phase: Any = np.float32(0.0)
+                    quadrature: Any = np.float32(0.0)
+                    other_power: Any = np.float32(0.0)
+                    for k in range(width):
+                        in_phase += real[k] * b_real[k] + imaginary[k] * b_imaginary[k]
+                        quadrature += real[k] * b_imaginary[k] - imaginary[k] * b_real[k]
+                        other_power += b_real[k] * b_real[k] + b_imaginary[k] * b_imaginary[k]
+                    sums[i, j, 0] += in_phase
+                    sums[i, j, 1] += quadrature
+                    sums[i, j, 2] += other_power
+        for i in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                energy = power * sums[i, j, 2]
+                together = sums[i, j, 0] ** 2 + sums[i, j, 1] ** 2
+                out[p, i, j] = together / energy if energy > 0.0 else np.nan

@@ -3,14 +3,18 @@
 Tissue holds structures longer than the beam is thick. Their echoes stay while speckle decorrelates, so that
 correlation falls to a plateau instead of to nothing, and read with a phantom's curve it says that the probe
 hardly moved. Pairs of frames far apart show the plateau directly; pairs close together show what
-electronic noise takes away. With a patch's echo the sum of a part that stays (share c of the power) and
+electronic noise takes away. With a patch's echo the sum of a part that stays (share c of the amplitude) and
 fully developed speckle, both Gaussian,
 
-    rho(d) = gain (c h(d) + (1 - c) sqrt(rho_F(d)))^2,
+    rho(d) = gain (c h(d) + (1 - c) sqrt(rho_F(d / stretch)))^2,
 
-where h falls slowly over the structures' own length. The distances of the pairs are known from fully
-developed curves only up to a scale that varies slowly along the sweep; it is the one at which all
-patches together are explained best, a coherent share being granted only where it pays for itself.
+where h falls slowly, over the structures' own length. Where scatterers are few it is the beam's width and no
+longer its curved wavefront that decorrelates them: the curve is stretched. Nothing scatters faster than
+fully developed speckle, so a stretch is never below one.
+
+The distances of the pairs are known from fully developed curves only up to a scale that varies slowly along
+the sweep; it is the one at which all patches together are explained best, a departure from fully developed
+speckle being granted only where it pays for itself.
 """
 
 from __future__ import annotations
@@ -18,18 +22,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import FloatArray
-from speckle3d.kernels.coherence import fit_coherent_shares
+from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
+from speckle3d.motion.distances import EchoModel
 from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.patches import IntArray, PatchGrid
 
-COARSE_SCALES = np.geomspace(0.7, 3.0, 12)
+COARSE_SCALES = np.geomspace(0.4, 3.0, 16)
 FINE_SCALES = np.geomspace(0.85, 1.18, 7)
+STRETCHES = np.array([1.0, 1.2, 1.4, 1.7])
+"""Of the curve where scatterers are few; beyond, a beam hardly differs from one that stays."""
+LENGTHS_MM = np.array([NO_GAIN, 0.0, 4.0, 10.0, 40.0])
+"""Of coherent structure; zero for none, and for neither structure nor noise."""
 GAIN_PRECISION = 40.0
 """Of the prior about gain one: a deviation of 0.16, noise some 10 dB below the echo."""
+_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
+"""Bins of distance: fine where the curves fall, coarse where only what stays is left."""
 
 
 class CoherenceSettings(BaseModel):
@@ -38,10 +50,9 @@ class CoherenceSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     adapt: bool = Field(True, description="Adapt to coherent echoes and noise; false: phantom curves alone.")
-    block_frames: int = Field(30, ge=8, description="Frames over which a patch's share is taken as constant.")
-    structure_mm: float = Field(10.0, gt=0, description="Length over which coherent structure changes.")
+    block_frames: int = Field(30, ge=8, description="Frames over which a patch's echo is taken as alike.")
     evidence: float = Field(
-        1.5, ge=0, description="Gain in twice the log-likelihood that grants a patch a share."
+        1.5, ge=0, description="Gain in twice the log-likelihood that grants a patch a share or a stretch."
     )
     redundancy: float = Field(
         20.0, ge=1, description="Frame pairs per independent piece of information: pairs share frames."
@@ -50,74 +61,96 @@ class CoherenceSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Coherence:
-    """Coherent share and gain of every patch, by frame.
+    """How the echoes of every patch depart from fully developed speckle, by frame.
 
     Attributes
     ----------
     frame : ndarray, shape (b,)
         Frames at which they are given; linear between them.
-    share, gain : ndarray, shape (b, p)
+    share, gain, stretch : ndarray, shape (b, p)
+    decay_per_mm : ndarray, shape (b, p)
+        One over the length of coherent structure.
     scale : ndarray, shape (b,)
         True over fully developed distance.
     scale_sigma : float
         Standard deviation of the scale's logarithm over the whole sweep.
-    structure_mm : float
     """
 
     frame: FloatArray
     share: FloatArray
     gain: FloatArray
+    stretch: FloatArray
+    decay_per_mm: FloatArray
     scale: FloatArray
     scale_sigma: float
-    structure_mm: float
 
-    def at(self, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Share and gain at frames, each of shape (e, p)."""
-        return tuple(  # type: ignore[return-value]
+    def models(self, frame: FloatArray, distance_mm: FloatArray) -> list[EchoModel]:
+        """Echo models of pairs about given frames and so far apart, both of shape (e,)."""
+        share, gain, stretch, decay = (
             np.stack([np.interp(frame, self.frame, column) for column in values.T], axis=1)
-            for values in (self.share, self.gain)
+            for values in (self.share, self.gain, self.stretch, self.decay_per_mm)
         )
+        staying = share * np.exp(-np.abs(distance_mm)[:, None] * decay)
+        return [EchoModel(*one) for one in zip(staying, 1 - share, gain, stretch, strict=True)]
 
 
 def estimate_coherence(
     first: IntArray,
     second: IntArray,
     correlation: Float32Array,
-    position_mm: FloatArray,
+    path: FloatArray,
     curves: DecorrelationCurves,
     patches: PatchGrid,
+    lateral_mm: FloatArray,
     settings: CoherenceSettings | None = None,
+    known_scale: bool = False,
 ) -> tuple[Coherence, FloatArray]:
-    """Fit shares, gains and the scale of distances.
+    """Fit shares, gains, stretches and the scale of distances.
 
     Parameters
     ----------
     first, second : ndarray, shape (e,)
         Frames of each pair; pairs sorted by the second.
     correlation : ndarray, shape (e, p)
-    position_mm : ndarray, shape (n,)
-        Elevational position of each frame, as fully developed curves have it.
+    path : ndarray, shape (n, 2)
+        Elevational position of each frame's centre and its slope along x.
+    lateral_mm : ndarray, shape (p,)
+        Of the patches, from the image's centre.
+    known_scale : bool
+        Whether the path has about the right scale already, so that only its neighbourhood is searched.
 
     Returns
     -------
     Coherence
-    ndarray, shape (n,)
-        Positions, rescaled.
+    ndarray, shape (n, 2)
+        The path, rescaled.
     """
     s = settings or CoherenceSettings()
-    problem = _Problem(first, second, correlation, curves, patches, s)
-    position = np.asarray(position_mm, dtype=float)
-    scale = np.ones(problem.centres.size)
-    for scales in (COARSE_SCALES, FINE_SCALES, FINE_SCALES):
-        fits = problem.fit(position, scales)
-        found, sigma = _best_scale(fits, scales, s.evidence)
-        position = _rescale(position, problem.centres, found)
+    problem = _Problem(first, second, correlation, curves, patches, lateral_mm, s)
+    path = np.asarray(path, dtype=float)
+    scale, sigma = np.ones(problem.centres.size), 0.0
+    some = (STRETCHES[:1], LENGTHS_MM[[0, 1, 3]])
+    stages = [(FINE_SCALES, STRETCHES, LENGTHS_MM)] * 2
+    for scales, stretches, lengths in stages if known_scale else [(COARSE_SCALES, *some), *stages]:
+        cost, _ = problem.fit(path, scales, stretches, lengths)
+        found, sigma = _best_scale(cost.reshape(*cost.shape[:3], -1).min(axis=-1), scales)
+        path = _rescale(path, problem.centres, found)
         scale = scale * found
-    fits = problem.fit(position, np.ones(1))[:, 0]
-    choice = np.argmin(_costs(fits, s.evidence), axis=-1)
-    share = np.where(choice == 2, fits[..., 0], 0.0)
-    gain = np.choose(choice, [np.ones_like(share), fits[..., 3], fits[..., 1]])
-    return Coherence(problem.centres, share, gain, scale, sigma, s.structure_mm), position
+    cost, fitted = problem.fit(path, np.ones(1), STRETCHES, LENGTHS_MM)
+    return _chosen(problem.centres, cost[:, 0], fitted[:, 0], scale, sigma), path
+
+
+def _chosen(
+    centres: FloatArray, cost: FloatArray, fitted: FloatArray, scale: FloatArray, sigma: float
+) -> Coherence:
+    """Best model of each block and patch; `cost` of shape (b, p, k, l)."""
+    blocks, patches = cost.shape[:2]
+    k, j = np.unravel_index(cost.reshape(blocks, patches, -1).argmin(axis=-1), cost.shape[2:])
+    b, p = np.ogrid[:blocks, :patches]
+    share, gain = np.moveaxis(fitted[b, p, k, j], -1, 0)
+    length = LENGTHS_MM[j]
+    decay = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
+    return Coherence(centres, share, gain, STRETCHES[k], decay, scale, sigma)
 
 
 class _Problem:
@@ -130,13 +163,14 @@ class _Problem:
         correlation: Float32Array,
         curves: DecorrelationCurves,
         patches: PatchGrid,
+        lateral_mm: FloatArray,
         settings: CoherenceSettings,
     ) -> None:
         self._first, self._second, self._rho = first, second, correlation
-        self._settings = settings
+        self._settings, self._lateral = settings, lateral_mm
         here = curves.at(patches.centre_mm[:, 1])
         self._amplitude = np.ascontiguousarray(np.sqrt(here.correlation))
-        self._cells = here.cells
+        self._cells, self._of_echo = here.cells, curves.key.correlation_of == "echo"
         self._step = float(curves.distance_mm[1])
         frames = int(second.max()) + 1
         half = settings.block_frames / 2
@@ -144,36 +178,41 @@ class _Problem:
         self.centres = np.linspace(min(half, frames / 2), max(frames - half, frames / 2), count)
         self._half = half
 
-    def fit(self, position_mm: FloatArray, scales: FloatArray) -> FloatArray:
-        """Fits of every block, shape (block, scale, patch, 6)."""
-        distance = np.abs(position_mm[self._second] - position_mm[self._first])
+    def fit(
+        self, path: FloatArray, scales: FloatArray, stretches: FloatArray, lengths_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Costs, penalties included, of every block, shape (b, s, p, k, l), and the shares and gains fitted."""
+        moved = path[self._second] - path[self._first]
         middle = (self._first + self._second) / 2
-        out = np.empty((self.centres.size, scales.size, self._rho.shape[1], 6))
+        patches = self._rho.shape[1]
+        shape = (self.centres.size, scales.size, patches, stretches.size, lengths_mm.size)
+        cost, found = np.empty(shape), np.empty((*shape, 2))
+        bins = np.empty((patches, _EDGES_MM.size - 1, 4))
         for block, centre in enumerate(self.centres):
             inside = np.abs(middle - centre) <= self._half
-            fit_coherent_shares(
-                np.ascontiguousarray(self._rho[inside]),
-                distance[inside],
+            offset, slope = moved[inside].T.copy()
+            bin_by_distance(self._rho[inside], offset, slope, self._lateral, _EDGES_MM, bins)
+            fit_echo_models(
+                bins,
                 scales,
+                stretches,
+                lengths_mm,
                 self._amplitude,
                 self._step,
                 self._cells,
-                self._settings.structure_mm,
+                self._of_echo,
                 self._settings.redundancy,
                 GAIN_PRECISION,
-                out[block],
+                cost[block],
+                found[block],
             )
-        return out
+        departures = 1.0 * (stretches > 1)[:, None] + (lengths_mm != NO_GAIN)
+        return cost + self._settings.evidence * departures, found
 
 
-def _costs(fits: FloatArray, evidence: float) -> FloatArray:
-    """Costs of phantom speckle, of it with a gain, and of a coherent share with a gain; shape (..., 3)."""
-    return np.stack([fits[..., 5], fits[..., 4] + evidence, fits[..., 2] + evidence], axis=-1)
-
-
-def _best_scale(fits: FloatArray, scales: FloatArray, evidence: float) -> tuple[FloatArray, float]:
+def _best_scale(cost: FloatArray, scales: FloatArray) -> tuple[FloatArray, float]:
     """Scale of each block from the likelihood profile, neighbours helping, and its overall deviation."""
-    cost = _costs(fits, evidence).min(axis=-1).sum(axis=2)
+    cost = cost.sum(axis=2)
     padded = np.pad(cost, ((2, 2), (0, 0)), mode="edge")
     smooth = sum(w * padded[k : k + len(cost)] for k, w in enumerate((1.0, 2.0, 3.0, 2.0, 1.0))) / 3.0
     best = np.array([_vertex(np.log(scales), row) for row in np.asarray(smooth)])
@@ -194,8 +233,9 @@ def _vertex(x: FloatArray, cost: FloatArray) -> float:
     return float(x[k] + (x[1] - x[0]) * (before - after) / (2 * (before - 2 * at + after)))
 
 
-def _rescale(position_mm: FloatArray, centres: FloatArray, scale: FloatArray) -> FloatArray:
+def _rescale(path: FloatArray, centres: FloatArray, scale: FloatArray) -> FloatArray:
     """Multiply the steps between frames by a scale that varies along the sweep."""
-    steps = np.diff(position_mm)
-    middle = np.arange(steps.size) + 0.5
-    return np.concatenate([[0.0], np.cumsum(steps * np.interp(middle, centres, scale))])
+    steps = np.diff(path, axis=0)
+    middle = np.arange(len(steps)) + 0.5
+    scaled = steps * np.interp(middle, centres, scale)[:, None]
+    return np.concatenate([path[:1], path[0] + np.cumsum(scaled, axis=0)])

@@ -12,11 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.optimize import least_squares
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import BoolArray
+from speckle3d.core.sweep import RFSettings
+from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.motion.intensity import two_way_wavenumber
+from speckle3d.motion.tilt import effective_distance, fit_tilt_response
 
+TILT_ROUNDS = 4
+LITTLE_TILT, LITTLE_TILT_MM = 0.1, 0.01
+"""Curves are fitted to frames whose turning changes distances by no more than this."""
 LEAST_RHO = 0.1
 """Curves end where the phantom's correlation falls to this: below it a patch of some hundred cells cannot
 tell one distance from another."""
@@ -38,13 +47,15 @@ class PhantomSamples:
 
     Attributes
     ----------
-    depth_mm, distance_mm, correlation : ndarray, shape (n,)
+    depth_mm, offset_mm, tilt_rad, correlation : ndarray, shape (n,)
+        Of each patch in each pair; the offset is signed as the tilt is.
     pairs : int
         Frame pairs they come from.
     """
 
     depth_mm: FloatArray
-    distance_mm: FloatArray
+    offset_mm: FloatArray
+    tilt_rad: FloatArray
     correlation: FloatArray
     pairs: int
 
@@ -66,26 +77,51 @@ def fit_curves(
     every = list(samples)
     if not every:
         raise InsufficientDataError("expected samples of at least one phantom sweep, got none")
-    depth, distance, rho = (
+    depth, offset, tilt, rho = (
         np.concatenate([getattr(one, name) for one in every])
-        for name in ("depth_mm", "distance_mm", "correlation")
+        for name in ("depth_mm", "offset_mm", "tilt_rad", "correlation")
     )
     rows = np.unique(np.round(depth, 6))
     grid = np.linspace(0.0, s.largest_mm, 251)
-    fitted = [_fit_row(row, grid, s.terms, *_select(depth, row, distance, rho)) for row in rows]
-    curves = np.stack([curve for curve, _ in fitted])
-    return DecorrelationCurves(
-        key, rows, grid, curves, np.array([cells for _, cells in fitted]), sum(one.pairs for one in every)
-    )
+    distance, response = np.abs(offset), None
+    of_echo = key.correlation_of == "echo"
+    fair = np.ones(depth.size, dtype=bool)
+    # Frames that turn distort the curves a little, and the curves say what turning does.
+    for turn in range(TILT_ROUNDS):
+        fitted = [_fit_row(row, grid, s.terms, of_echo, *_select(fair, depth, row, distance, rho)) for row in rows]
+        curves, cells = np.stack([curve for curve, _ in fitted]), np.array([count for _, count in fitted])
+        if turn == TILT_ROUNDS - 1:
+            break
+        response = fit_tilt_response(
+            rows, curves, cells, grid, _wavenumber(key), of_echo, (depth, offset, tilt, rho)
+        )
+        if response is None:
+            break
+        here = response.at(depth, rows)
+        distance = effective_distance(offset, tilt, here.pivot_mm, here.spread_mm)
+        fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT_MM + LITTLE_TILT * np.abs(offset)
+    return DecorrelationCurves(key, rows, grid, curves, cells, sum(one.pairs for one in every), response)
 
 
-def _select(depth: FloatArray, row: float, *columns: FloatArray) -> tuple[FloatArray, ...]:
-    here = np.abs(depth - row) < 1e-5
+def _wavenumber(key: CurveKey) -> float:
+    """Two-way wavenumber, 1/mm; zero for B-mode images, whose frequency is not known."""
+    return two_way_wavenumber(key.signal) if isinstance(key.signal, RFSettings) else 0.0
+
+
+def _select(
+    fair: BoolArray, depth: FloatArray, row: float, *columns: FloatArray
+) -> tuple[FloatArray, ...]:
+    here = fair & (np.abs(depth - row) < 1e-5)
     return tuple(c[here & np.isfinite(columns[1])] for c in columns)
 
 
 def _fit_row(
-    depth_mm: float, grid: FloatArray, terms: int, distance: FloatArray, rho: FloatArray
+    depth_mm: float,
+    grid: FloatArray,
+    terms: int,
+    of_echo: bool,
+    distance: FloatArray,
+    rho: FloatArray,
 ) -> tuple[FloatArray, float]:
     """Curve of one depth on `grid`, and the number of cells that explains the scatter about it."""
     centre, mean = _bin_means(distance, rho)
@@ -104,8 +140,16 @@ def _fit_row(
     curve = floor + (1 - floor) * np.exp(-_fitted_fall(grid, centre, excess, min(terms, centre.size - 2)))
     used = distance <= centre[-1]
     expected = np.interp(distance[used], grid, curve)
-    spread = np.median(np.abs(rho[used] - expected) / (1 - expected**2 + 1e-3)) * 1.4826
-    return curve, float(1.0 / spread**2)
+    return curve, _cells(rho[used] - expected, expected, of_echo)
+
+
+def _cells(left: FloatArray, expected: FloatArray, of_echo: bool) -> float:
+    """Number of independent cells that explains the residuals' spread."""
+    cells = 60.0
+    for _ in range(4):
+        variance = correlation_variance(expected, cells, of_echo) + 1e-6
+        cells /= (1.4826 * float(np.median(np.abs(left) / np.sqrt(variance)))) ** 2
+    return cells
 
 
 def _floor(centre: FloatArray, mean: FloatArray) -> float:
@@ -123,8 +167,11 @@ def _fitted_fall(grid: FloatArray, centre: FloatArray, rho: FloatArray, terms: i
     """Rise of -ln(rho) with distance on `grid`: a polynomial in squared distance, then a straight line."""
     reach = centre[-1]
     design = (centre[:, None] / reach) ** (2 * np.arange(terms + 1))
-    weight = rho / (1 - rho**2 + 0.01)
-    coefficients = np.linalg.lstsq(design * weight[:, None], -np.log(rho) * weight, rcond=None)[0]
+    weight = 1 / (1 - rho**2 + 0.01)
+    log_weight = rho * weight
+    start = np.linalg.lstsq(design * log_weight[:, None], -np.log(rho) * log_weight, rcond=None)[0]
+    # The logarithm of a mean is not the mean of logarithms: the last word has the correlation itself.
+    coefficients = least_squares(lambda c: (np.exp(-design @ c) - rho) * weight, start).x
     coefficients[0] = max(coefficients[0], 1e-6)
     inside = grid <= reach
     fall = (grid[inside, None] / reach) ** (2 * np.arange(terms + 1)) @ coefficients

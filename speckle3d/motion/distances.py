@@ -8,6 +8,7 @@ import numpy as np
 
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import FloatArray
+from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.motion.patches import PatchGrid
 
 LEAST_CORRELATION = 0.03
@@ -15,6 +16,8 @@ LEAST_CORRELATION = 0.03
 TABLE_STEPS = 400
 SHARE_ERROR = 0.3
 """Relative error of a coherent share: structure is neither quite frozen nor quite Gaussian."""
+STRETCH_ERROR = 0.1
+"""Relative error of a stretch, which is chosen from steps of a sixth."""
 
 
 @dataclass(frozen=True)
@@ -35,27 +38,61 @@ class PatchDistances:
 class EchoModel:
     """How a patch's correlation departs from fully developed speckle's, rho_F, in one pair.
 
-    rho = gain (staying + moving sqrt(rho_F))^2; see `speckle3d.motion.coherence`.
+    rho(d) = gain (staying + moving sqrt(rho_F(d / stretch)))^2; see `speckle3d.motion.coherence`.
 
     Attributes
     ----------
-    staying, moving, gain : ndarray, shape (p,)
+    staying, moving, gain, stretch : ndarray, shape (p,)
     """
 
     staying: FloatArray
     moving: FloatArray
     gain: FloatArray
+    stretch: FloatArray
+
+    @classmethod
+    def fully_developed(cls, patches: int) -> EchoModel:
+        """Return the model of a phantom's speckle."""
+        one = np.ones(patches)
+        return cls(np.zeros(patches), one, one, one)
+
+    def table(self) -> FloatArray:
+        """Parameters and the errors of the first and the last, shape (p, 6), as kernels take them."""
+        return np.column_stack(
+            [
+                self.staying,
+                self.moving,
+                self.gain,
+                self.stretch,
+                SHARE_ERROR * self.staying,
+                np.where(self.stretch > 1.0 + 1e-9, STRETCH_ERROR, 0.0),
+            ]
+        )
 
 
 class DistanceEstimator:
-    """Inverts decorrelation curves at the depths of a sweep's patches."""
+    """Inverts decorrelation curves at the depths of a sweep's patches.
+
+    Attributes
+    ----------
+    amplitude : ndarray, shape (p, m)
+        sqrt(rho_F) of each patch on a grid of `step_mm`.
+    cells : ndarray, shape (p,)
+    of_echo : bool
+        Whether correlations are of complex echoes.
+    tilt : TiltResponse or None
+        At the patches.
+    """
 
     def __init__(self, curves: DecorrelationCurves, patches: PatchGrid) -> None:
         here = curves.at(patches.centre_mm[:, 1])
-        self._cells = here.cells
+        self.cells, self.of_echo = here.cells, curves.key.correlation_of == "echo"
+        self.step_mm = float(curves.distance_mm[1])
+        self.amplitude = np.ascontiguousarray(np.sqrt(here.correlation))
+        self.tilt = here.tilt
         self._grid = curves.distance_mm
         self._rho = here.correlation
-        self._slope = -np.gradient(here.correlation, self._grid[1], axis=1)
+        self._slope = -np.gradient(here.correlation, self.step_mm, axis=1)
         self._slope[:, 0] = 0.0
         root = np.sqrt(-np.log(here.correlation))
         self._root_step = root.max() / (TABLE_STEPS - 1)
@@ -75,36 +112,38 @@ class DistanceEstimator:
         patch = np.arange(rho.size)
         low, high = self._distance[patch, cell], self._distance[patch, cell + 1]
         distance = low + np.clip(position - cell, 0, 1) * (high - low)
+        if model is not None:
+            distance = distance * model.stretch
         return PatchDistances(distance, np.where(np.isnan(rho), np.nan, self.sigma(distance, model)))
 
     def fully_developed(self, distance_mm: float) -> FloatArray:
         """Correlation that fully developed speckle would have at one distance, shape (p,)."""
-        cell = min(round(distance_mm / self._grid[1]), self._grid.size - 1)
+        cell = min(round(distance_mm / self.step_mm), self._grid.size - 1)
         return np.asarray(self._rho[:, cell])
 
     def sigma(self, distance_mm: FloatArray, model: EchoModel | None = None) -> FloatArray:
         """Standard deviation of a distance estimate where the true distance is `distance_mm`, shape (p,).
 
-        From Var(rho) = (1 - rho^2)^2 / N for N independent cells and the curve's slope. Near zero the slope
+        From the correlation's variance over N independent cells and the curve's slope. Near zero the slope
         vanishes; there it is the squared distance whose deviation stays finite.
         """
-        step = self._grid[1]
-        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3)
-        position = np.clip(d / step, 0, self._grid.size - 2.001)
+        m = model or EchoModel.fully_developed(self.cells.size)
+        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3) / m.stretch
+        position = np.clip(d / self.step_mm, 0, self._grid.size - 2.001)
         cell = position.astype(int)
         patch, part = np.arange(cell.size), position - cell
         rho, slope = (
             (1 - part) * table[patch, cell] + part * table[patch, cell + 1]
             for table in (self._rho, self._slope)
         )
-        sigma_rho = (1 - rho**2) / np.sqrt(self._cells)
-        if model is not None:
-            g = np.sqrt(rho)
-            echo = model.staying + model.moving * g
-            measured = np.minimum(model.gain * echo**2, 0.999)
-            noise = (1 - measured**2) / np.sqrt(self._cells)
-            misfit = SHARE_ERROR * model.staying * (1 - g) * 2 * echo * model.gain
-            sigma_rho = np.hypot(noise, misfit) * g / np.maximum(model.gain * echo * model.moving, 1e-6)
+        _, _, _, _, staying_sd, stretch_sd = m.table().T
+        g = np.sqrt(rho)
+        echo = m.staying + m.moving * g
+        seen = np.minimum(m.gain * echo**2, 0.999)
+        noise = np.sqrt(correlation_variance(seen, self.cells, self.of_echo))
+        misfit = staying_sd * (1 - g) * 2 * echo * m.gain
+        sigma_rho = np.hypot(noise, misfit) * g / np.maximum(m.gain * echo * m.moving, 1e-6)
         d = np.minimum(d, self._grid[-1])
         direct = sigma_rho / np.maximum(slope, 1e-9)
-        return np.asarray(np.minimum(direct, np.sqrt(2 * d * direct)))
+        sigma = np.minimum(direct, np.sqrt(2 * d * direct)) * m.stretch
+        return np.asarray(np.hypot(sigma, stretch_sd * d * m.stretch))

@@ -16,7 +16,7 @@ from scipy import fft
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.kernels.correlation import patch_correlations
+from speckle3d.kernels.correlation import patch_coherences, patch_correlations
 from speckle3d.motion.intensity import Complex64Array, Float32Array
 from speckle3d.motion.patches import PatchGrid
 
@@ -62,7 +62,7 @@ class PatchMatch:
     Attributes
     ----------
     correlation : ndarray, shape (p,)
-        Of intensity, at the frame's in-plane shift; NaN where a patch left the image or is flat.
+        Of intensity, or the squared magnitude of the complex echo's, at the frame's in-plane shift; NaN where a patch left the image or is flat.
     shift_mm : ndarray, shape (p, 2)
         Each patch's own shift, lateral and axial; NaN where it has no peak.
     motion : InPlaneMotion
@@ -115,6 +115,8 @@ def match_patches(
     start: InPlaneMotion,
     centre_mm: FloatArray,
     settings: InPlaneSettings | None = None,
+    echoes: tuple[Float32Array, Float32Array] | None = None,
+    wavenumber_per_mm: float = 0.0,
 ) -> PatchMatch:
     """Find the in-plane motion between two frames and the correlation left at it.
 
@@ -127,6 +129,10 @@ def match_patches(
         Right to about a sample, e.g. from `CoarseMatcher` or from the step before.
     centre_mm : ndarray, shape (3,)
         The image's centre.
+    echoes : tuple of ndarray of float32, shape (2, vector, sample), optional
+        Real and imaginary parts of both frames' demodulated echoes, to be correlated instead of intensity.
+    wavenumber_per_mm : float
+        Two-way, of the demodulation: what turns in the plane and strain do to their phase is undone.
 
     References
     ----------
@@ -137,15 +143,20 @@ def match_patches(
         raise InvalidInputError(f"expected two frames of one shape, got {fixed.shape} and {moving.shape}")
     s = settings or InPlaneSettings()
     at = patches.centre_mm - centre_mm[:2]
-    predicted = _shift_field(start, at)
+    predicted, strain = _shift_field(start, at), np.zeros(2)
+    place = (patches.first, patches.size)
     for _ in range(s.passes):
         lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
         rho = np.empty((len(patches), 3, 3))
-        patch_correlations(fixed, moving, patches.first, patches.size, lag, s.least_overlap, rho)
+        patch_correlations(fixed, moving, *place, lag, s.least_overlap, rho)
         shift, weight = _patch_peaks(rho, lag, patches)
-        motion, predicted = _fit_motion(shift, weight, at, start, predicted)
+        motion, predicted, strain = _fit_motion(shift, weight, at, start, predicted)
         if np.array_equal(np.rint(predicted / patches.spacing_mm), lag):
             break
+    if echoes is not None:
+        lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
+        ramp = wavenumber_per_mm * strain * patches.spacing_mm
+        patch_coherences(*echoes, *place, lag, ramp, s.least_overlap, rho)
     correlation = _read_at(rho, predicted / patches.spacing_mm - lag)
     return PatchMatch(correlation, shift, motion)
 
@@ -195,8 +206,10 @@ def _vertex(before: FloatArray, at: FloatArray, after: FloatArray) -> FloatArray
 
 def _fit_motion(
     shift: FloatArray, weight: FloatArray, at: FloatArray, start: InPlaneMotion, predicted: FloatArray
-) -> tuple[InPlaneMotion, FloatArray]:
+) -> tuple[InPlaneMotion, FloatArray, FloatArray]:
     """In-plane motion by robust least squares, and the smooth (affine) field to read correlations at.
+
+    Last comes the change of axial shift along x and y, which turns the echoes' phase.
 
     Roll comes from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves
     speckle laterally about the focus rather than about the probe, and lateral shifts understate it by a
@@ -205,7 +218,7 @@ def _fit_motion(
     good = weight > 0
     design = np.column_stack([np.ones(len(at)), at])
     if good.sum() < 6 or np.linalg.matrix_rank(design[good]) < 3:
-        return start, predicted
+        return start, predicted, np.zeros(2)
     fits = [_robust_fit(design[good], shift[good, k], weight[good]) for k in range(2)]
     (lateral, lateral_covariance), (axial, axial_covariance) = fits
     covariance = np.zeros((3, 3))
@@ -216,7 +229,7 @@ def _fit_motion(
     c, s = np.cos(roll), np.sin(roll)
     x, y = s * axial[0] - c * lateral[0], -s * lateral[0] - c * axial[0]
     motion = InPlaneMotion(float(x), float(y), roll, covariance)
-    return motion, np.stack([design @ lateral, design @ axial], axis=1)
+    return motion, np.stack([design @ lateral, design @ axial], axis=1), np.asarray(axial[1:])
 
 
 def _robust_fit(

@@ -106,8 +106,7 @@ class IntensityExtractor:
         if isinstance(self.signal, BModeSettings):
             self._check(frame)
             return _decompress(frame, self.signal)
-        a = self.analytic(frame)
-        return np.asarray(a.real * a.real + a.imag * a.imag)
+        return intensity_of(self.analytic(frame))
 
     def equalise(self, intensity: Float32Array) -> Float32Array:
         """Divide out the local mean, so that echogenicity does not read as speckle that stays.
@@ -125,6 +124,16 @@ class IntensityExtractor:
     def _check(self, frame: npt.NDArray[Any]) -> None:
         if frame.shape != self._frame_shape:
             raise InvalidInputError(f"expected a frame of shape {self._frame_shape}, got {frame.shape}")
+
+
+def intensity_of(analytic: Complex64Array) -> Float32Array:
+    """Squared magnitude."""
+    return np.asarray(analytic.real * analytic.real + analytic.imag * analytic.imag)
+
+
+def two_way_wavenumber(signal: RFSettings) -> float:
+    """Phase per depth, rad/mm, that the analytic signal was freed of: the band's centre, there and back."""
+    return float(4e-3 * np.pi * np.mean(signal.bandwidth_hz) / signal.speed_of_sound_m_s)
 
 
 def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> _Resampling:

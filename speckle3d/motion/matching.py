@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.curves import CurveKey
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.motion.inplane import CoarseMatcher, InPlaneMotion, InPlaneSettings, PatchMatch, match_patches
 from speckle3d.motion.intensity import (
     Complex64Array,
     Float32Array,
     IntensityExtractor,
     IntensitySettings,
+    intensity_of,
+    two_way_wavenumber,
 )
 from speckle3d.motion.patches import PatchSettings, lay_patches
+
+
+class MatchingSettings(BaseModel):
+    """What of two frames is correlated once their in-plane motion is known."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    correlate: Literal["echo", "intensity"] = Field(
+        "echo",
+        description="echo: the complex echo, whose distances reach the Cramer-Rao bound and in which structure "
+        "that stays weighs less. intensity: as published. B-mode images hold intensity alone.",
+    )
+
+
+@dataclass(frozen=True)
+class Echo:
+    """One frame's intensity, shape (vector, sample), and the analytic signal it comes from, if known."""
+
+    intensity: Float32Array
+    analytic: Complex64Array | None
 
 
 @dataclass(frozen=True)
@@ -28,13 +51,20 @@ class ReadyFrame:
     """Equalised intensity, shape (vector, sample)."""
     spectrum: Complex64Array
     """For the coarse search."""
+    echo: Float32Array | None = None
+    """Real and imaginary parts of the equalised echo, shape (2, vector, sample)."""
 
 
 class FrameMatcher:
     """Prepares the frames of one sweep and matches pairs of them."""
 
     def __init__(
-        self, sweep: Sweep, intensity: IntensitySettings, patches: PatchSettings, inplane: InPlaneSettings
+        self,
+        sweep: Sweep,
+        intensity: IntensitySettings,
+        patches: PatchSettings,
+        inplane: InPlaneSettings,
+        matching: MatchingSettings | None = None,
     ) -> None:
         self.extractor = IntensityExtractor.for_sweep(sweep, intensity)
         self.grid = self.extractor.grid
@@ -43,22 +73,34 @@ class FrameMatcher:
         self.at_mm = self.patches.centre_mm - self.centre_mm[:2]
         self.inplane = inplane
         self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
+        rf = isinstance(sweep.signal, RFSettings)
+        self.of_echo = rf and (matching or MatchingSettings()).correlate == "echo"
+        self._wavenumber = two_way_wavenumber(sweep.signal) if rf else 0.0
         self.key = CurveKey(
             sweep.signal,
             self.grid.vector_pitch_mm,
             patches.width_mm,
             patches.height_mm,
             intensity.equalise_mm,
+            "echo" if self.of_echo else "intensity",
         )
 
-    def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
-        """Echo intensity of a frame as read, shape (vector, grid.samples)."""
-        return self.extractor.intensity(frame)
+    def echo(self, frame: npt.NDArray[Any]) -> Echo:
+        """Echo of a frame as read."""
+        if not self.of_echo:
+            return Echo(self.extractor.intensity(frame), None)
+        analytic = self.extractor.analytic(frame)
+        return Echo(intensity_of(analytic), analytic)
 
-    def prepare(self, intensity: Float32Array) -> ReadyFrame:
-        """Equalise an intensity image and transform it for the coarse search."""
-        image = self.extractor.equalise(intensity)
-        return ReadyFrame(image, self._coarse.spectrum(image))
+    def prepare(self, echo: Echo) -> ReadyFrame:
+        """Equalise an echo and transform it for the coarse search."""
+        image = self.extractor.equalise(echo.intensity)
+        parts = None
+        if echo.analytic is not None:
+            floor = np.finfo(np.float32).tiny
+            gain = np.sqrt(image / np.maximum(echo.intensity, floor))
+            parts = np.stack([echo.analytic.real * gain, echo.analytic.imag * gain])
+        return ReadyFrame(image, self._coarse.spectrum(image), parts)
 
     def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:
         """In-plane motion to the nearest sample, looked for over the whole search range."""
@@ -67,7 +109,19 @@ class FrameMatcher:
 
     def match(self, fixed: ReadyFrame, moving: ReadyFrame, start: InPlaneMotion) -> PatchMatch:
         """In-plane motion and correlation of one pair, from a start that is right to about a sample."""
-        return match_patches(fixed.image, moving.image, self.patches, start, self.centre_mm, self.inplane)
+        echoes = None
+        if fixed.echo is not None and moving.echo is not None:
+            echoes = fixed.echo, moving.echo
+        return match_patches(
+            fixed.image,
+            moving.image,
+            self.patches,
+            start,
+            self.centre_mm,
+            self.inplane,
+            echoes,
+            self._wavenumber,
+        )
 
 
 def compose(first: InPlaneMotion, then: InPlaneMotion) -> InPlaneMotion:

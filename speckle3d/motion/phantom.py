@@ -66,7 +66,7 @@ def phantom_samples(
     motion = {0: InPlaneMotion()}
     rows: list[FloatArray] = []
     for frame in range(len(sweep)):
-        kept[frame] = matcher.prepare(matcher.intensity(sweep.frames[frame]))
+        kept[frame] = matcher.prepare(matcher.echo(sweep.frames[frame]))
         if frame:
             start = matcher.search(kept[frame - 1], kept[frame])
             step = matcher.match(kept[frame - 1], kept[frame], start).motion
@@ -74,8 +74,9 @@ def phantom_samples(
         for first in wanted[wanted[:, 1] == frame, 0]:
             start = compose(inverse(motion[first]), motion[frame])
             match = matcher.match(kept[first], kept[frame], start)
-            distance = _patch_distances(poses[first].inv() * poses[frame], matcher, match.motion)
-            rows.append(np.column_stack([matcher.patches.centre_mm[:, 1], distance, match.correlation]))
+            offset, tilt = _patch_offsets(poses[first].inv() * poses[frame], matcher, match.motion)
+            depth = matcher.patches.centre_mm[:, 1]
+            rows.append(np.column_stack([depth, offset, np.full(depth.size, tilt), match.correlation]))
         needed = wanted[wanted[:, 1] > frame, 0]
         kept = {k: v for k, v in kept.items() if k == frame or k in needed}
         if progress:
@@ -85,7 +86,7 @@ def phantom_samples(
             f"{sweep.name}: expected phantom frames closer than {s.largest_mm:g} mm, got none"
         )
     table = np.concatenate(rows)
-    return PhantomSamples(table[:, 0], table[:, 1], table[:, 2], len(rows))
+    return PhantomSamples(*table.T, len(rows))
 
 
 def _separations(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
@@ -107,10 +108,12 @@ def _choose_pairs(separation: FloatArray, settings: CurveSettings) -> IntArray:
     return np.asarray(pairs[np.sort(kept)])
 
 
-def _patch_distances(
+def _patch_offsets(
     first_from_second: RigidTransform, matcher: FrameMatcher, motion: InPlaneMotion
-) -> FloatArray:
-    """Distance of each patch of the second frame from the first frame's plane, shape (p,), mm."""
+) -> tuple[FloatArray, float]:
+    """Signed distance of each patch of the second frame from the first frame's plane, mm, and its tilt."""
     lateral = matcher.patches.centre_mm - [motion.x_mm, motion.y_mm]
     points = np.column_stack([lateral, np.zeros(len(lateral))])
-    return np.asarray(np.abs(first_from_second.apply(points)[:, 2]))
+    return np.asarray(first_from_second.apply(points)[:, 2]), float(
+        first_from_second.rotation.as_matrix()[2, 1]
+    )

@@ -1,8 +1,13 @@
-"""A plane through the patches' distances: the second frame seen from the first.
+"""The plane through a frame pair's patches: the second frame seen from the first.
 
 z(x, y) = a + b (x - xc) + c (y - yc) for points of the second frame, about the image's centre, where
-b = R31 and c = R32 of the relative rotation. Distances are unsigned; the plane returned has a >= 0 and
-its sign is settled by the trajectory.
+b = R31 and c = R32 of the relative rotation. The plane is fitted to the correlations themselves, whose errors
+are nearly Gaussian, and not to distances, which are skewed where speckle has all but gone and missing
+where it has. Correlations know no sign; the plane returned has a >= 0, and the trajectory settles its sign.
+
+Tilt is nearly invisible to decorrelation: a focused beam's wavefront is curved about the focus, so that
+turning moves speckle at every depth as it moves it there, and patches see a + c (y - yc - pivot) with a pivot
+that grows with depth just as y does. The fit keeps what little is seen; `speckle3d.motion.slopes` says what it is worth.
 """
 
 from __future__ import annotations
@@ -14,7 +19,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import BoolArray
-from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
+from speckle3d.kernels.planes import fit_correlation_plane
+from speckle3d.motion.distances import DistanceEstimator, EchoModel
+
+CROSSING_EVIDENCE = 6.0
+"""Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
+LOOSE_SLOPE = 0.05
+"""Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
+SENSED_SLOPE = 5e-4
+"""Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
+ROUNDS = 12
+LEAST_PATCHES = 6
 
 
 class PlaneSettings(BaseModel):
@@ -28,12 +43,15 @@ class PlaneSettings(BaseModel):
         description="Error common to a pair's distances that no number of patches averages out; it keeps "
         "tiny separations from outweighing long ones.",
     )
-    huber: float = Field(1.5, gt=0, description="Standard deviations at which a patch begins to lose weight.")
+    huber: float = Field(2.0, gt=0, description="Standard deviations at which a patch begins to lose weight.")
     support_sigma: float = Field(
-        1.0,
+        1.0, gt=0, description="Threshold of the orientation-consistent subset, standard deviations."
+    )
+    turn_deg_per_mm: float = Field(
+        0.04,
         gt=0,
-        description="Threshold of the orientation-consistent subset, standard deviations. One is published; "
-        "distances being skewed, it makes phantom sweeps 0.3 % longer, and two leaves them as they are.",
+        description="Yaw and tilt per distance that sweeps are expected to have, standard deviation; what "
+        "images see of them is believed as far as it is more certain than this.",
     )
 
 
@@ -49,6 +67,9 @@ class PairPlane:
         Of (a, b, c).
     used : ndarray of bool, shape (p,)
         Patches that took part.
+    excess_mm, sigma_mm : ndarray, shape (p,)
+        How much farther each patch is than the plane has it, and the standard deviation of that, both to
+        first order in the correlation; NaN for patches that took no part.
     """
 
     offset_mm: float
@@ -56,6 +77,8 @@ class PairPlane:
     slope_y: float
     covariance: FloatArray
     used: BoolArray
+    excess_mm: FloatArray
+    sigma_mm: FloatArray
 
     @property
     def coefficients(self) -> FloatArray:
@@ -63,109 +86,116 @@ class PairPlane:
         return np.array([self.offset_mm, self.slope_x, self.slope_y])
 
 
-def fit_plane(
-    distances: PatchDistances,
-    estimator: DistanceEstimator,
-    at_mm: FloatArray,
-    settings: PlaneSettings | None = None,
-    subset: BoolArray | None = None,
-    model: EchoModel | None = None,
-    side: FloatArray | None = None,
-) -> PairPlane | None:
-    """Robust weighted least squares; None if fewer than six patches can take part.
+class PlaneFitter:
+    """Fits planes to the correlations of a sweep's frame pairs."""
 
-    Each patch is weighted by the deviation expected at the plane's distance, not at its own: weights
-    taken from the estimates themselves favour those that came out short.
+    def __init__(
+        self, estimator: DistanceEstimator, at_mm: FloatArray, settings: PlaneSettings | None = None
+    ) -> None:
+        self._estimator, self._at = estimator, at_mm
+        self.settings = settings or PlaneSettings()
+        zero = np.zeros(len(at_mm))
+        tilt = estimator.tilt
+        # Where the curves know nothing of tilt, it is taken to turn about the focus, and the focus to be at
+        # the image's centre: all depths then see the centre's distance.
+        self._lever = zero if tilt is None else at_mm[:, 1] - tilt.pivot_mm
+        self._spread = zero if tilt is None else tilt.spread_mm
 
-    Parameters
-    ----------
-    at_mm : ndarray, shape (p, 2)
-        Patch centres less the image's centre.
-    subset : ndarray of bool, shape (p,), optional
-        Patches allowed to take part.
-    model : EchoModel, optional
-        With which the distances were made.
-    side : ndarray of +1 and -1, shape (p,), optional
-        On which side of the first frame each patch lies, where that is known; without it all on one.
-    """
-    s = settings or PlaneSettings()
-    d = distances.distance_mm
-    used = np.isfinite(d) if subset is None else np.isfinite(d) & subset
-    if used.sum() < 6:
-        return None
-    design = np.column_stack([np.ones(len(d)), at_mm])
-    predicted = np.full(len(d), np.median(d[used]))  # only its size matters
-    robust = np.ones(len(d))
-    data = np.nan_to_num(d) if side is None else np.nan_to_num(d) * side
-    for _ in range(5):
-        sigma = estimator.sigma(np.abs(predicted), model)
-        weight = used * robust / sigma**2
-        inverse = _inverse(design.T @ (design * weight[:, None]))
-        plane = inverse @ (design.T @ (weight * data))
-        predicted = design @ plane
-        size = np.abs(data - predicted) / sigma
-        robust = np.minimum(1.0, s.huber / np.maximum(size, 1e-9))
-    excess = max(1.0, float((weight * (data - predicted) ** 2).sum() / max(used.sum() - 3, 1)))
-    covariance = np.asarray(inverse * excess, dtype=float)
-    covariance[0, 0] += s.bias_mm**2
-    if plane[0] < 0:
-        plane = -plane
-    return PairPlane(float(plane[0]), float(plane[1]), float(plane[2]), covariance, used)
+    def design(self, moved_mm: FloatArray) -> FloatArray:
+        """What a, b and c are multiplied by for each patch, shape (p, 3).
 
+        Parameters
+        ----------
+        moved_mm : ndarray, shape (2,)
+            In-plane displacement of the second frame.
+        """
+        lateral = self._at[:, 0] - moved_mm[0]
+        return np.column_stack([np.ones(len(lateral)), lateral, self._lever - moved_mm[1] * self._has_lever])
 
-@dataclass(frozen=True)
-class ConsistentSubset:
-    """Patches that agree on an oriented plane, and on which side of the first frame it has them.
+    @property
+    def _has_lever(self) -> float:
+        return float(self._estimator.tilt is not None)
 
-    Attributes
-    ----------
-    support : ndarray of bool, shape (p,)
-    side : ndarray of +1 and -1, shape (p,)
-    """
+    def fit(
+        self,
+        correlation: FloatArray,
+        moved_mm: FloatArray,
+        model: EchoModel | None = None,
+        subset: BoolArray | None = None,
+        slopes: FloatArray | None = None,
+    ) -> PairPlane | None:
+        """Robust maximum likelihood; None if fewer than six patches can take part.
 
-    support: BoolArray
-    side: FloatArray
+        Parameters
+        ----------
+        correlation : ndarray, shape (p,)
+        moved_mm : ndarray, shape (2,)
+            In-plane displacement of the second frame.
+        subset : ndarray of bool, shape (p,), optional
+            Patches allowed to take part.
+        slopes : ndarray, shape (2,), optional
+            b and c as a sensor has them. The plane's sign is then theirs, and a may be negative.
+        """
+        used = np.isfinite(correlation) if subset is None else np.isfinite(correlation) & subset
+        if used.sum() < LEAST_PATCHES:
+            return None
+        rho = np.where(used, correlation, np.nan).astype(float)
+        model = model or EchoModel.fully_developed(rho.size)
+        echo, design = model.table(), self.design(moved_mm)
+        best, least = np.zeros(3), np.inf
+        for number, (start, prior, precision) in enumerate(self._starts(rho, model, design, used, slopes)):
+            plane = start.copy()
+            information, standard, sensitivity = np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size)
+            cost = fit_correlation_plane(
+                rho,
+                design,
+                self._spread,
+                self._estimator.amplitude,
+                self._estimator.step_mm,
+                echo,
+                self._estimator.cells,
+                self._estimator.of_echo,
+                prior,
+                precision,
+                self.settings.huber,
+                ROUNDS,
+                plane,
+                information,
+                standard,
+                sensitivity,
+            )
+            if cost + (CROSSING_EVIDENCE if number else 0.0) < least:
+                best, least, normal = plane, cost, information
+                sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan)
+                excess = -standard * sigma
+        covariance = np.linalg.inv(normal) * max(1.0, least / max(int(used.sum()) - 3, 1))
+        covariance[0, 0] += self.settings.bias_mm**2
+        if best[0] < 0 and slopes is None:
+            best = -best
+        return PairPlane(float(best[0]), float(best[1]), float(best[2]), covariance, used, excess, sigma)
 
-
-def consistent_subset(
-    distances: PatchDistances, at_mm: FloatArray, slopes: FloatArray, settings: PlaneSettings | None = None
-) -> ConsistentSubset:
-    """Patches whose distances agree on one plane of the orientation that the sensor measured.
-
-    Every patch in turn places the plane, through +d and through -d; the placement that most others agree
-    with, in magnitude and within `support_sigma` of their own deviations, keeps its supporters.
-
-    Parameters
-    ----------
-    slopes : ndarray, shape (2,)
-        R31 and R32 of the relative rotation from the sensor.
-
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, "Sensorless drift correction using
-       orientation measurements", figure 4.
-    """
-    s = settings or PlaneSettings()
-    d, sigma = distances.distance_mm, distances.sigma_mm
-    known = np.flatnonzero(np.isfinite(d))
-    support = np.zeros(len(d), dtype=bool)
-    if known.size == 0:
-        return ConsistentSubset(support, np.ones(len(d)))
-    tilt = at_mm[known] @ slopes
-    offsets = np.concatenate([d[known] - tilt, -d[known] - tilt])
-    distance = np.abs(offsets[:, None] + tilt)
-    error = np.abs(distance - d[known]) / sigma[known]
-    agree = error <= s.support_sigma
-    # Among placements of equal support, the one whose supporters lie closest.
-    score = agree.sum(axis=1) - np.where(agree, error, 0.0).sum(axis=1) / (
-        agree.shape[1] * s.support_sigma + 1
-    )
-    best = int(np.argmax(score))
-    support[known] = agree[best]
-    return ConsistentSubset(support, np.where(offsets[best] + at_mm @ slopes < 0, -1.0, 1.0))
-
-
-def _inverse(normal: FloatArray) -> FloatArray:
-    """Inverse of a 3 x 3 normal matrix; slopes that the patches do not determine get a huge variance."""
-    slack = 1e-9 * np.diag(normal).max() * np.array([1e-6, 1.0, 1.0])
-    return np.asarray(np.linalg.inv(normal + np.diag(slack)))
+    def _starts(
+        self,
+        rho: FloatArray,
+        model: EchoModel,
+        design: FloatArray,
+        used: BoolArray,
+        slopes: FloatArray | None,
+    ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Starts with their priors: all patches on one side, then frames that cross within the image."""
+        d = np.abs(self._estimator.distances(rho, model).distance_mm)
+        middle = float(np.nanmedian(d)) if np.isfinite(d).any() else 0.5
+        if slopes is not None:
+            known, sure = np.array([0.0, *slopes]), np.array([1e-6, SENSED_SLOPE**-2, SENSED_SLOPE**-2])
+            return [(np.array([side * middle, *slopes]), known, sure) for side in (1.0, -1.0)]
+        loose = np.array([1e-6, LOOSE_SLOPE**-2, LOOSE_SLOPE**-2])
+        starts = [np.array([middle, 0.0, 0.0])]
+        lateral = design[used, 1]
+        half = np.ptp(lateral) / 2
+        # V-shaped distances, which no plane on one side explains, fall towards the crossing.
+        if half > 0 and middle < LOOSE_SLOPE * half:
+            for at in (-0.5, 0.0, 0.5):
+                centre = lateral.mean() + at * half
+                slope = middle / np.abs(lateral - centre).mean()
+                starts.append(np.array([-slope * centre, slope, 0.0]))
+        return [(start, np.zeros(3), loose) for start in starts]

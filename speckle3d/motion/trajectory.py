@@ -1,13 +1,10 @@
-"""Frame pairs to poses: which pairs to measure, the sign of each, and the least-squares trajectory.
-
-A distance has no sign. A frame is placed against several earlier ones at once, and only one side of
-them agrees with all the distances; so reversals and pauses resolve as the sweep is read.
-"""
+"""Frame pairs to poses: which pairs to measure, and the least-squares trajectory of all of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,12 +16,6 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles, skew
 from speckle3d.motion.inplane import InPlaneMotion
 from speckle3d.motion.planes import PairPlane
-
-TREND_MM = 0.3
-"""Travel over which a direction is remembered: a few frames of a hand-held sweep."""
-TURNING_COST = 2.0
-"""Squared deviations by which the distances must speak for turning back: hands turn back rarely."""
-
 
 class TrajectorySettings(BaseModel):
     """Which frame pairs are measured and how they are joined."""
@@ -50,6 +41,11 @@ class TrajectorySettings(BaseModel):
         "to be used.",
     )
     huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
+    join: Literal["graph", "chain"] = Field(
+        "graph",
+        description="graph: least squares over all pairs. chain: each frame by the one earlier frame that "
+        "tells its distance best, for comparison.",
+    )
 
 
 @dataclass(frozen=True)
@@ -97,58 +93,9 @@ class PairSchedule:
         return {*range(max(0, frame - self.settings.recent + 1), frame + 1), *self._keys}
 
 
-class SignResolver:
-    """Gives every pair a sign by placing the frames of a sweep one after the other.
-
-    Each frame goes to the elevational position that agrees best, in a capped squared error, with its
-    distances to all the earlier frames it was measured against. The sweep's first motion counts as positive.
-    """
-
-    def __init__(self) -> None:
-        self._position = {0: 0.0}
-        self._trend = 1.0
-
-    def place(self, pairs: Sequence[PairMeasurement]) -> FloatArray:
-        """Place the frame that all of `pairs` have second; returns the sign of each pair, shape (e,)."""
-        frame = pairs[0].second
-        here = np.array([self._position[p.first] for p in pairs])
-        position = _best_position(here, pairs, self._trend)
-        latest = int(np.argmax([p.first for p in pairs]))
-        step = position - here[latest]
-        # The direction travelled lately settles the placements that the distances leave open. It is averaged
-        # over travel and not over time, so that a pause, in which steps have random signs, keeps it.
-        share = 1.0 - np.exp(-abs(step) / TREND_MM)
-        self._trend += share * (np.sign(step) - self._trend)
-        self._position[frame] = position
-        return np.where(position >= here, 1.0, -1.0)
-
-    def position(self, frame: int) -> float:
-        """Elevational position at which a frame was placed, mm."""
-        return self._position[frame]
-
-    def forget(self, keep: set[int]) -> None:
-        """Drop the positions of frames that no later one will be measured against."""
-        self._position = {frame: z for frame, z in self._position.items() if frame in keep}
-
-
-def _best_position(here: FloatArray, pairs: Sequence[PairMeasurement], trend: float) -> float:
-    d = np.array([p.plane.offset_mm for p in pairs])
-    # Coherent tissue makes long distances too short: a misfit of a quarter is no sign of turning back.
-    sigma = np.sqrt([p.plane.covariance[0, 0] + (0.25 * p.plane.offset_mm) ** 2 for p in pairs])
-    candidates = np.concatenate([here + d, here - d])
-    misfit = (np.abs(candidates[:, None] - here) - d) / sigma
-    cost = np.minimum(misfit**2, 9.0).sum(axis=1)
-    against = np.sign(candidates - here[0]) * np.sign(trend) < 0
-    best = int(np.argmin(cost + TURNING_COST * against))
-    sign = np.where(candidates[best] >= here, 1.0, -1.0)
-    near = np.abs(misfit[best]) < 3
-    if not near.any():
-        return float(candidates[best])
-    return float(np.average((here + sign * d)[near], weights=1 / sigma[near] ** 2))
-
-
-def sign_pair(pair: PairMeasurement, plane: PairPlane, sign: float) -> SignedPair:
+def sign_pair(pair: PairMeasurement, sign: float) -> SignedPair:
     """Relative pose of a pair, about the image's centre, from in-plane motion and signed plane."""
+    plane = pair.plane
     a, b, c = sign * plane.coefficients
     yaw = -np.arcsin(np.clip(b, -1, 1))
     tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
@@ -189,8 +136,8 @@ def solve_trajectory(
     _require_connected(second, frames)
     measured = RigidTransform.concatenate([p.pose for p in pairs])
     whitening = np.linalg.cholesky(np.linalg.inv(np.array([p.covariance for p in pairs]))).transpose(0, 2, 1)
-    poses = _chain(pairs, frames)
-    for _ in range(rounds):
+    poses = _chain(pairs, frames, s.join == "chain")
+    for _ in range(rounds if s.join == "graph" else 0):
         step = _gauss_newton_step(poses, first, second, measured, whitening, s.huber)
         poses = poses * RigidTransform.from_exp_coords(step)
         if np.abs(step).max() < 1e-7:
@@ -211,12 +158,17 @@ def _require_connected(second: FloatArray, frames: int) -> None:
         )
 
 
-def _chain(pairs: Sequence[SignedPair], frames: int) -> RigidTransform:
-    """Start: each frame from its most certain pair."""
+def _chain(pairs: Sequence[SignedPair], frames: int, relative: bool) -> RigidTransform:
+    """Each frame from the pair whose distance is most certain, absolutely or relative to its size."""
+
+    def doubt(p: SignedPair) -> float:
+        variance = float(p.covariance[2, 2])
+        return variance / max(float(p.pose.translation[2]) ** 2, 1e-6) if relative else variance
+
     best: dict[int, SignedPair] = {}
     for p in pairs:
         kept = best.get(p.second)
-        if kept is None or p.covariance[2, 2] < kept.covariance[2, 2]:
+        if kept is None or doubt(p) < doubt(kept):
             best[p.second] = p
     matrices = np.tile(np.eye(4), (frames, 1, 1))
     for frame in range(1, frames):

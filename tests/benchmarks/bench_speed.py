@@ -67,7 +67,7 @@ def report_correlation(path: Path, runs: int) -> None:
     """Print the correlation kernel's time for one frame pair beside SciPy's and NumPy's."""
     sweep, config = load_sweep(path), Config()
     matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane)
-    fixed, moving = (matcher.prepare(matcher.intensity(sweep.frames[i])) for i in (0, 1))
+    fixed, moving = (matcher.prepare(matcher.echo(sweep.frames[i])) for i in (0, 1))
     ways = {"this package": by_kernel, "numpy, lag by lag": by_numpy, "scipy.signal.correlate": by_scipy}
     values = {name: way(fixed, moving, matcher.patches) for name, way in ways.items()}
     ours = values["this package"]

@@ -54,7 +54,7 @@ def steps():
 def test_motion_is_found_in_log_compressed_images_too(steps):
     sweep, places = steps
     matcher = matcher_of(sweep)
-    ready = [matcher.prepare(matcher.intensity(sweep.frames[i])) for i in range(3)]
+    ready = [matcher.prepare(matcher.echo(sweep.frames[i])) for i in range(3)]
     one, two = (matcher.match(a, b, matcher.search(a, b)) for a, b in pairwise(ready))
     both = matcher.match(ready[0], ready[2], compose(one.motion, two.motion))
     # Grey levels of 0.24 dB and a clipped bottom cost next to nothing.

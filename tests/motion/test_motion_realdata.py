@@ -36,7 +36,7 @@ def recording(request, realdata):
 
 
 def ready(matcher, frame):
-    return matcher.prepare(matcher.intensity(frame))
+    return matcher.prepare(matcher.echo(frame))
 
 
 @pytest.mark.parametrize(("vectors", "steps"), [(0, 0), (2, 10), (-3, -15), (5, 31), (1, -40)])
