@@ -15,7 +15,7 @@ from speckle3d.core.geometry import FloatArray, mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.streams import BoolArray
 from speckle3d.direction import sensed_orientation, settle_direction
-from speckle3d.motion.coherence import Coherence, estimate_coherence
+from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence
 from speckle3d.motion.distances import EchoModel, PatchDistances
 from speckle3d.motion.patches import IntArray
 from speckle3d.motion.planes import PairPlane
@@ -27,8 +27,6 @@ from speckle3d.walk import StageTimes, Walk
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 SINK_PAIRS = 1024
-PHANTOM_SCALE_SIGMA = 0.005
-"""Relative error of distances even on a phantom: the curves' own, from sweeps of known length."""
 ADAPTED_ERROR = 0.1
 """Relative error of distances where coherence has been adapted to, for the choice of signs."""
 MOST_UNRELIABLE = 0.3
@@ -212,7 +210,7 @@ class Solution:
         return weigh_slopes(
             [self._walk.fitter.design(self._moved(m.row)) for m in measured],
             [m.plane for m in measured],
-            max(PHANTOM_SCALE_SIGMA, coherence.scale_sigma if coherence is not None else 0.0),
+            CURVES_SIGMA if coherence is None else coherence.scale_sigma,
             float(np.deg2rad(self._config.planes.turn_deg_per_mm)),
         )
 

@@ -17,6 +17,7 @@ _variance = njit(correlation_variance)
 NO_GAIN = -1.0
 """In place of a length of coherent structure: neither structure nor noise, so that the gain is one."""
 _ROUNDS = 8
+_SETTLED = 2e-3
 _VARIANCE_FLOOR = 1e-3
 """Variance of a correlation that no number of cells removes: what the model itself leaves out."""
 
@@ -148,7 +149,10 @@ def fit_echo_models(
                         if not coherent:
                             cc, cg, rc = 1.0, 0.0, 0.0
                         determinant = cc * gg - cg * cg
-                        share = min(max(share + 0.8 * (gg * rc - cg * rg) / determinant, 0.0), 0.97)
-                        gain = min(max(gain + 0.8 * (cc * rg - cg * rc) / determinant, 0.1), 1.03)
+                        new_share = min(max(share + 0.8 * (gg * rc - cg * rg) / determinant, 0.0), 0.97)
+                        new_gain = min(max(gain + 0.8 * (cc * rg - cg * rc) / determinant, 0.1), 1.03)
+                        if abs(new_share - share) + abs(new_gain - gain) < _SETTLED:
+                            break
+                        share, gain = new_share, new_gain
                     cost[s, p, k, j] = total
                     found[s, p, k, j, 0], found[s, p, k, j, 1] = share, gain

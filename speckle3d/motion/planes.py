@@ -48,7 +48,7 @@ class PlaneSettings(BaseModel):
         1.0, gt=0, description="Threshold of the orientation-consistent subset, standard deviations."
     )
     turn_deg_per_mm: float = Field(
-        0.04,
+        0.05,
         gt=0,
         description="Yaw and tilt per distance that sweeps are expected to have, standard deviation; what "
         "images see of them is believed as far as it is more certain than this.",

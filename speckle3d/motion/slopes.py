@@ -17,6 +17,8 @@ from speckle3d.motion.planes import PairPlane
 
 NEAR_MM = 0.1
 """Frames nearer than this may turn as if they were this far apart: a hand trembles in place."""
+UNEVENNESS = 0.5
+"""Variation of the error of distances over the image against its mean; measured on simulated sweeps."""
 BEYOND_DOUBT = 2.0
 """Deviations at which a turn is taken for deliberate, however large it is."""
 
@@ -72,7 +74,7 @@ def weigh_slopes(
     for plane in planes:
         weight += np.nan_to_num(1.0 / plane.sigma_mm**2)
     lever = np.array([_deviation(designs[0][:, k], weight) for k in (1, 2)])
-    false = scale_sigma / np.maximum(lever, 1e-6)
+    false = UNEVENNESS * scale_sigma / np.maximum(lever, 1e-6)
     travelled = np.maximum((coefficients[:, 0] ** 2).sum(), 1e-12)
     seen = (coefficients[:, 1:] * coefficients[:, :1]).sum(axis=0) / travelled
     expected = np.maximum(expected_per_mm**2, seen**2 - (BEYOND_DOUBT * false) ** 2)
