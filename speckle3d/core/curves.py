@@ -23,6 +23,12 @@ class CurveKey:
     equalise_mm: float
     correlation_of: str = "intensity"
 
+    def __post_init__(self) -> None:
+        if self.correlation_of not in ("echo", "intensity"):
+            raise InvalidInputError(
+                f"correlation_of: expected 'echo' or 'intensity', got {self.correlation_of!r}"
+            )
+
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         for name, mine, theirs in _differing(self, other):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import speckle
 
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings
 
@@ -43,6 +43,14 @@ def test_rf_and_bmode_are_never_the_same():
         replace(speckle.KEY, signal=BMODE).require_same(replace(speckle.KEY, signal=BModeSettings(70.0)))
 
 
+@pytest.mark.parametrize(("mine", "theirs"), [("intensity", "echo"), ("echo", "intensity")])
+def test_intensity_and_echo_are_never_mixed(mine, theirs):
+    a, b = (replace(speckle.KEY, correlation_of=of) for of in (mine, theirs))
+    a.require_same(a)
+    with pytest.raises(MismatchError, match=f"correlation_of is {mine} and {theirs}"):
+        a.require_same(b)
+
+
 def test_rounding_of_a_header_is_no_difference():
     rounded = replace(
         speckle.KEY,
@@ -69,6 +77,32 @@ def test_between_two_depths_the_width_lies_between():
 def test_cells_are_interpolated_too():
     made = replace(speckle.curves(depth_mm=(10.0, 20.0)), cells=np.array([20.0, 40.0]))
     assert made.at(np.array([12.5])).cells.tolist() == [25.0]
+
+
+def tilted(pivot=(-8.0, 8.0), spread=(2.0, 6.0)):
+    made = speckle.curves(depth_mm=(10.0, 20.0))
+    return replace(made, tilt=TiltResponse(np.array(pivot), np.array(spread)))
+
+
+def test_the_response_to_tilt_is_interpolated_with_the_curves():
+    at = tilted().at(np.array([10.0, 12.5, 20.0, 30.0])).tilt
+    np.testing.assert_allclose(at.pivot_mm, [-8.0, -4.0, 8.0, 8.0])
+    np.testing.assert_allclose(at.spread_mm, [2.0, 3.0, 6.0, 6.0])
+    assert speckle.curves().at(np.array([12.5])).tilt is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pivot": (1.0,)}, "pivot_mm: expected a finite number for each depth"),
+        ({"pivot": (1.0, np.nan)}, "pivot_mm: expected a finite number for each depth"),
+        ({"spread": (1.0, 2.0, 3.0)}, "spread_mm: expected a finite number for each depth"),
+        ({"spread": (np.inf, 2.0)}, "spread_mm: expected a finite number for each depth"),
+    ],
+)
+def test_a_response_to_tilt_that_cannot_be_is_refused(changes, message):
+    with pytest.raises(InvalidInputError, match=message):
+        tilted(**changes)
 
 
 def spoiled(**changes):

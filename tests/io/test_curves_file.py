@@ -7,6 +7,7 @@ import speckle
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from speckle3d.core.curves import TiltResponse
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.curves import read_curves, write_curves
@@ -14,22 +15,43 @@ from speckle3d.io.curves import read_curves, write_curves
 ARRAYS = ("depth_mm", "distance_mm", "correlation", "cells")
 
 
+TILT = ("pivot_mm", "spread_mm")
+
+
+def made(signal=speckle.RF, of="intensity", turned=False):
+    tilt = TiltResponse(np.array([-7.5, 11.0]), np.array([1.5, 7.25])) if turned else None
+    key = replace(speckle.KEY, signal=signal, correlation_of=of)
+    return replace(speckle.curves(sigma_mm=[0.3, 0.6]), key=key, pairs_used=4321, tilt=tilt)
+
+
 @pytest.fixture
 def path(tmp_path):
-    write_curves(tmp_path / "curves.h5", speckle.curves(sigma_mm=[0.3, 0.6]))
+    write_curves(tmp_path / "curves.h5", made(turned=True))
     return tmp_path / "curves.h5"
 
 
-@pytest.mark.parametrize("signal", [speckle.RF, BModeSettings(60.0, 250.0)])
-def test_curves_come_back(tmp_path, signal):
-    made = speckle.curves(sigma_mm=[0.3, 0.6])
-    made = replace(made, key=replace(made.key, signal=signal), pairs_used=4321)
-    write_curves(tmp_path / "c.h5", made)
+@pytest.mark.parametrize("of", ["intensity", "echo"])
+@pytest.mark.parametrize("turned", [False, True], ids=["no tilt", "tilt"])
+@pytest.mark.parametrize("signal", [speckle.RF, BModeSettings(60.0, 250.0)], ids=["rf", "bmode"])
+def test_curves_come_back(tmp_path, signal, turned, of):
+    written = made(signal, of, turned)
+    write_curves(tmp_path / "c.h5", written)
     got = read_curves(tmp_path / "c.h5")
-    assert got.key == made.key
+    assert got.key == written.key
     assert got.pairs_used == 4321
     for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(got, name), getattr(made, name))
+        np.testing.assert_array_equal(getattr(got, name), getattr(written, name))
+    assert (got.tilt is not None) == turned
+    for name in TILT if turned else ():
+        np.testing.assert_array_equal(getattr(got.tilt, name), getattr(written.tilt, name))
+
+
+def test_files_from_before_echoes_were_correlated_hold_intensity(path):
+    with h5py.File(path, "r+") as file:
+        del file.attrs["correlation_of"], file["tilt"]
+    got = read_curves(path)
+    assert got.key.correlation_of == "intensity"
+    assert got.tilt is None
 
 
 def test_nothing_is_left_where_writing_fails(tmp_path):
@@ -47,7 +69,7 @@ def test_an_older_file_stays_whole_when_writing_fails(path):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("name", ARRAYS)
+@pytest.mark.parametrize("name", [*ARRAYS, *(f"tilt/{name}" for name in TILT)])
 def test_a_missing_data_set_is_named(path, name):
     with h5py.File(path, "r+") as file:
         del file[name]
@@ -80,6 +102,10 @@ def test_a_missing_attribute_is_named(path, name):
         ("cells", lambda a: -a, "cells: expected a number above zero"),
         ("cells", lambda a: a[:1], r"/cells: expected shape \(2,\), got \(1,\)"),
         ("cells", lambda a: a.astype("S8"), "/cells: expected numbers"),
+        ("tilt/pivot_mm", lambda a: a[:1], r"/tilt/pivot_mm: expected shape \(2,\), got \(1,\)"),
+        ("tilt/pivot_mm", lambda a: a * np.nan, "pivot_mm: expected a finite"),
+        ("tilt/spread_mm", lambda a: a + np.inf, "spread_mm: expected a finite"),
+        ("tilt/spread_mm", lambda a: a.astype("S8"), "/tilt/spread_mm: expected numbers"),
     ],
 )
 def test_what_is_wrong_is_said_with_the_file(path, name, change, message):
@@ -97,6 +123,8 @@ def test_what_is_wrong_is_said_with_the_file(path, name, change, message):
     ("name", "value", "message"),
     [
         ("signal", "video", "expected 'rf' or 'bmode', got 'video'"),
+        ("correlation_of", "amplitude", "correlation_of: expected 'echo' or 'intensity', got 'ampl"),
+        ("correlation_of", 3.0, "correlation_of"),
         ("format", "speckle3d.sweep", r"expected format 'speckle3d\.curves', got 'speckle3d\.sweep'"),
         ("version", 2, "version 1, got 2"),
         ("sampling_rate_hz", np.nan, "sampling_rate_hz: expected finite"),

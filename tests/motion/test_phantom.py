@@ -59,27 +59,39 @@ def test_the_curve_comes_back(phantom):
 def test_pairs_are_within_reach_and_about_as_many_as_asked(phantom):
     samples = phantom_samples(phantom, matcher_of(phantom), CurveSettings(largest_mm=0.5, pairs=60))
     assert samples.pairs == 60
-    assert samples.distance_mm.max() <= 0.5 + 1e-9
+    assert np.abs(samples.offset_mm).max() <= 0.5 + 1e-9
     every = phantom_samples(phantom, matcher_of(phantom), CurveSettings(largest_mm=0.5, pairs=3000))
     # Thinned, they are spread over separation as all of them are, to half a step.
     quantiles = [0.1, 0.3, 0.5, 0.7, 0.9]
-    spread = [np.quantile(one.distance_mm, quantiles) for one in (samples, every)]
+    spread = [np.quantile(np.abs(one.offset_mm), quantiles) for one in (samples, every)]
     np.testing.assert_allclose(*spread, atol=0.05)
     assert every.pairs > 60
     assert set(samples.depth_mm) == set(matcher_of(phantom).patches.centre_mm[:, 1])
 
 
-def test_distances_are_those_of_the_patches_when_frames_are_tipped(phantom):
-    tilt = 0.01
+def stepped_and_tipped(phantom, step_mm, tilt):
+    """The phantom's first two frames, the second moved and turned about the middle of its depth."""
     about = RigidTransform.from_translation(GRID.centre_mm)
     turn = about * RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [tilt, 0, 0]])) * about.inv()
-    step = RigidTransform.from_translation([[0, 0, 0], [0, 0, 0.3]])
-    two = replace(
+    step = RigidTransform.from_translation([[0, 0, 0], [0, 0, step_mm]])
+    return replace(
         phantom, frames=phantom.frames[:2], frame_time_s=phantom.frame_time_s[:2], truth=step * turn
     )
+
+
+@pytest.mark.parametrize("step_mm", [0.3, -0.3, 0.0])
+@pytest.mark.parametrize("tilt", [0.01, -0.01])
+def test_offsets_and_tilt_are_signed_and_those_of_the_patches(phantom, step_mm, tilt):
+    two = stepped_and_tipped(phantom, step_mm, tilt)
     samples = phantom_samples(two, matcher_of(two), SETTINGS)
-    expected = 0.3 + np.sin(tilt) * (samples.depth_mm - GRID.centre_mm[1])
-    np.testing.assert_allclose(samples.distance_mm, expected, atol=1e-3)
+    expected = step_mm + np.sin(tilt) * (samples.depth_mm - GRID.centre_mm[1])
+    np.testing.assert_allclose(samples.offset_mm, expected, atol=1e-3)
+    np.testing.assert_allclose(samples.tilt_rad, np.sin(tilt), atol=1e-9)
+
+
+def test_frames_that_do_not_turn_have_no_tilt(phantom):
+    samples = phantom_samples(phantom, matcher_of(phantom), SETTINGS)
+    assert np.abs(samples.tilt_rad).max() < 1e-9
 
 
 def test_frames_too_far_apart_or_without_positions_are_refused(phantom):
