@@ -174,3 +174,44 @@ def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
     most = max(count for count, _, _ in tried)
     closest = min(misfit for count, misfit, _ in tried if count == most)
     return [s for count, misfit, s in tried if count == most and misfit <= closest + 1e-9]
+
+
+def patch_coherences(fixed, moving, first, size, shift, ramp_rad, least_overlap, radius):
+    """Twin of `speckle3d.kernels.correlation.patch_coherences`: complex sums sample by sample.
+
+    fixed, moving: complex (vector, sample); radius: (lateral, axial). The ramp is undone on `moving`.
+    Returns (p, 2 * lateral + 1, 2 * axial + 1).
+    """
+    lags = [(i, j) for i in range(-radius[0], radius[0] + 1) for j in range(-radius[1], radius[1] + 1)]
+    out = np.full((len(first), len(lags)), np.nan)
+    for p, (corner, about) in enumerate(zip(first, shift, strict=True)):
+        partners = {}
+        for v, s in np.ndindex(*size):
+            at = corner[0] + v, corner[1] + s
+            theirs = [(at[0] + about[0] + i, at[1] + about[1] + j) for i, j in lags]
+            everyone = [at, *theirs]
+            if all(0 <= a < fixed.shape[0] and 0 <= b < fixed.shape[1] for a, b in everyone):
+                partners[at] = theirs
+        if not partners or len(partners) < least_overlap * size[0] * size[1]:
+            continue
+        a = np.array([fixed[at] for at in partners], complex)
+        turn = np.exp(1j * np.array([v * ramp_rad[0] + s * ramp_rad[1] for v, s in partners]))
+        for n in range(len(lags)):
+            b = np.array([moving[theirs[n]] for theirs in partners.values()], complex) * turn
+            energy = np.vdot(a, a).real * np.vdot(b, b).real
+            if energy > 0:
+                out[p, n] = np.abs(np.vdot(a, b)) ** 2 / energy
+    return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
+
+
+def bin_by_distance(rho, offset_mm, slope, lateral_mm, edges_mm):
+    """Twin of `speckle3d.kernels.coherence.bin_by_distance`: every bin picks its pairs by a mask."""
+    d = np.abs(offset_mm[:, None] + slope[:, None] * lateral_mm)
+    edges = np.append(edges_mm[:-1], np.inf)
+    out = np.zeros((rho.shape[1], len(edges_mm) - 1, 4))
+    for b in range(len(edges_mm) - 1):
+        for p in range(rho.shape[1]):
+            one = np.isfinite(rho[:, p]) & (d[:, p] >= edges[b]) & (d[:, p] < edges[b + 1])
+            r = rho[one, p].astype(float)
+            out[p, b] = [one.sum(), d[one, p].sum(), r.sum(), (r**2).sum()]
+    return out
