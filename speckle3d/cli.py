@@ -227,11 +227,8 @@ def reconstruct(
         return
     _emit(result.table)
     details = result.summary.details
-    if bad := details["unreliable_frames"]:
-        listed = ", ".join(str(frame) for frame in bad[:8]) + (" ..." if len(bad) > 8 else "")
-        _note(
-            f"frames {listed} share too little speckle with any earlier one: lengths across them are guesses"
-        )
+    for line in details["flagged_frames"]:
+        _note(f"{line}: poses there are guesses")
     if 0 < result.summary.coverage < 1:
         _note(f"compared over the {100 * result.summary.coverage:.0f} % of frames that have a reference")
     rejected = details["rejected_patch_share"]

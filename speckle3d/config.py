@@ -20,7 +20,8 @@ from speckle3d.motion.intensity import IntensitySettings
 from speckle3d.motion.matching import MatchingSettings
 from speckle3d.motion.patches import PatchSettings
 from speckle3d.motion.planes import PlaneSettings
-from speckle3d.motion.trajectory import TrajectorySettings
+from speckle3d.motion.quality import QualitySettings
+from speckle3d.motion.schedule import TrajectorySettings
 
 
 class SensorSettings(BaseModel):
@@ -56,6 +57,7 @@ class Config(BaseModel):
     curves: CurveSettings = CurveSettings()
     coherence: CoherenceSettings = CoherenceSettings()
     planes: PlaneSettings = PlaneSettings()
+    quality: QualitySettings = QualitySettings()
     trajectory: TrajectorySettings = TrajectorySettings()
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()

@@ -50,7 +50,7 @@ def track(
     matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane, settings.matching)
     curves.key.require_same(matcher.key)
     walk = Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
-    for frame, ready in enumerate(prefetch(sweep, matcher, walk.times, images)):
+    for frame, ready in enumerate(prefetch(walk, images)):
         walk.advance(frame, ready)
         if progress:
             progress(frame + 1, len(sweep))

@@ -19,18 +19,29 @@ from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coheren
 from speckle3d.motion.distances import EchoModel, PatchDistances
 from speckle3d.motion.patches import IntArray
 from speckle3d.motion.planes import PairPlane
+from speckle3d.motion.quality import FrameFlag, describe, flag_frames
 from speckle3d.motion.signs import SignResolver, pair_signs
 from speckle3d.motion.subset import consistent_subset
 from speckle3d.motion.slopes import SlopeEvidence, weigh_slopes
-from speckle3d.motion.trajectory import PairMeasurement, SignedPair, sign_pair, solve_trajectory
+from speckle3d.motion.trajectory import (
+    RelativePoses,
+    Trajectory,
+    held,
+    joined,
+    relative_poses_of,
+    solve_trajectory,
+)
+from speckle3d.motion.uncertainty import pose_covariance
+from speckle3d.revisit import find_revisits
 from speckle3d.walk import StageTimes, Walk
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 SINK_PAIRS = 1024
 ADAPTED_ERROR = 0.1
 """Relative error of distances where coherence has been adapted to, for the choice of signs."""
-MOST_UNRELIABLE = 0.3
-"""Share of frames that may lack a reliable neighbour; with more, lengths are mostly guesses."""
+MOST_LOST = 0.3
+"""Share of frames that may not be placed; with more, lengths are mostly guesses."""
+MIRROR = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -41,12 +52,14 @@ class Tracked:
     ----------
     image : RigidTransform, length n
         Poses from all patches.
+    covariance : ndarray, shape (n, 6, 6)
+        Of `image`; see `speckle3d.motion.uncertainty`.
     subset : RigidTransform, length n, or None
         Poses from the orientation-consistent patches.
     rejected_share : float
         Share of measured patches outside the consistent subset; NaN without one.
-    unreliable : ndarray of int
-        Frames that no reliable pair joins to an earlier one.
+    flags : ndarray of int, shape (n,)
+        `FrameFlag` of every frame; zero for those to be trusted.
     direction_from : str
         What settled the sign of the elevational motion.
     coherence : Coherence or None
@@ -56,9 +69,10 @@ class Tracked:
     """
 
     image: RigidTransform
+    covariance: FloatArray
     subset: RigidTransform | None
     rejected_share: float
-    unreliable: tuple[int, ...]
+    flags: IntArray
     pairs: int
     direction: int
     direction_from: str
@@ -74,8 +88,15 @@ class Solution:
         self._walk, self._config, self._curves = walk, walk.config, curves
         self._estimator, self._matcher = walk.estimator, walk.matcher
         self._frames = len(walk.sweep)
-        self._first, self._second = walk.table.first, walk.table.second
-        self._rho = walk.table.correlation
+        self._flags = flag_frames(walk.features, walk.config.quality)
+        self._flags[walk.unmatched] |= FrameFlag.UNMATCHED
+        self._take_table()
+
+    def _take_table(self) -> None:
+        table = self._walk.table
+        self._first, self._second, self._rho = table.first, table.second, table.correlation
+        bad = (self._flags & ~FrameFlag.UNMATCHED) != 0
+        self._sound = ~bad[self._first] & ~bad[self._second]
 
     def solve(self, sink: PairSink | None) -> Tracked:
         """Trajectories from all usable pairs.
@@ -83,41 +104,53 @@ class Solution:
         Raises
         ------
         InsufficientDataError
-            If most frames share too little speckle with any other.
+            If too many frames cannot be placed.
         """
         walk = self._walk
-        if len(walk.unreliable) > MOST_UNRELIABLE * self._frames:
-            raise InsufficientDataError(
-                f"{walk.sweep.name}: expected neighbouring frames to share speckle, got "
-                f"{len(walk.unreliable)} of {self._frames} frames that share too little with any earlier one"
-            )
+        self._require_enough()
         measured, coherence = self._adapted()
+        measured = self._with_revisits(measured, coherence)
         then = time.perf_counter()
         slopes = self._evidence(measured, coherence)
-        pairs = [self._signed(m, slopes.applied(m.plane)) for m in measured]
-        image = self._trajectory(pairs)
+        pairs = self._edges(measured, [slopes.applied(m.plane) for m in measured])
+        trajectory = self._trajectory(pairs, with_covariance=True)
+        image = trajectory.poses
         direction, source = settle_direction(walk.sweep, image, self._config)
+        scale_sigma = CURVES_SIGMA if coherence is None else coherence.scale_sigma
+        covariance = pose_covariance(
+            image, trajectory.covariance, self._matcher.centre_mm, scale_sigma, slopes
+        )
         walk.times.add("trajectory", then)
         subset, used = self._consistent(measured, direction)
         if direction < 0:
             image, subset = mirrored(image), mirrored(subset) if subset is not None else None
+            covariance = MIRROR @ covariance @ MIRROR
         if sink:
-            for start in range(0, len(pairs), SINK_PAIRS):
+            for start in range(0, len(measured), SINK_PAIRS):
                 some = slice(start, start + SINK_PAIRS)
-                sink(self._rows(measured[some], pairs[some], used[some], direction))
-        rejected = sum(int((m.known & ~u).sum()) for m, u in zip(measured, used, strict=True))
+                sink(self._rows(measured[some], pairs, some, used[some], direction))
+        rejected = sum(int((m.plane.used & ~u).sum()) for m, u in zip(measured, used, strict=True))
         return Tracked(
             image,
+            covariance,
             subset,
-            rejected / sum(int(m.known.sum()) for m in measured) if subset is not None else float("nan"),
-            tuple(walk.unreliable),
-            len(pairs),
+            rejected / sum(int(m.plane.used.sum()) for m in measured) if subset is not None else float("nan"),
+            self._flags,
+            len(measured),
             direction,
             source,
             coherence,
             slopes,
             walk.times,
         )
+
+    def _require_enough(self) -> None:
+        lost = int((self._flags != 0).sum())
+        if lost > MOST_LOST * self._frames:
+            raise InsufficientDataError(
+                f"{self._walk.sweep.name}: expected frames with speckle in common, got {lost} of "
+                f"{self._frames} that cannot be placed: {'; '.join(describe(self._flags))}"
+            )
 
     def _adapted(self) -> tuple[list[_Measured], Coherence | None]:
         """Signed planes of all usable pairs, read with what the sweep itself says of its echoes.
@@ -130,9 +163,9 @@ class Solution:
         for known_scale in (False, True):
             then = time.perf_counter()
             coherence, path = estimate_coherence(
-                self._first,
-                self._second,
-                self._rho,
+                self._first[self._sound],
+                self._second[self._sound],
+                self._rho[self._sound],
                 path,
                 self._curves,
                 self._matcher.patches,
@@ -142,10 +175,7 @@ class Solution:
             )
             self._walk.times.add("coherence", then)
             measured = self._measure(path, coherence)
-            slopes = self._evidence(measured, coherence)
-            path = self._path_of(
-                self._trajectory([self._signed(m, slopes.applied(m.plane)) for m in measured])
-            )
+            path = self._path(measured, coherence)
         return measured, coherence
 
     def _measure(self, path: FloatArray, coherence: Coherence | None) -> list[_Measured]:
@@ -153,35 +183,36 @@ class Solution:
         then = time.perf_counter()
         chosen = self._choose(path[:, 0])
         first, second = self._first[chosen], self._second[chosen]
+        apart = path[second, 0] - path[first, 0]
         models: Sequence[EchoModel | None] = [None] * chosen.size
         if coherence is not None:
-            models = coherence.models((first + second) / 2, path[second, 0] - path[first, 0])
+            models = coherence.models((first + second) / 2, apart)
         found = []
-        for row, i, j, model in zip(chosen, first, second, models, strict=True):
+        for row, i, j, model, d in zip(chosen, first, second, models, apart, strict=True):
             rho = self._rho[row].astype(float)
-            plane = self._walk.fitter.fit(rho, self._moved(row), model)
+            plane = self._walk.fitter.fit(rho, self._moved(row), model, start_mm=abs(float(d)))
             if plane is not None:
-                found.append(_Measured(row, int(i), int(j), model, plane, self._estimator.distances(rho, model)))
+                found.append(_Measured(int(row), int(i), int(j), model, plane))
         signs = self._signs(found, ADAPTED_ERROR if coherence is not None else None)
         self._walk.times.add("distances and planes", then)
-        return [replace(m, sign=sign) for m, sign in zip(found, signs, strict=True)]
+        return [replace(m, sign=float(sign)) for m, sign in zip(found, signs, strict=True)]
 
     def _choose(self, position_mm: FloatArray) -> IntArray:
         """Pairs near enough to tell a distance: what would be left of fully developed speckle is enough."""
         least = self._config.trajectory.least_correlation
         distance = np.abs(position_mm[self._second] - position_mm[self._first])
         left = np.array([np.median(self._estimator.fully_developed(d)) for d in distance])
-        near = left >= least
+        near = (left >= least) & self._sound
         # Every frame keeps its nearest pair, however little it tells.
-        for frame in np.setdiff1d(np.arange(1, len(position_mm)), self._second[near]):
-            rows = np.flatnonzero(self._second == frame)
+        for frame in np.setdiff1d(self._second[self._sound], self._second[near]):
+            rows = np.flatnonzero((self._second == frame) & self._sound)
             near[rows[np.argmax(left[rows])]] = True
         return np.flatnonzero(near)
 
     def _signs(self, measured: list[_Measured], relative_error: float | None) -> FloatArray:
         resolver = SignResolver(self._frames, *([] if relative_error is None else [relative_error]))
-        start = 0
         second = np.array([m.second for m in measured])
+        start = 0
         while start < len(measured):
             stop = int(np.searchsorted(second, second[start], side="right"))
             some = measured[start:stop]
@@ -190,25 +221,62 @@ class Solution:
         first = np.array([m.first for m in measured])
         return pair_signs(resolver.path, first, second, [m.plane for m in measured])
 
+    def _with_revisits(self, measured: list[_Measured], coherence: Coherence | None) -> list[_Measured]:
+        """Add pairs of frames from different visits of the same tissue, if the sweep comes back to any."""
+        then = time.perf_counter()
+        path = self._path(measured, coherence)
+        rows = len(self._walk.table)
+        revisits = [
+            r
+            for r in find_revisits(self._walk, path[:, 0], coherence)
+            if not self._flags[r.first] and not self._flags[r.second]
+        ]
+        for r in revisits:
+            self._walk.table.append(r.first, r.second, r.match)
+        self._take_table()
+        for row, r in enumerate(revisits, start=rows):
+            model = None
+            if coherence is not None:
+                apart = path[[r.second], 0] - path[[r.first], 0]
+                model = coherence.models(np.array([(r.first + r.second) / 2]), np.minimum(apart, 0.5))[0]
+            plane = self._walk.fitter.fit(self._rho[row].astype(float), self._moved(row), model)
+            if plane is not None:
+                measured = [*measured, _Measured(row, r.first, r.second, model, plane, r.sign)]
+        self._walk.times.add("revisits", then)
+        return sorted(measured, key=lambda m: (m.second, m.first))
+
     def _moved(self, row: int) -> FloatArray:
         motion = self._walk.table.motion(row)
         return np.array([motion.x_mm, motion.y_mm])
 
-    def _signed(self, measured: _Measured, plane: PairPlane) -> SignedPair:
-        motion = self._walk.table.motion(measured.row)
-        return sign_pair(PairMeasurement(measured.first, measured.second, motion, plane), measured.sign)
+    def _edges(self, measured: list[_Measured], planes: Sequence[PairPlane]) -> RelativePoses:
+        motions = [self._walk.table.motion(m.row) for m in measured]
+        return relative_poses_of(
+            [m.first for m in measured],
+            [m.second for m in measured],
+            motions,
+            planes,
+            [m.sign for m in measured],
+        )
 
-    def _trajectory(self, pairs: list[SignedPair]) -> RigidTransform:
-        return solve_trajectory(pairs, self._frames, self._matcher.centre_mm, self._config.trajectory)
+    def _trajectory(self, pairs: RelativePoses, with_covariance: bool = False) -> Trajectory:
+        lone = np.setdiff1d(np.arange(1, self._frames), pairs.second)
+        after = lone[lone + 1 < self._frames]
+        self._flags[lone[self._flags[lone] == 0]] |= FrameFlag.UNMATCHED
+        edges = joined(pairs, held(np.concatenate([lone - 1, after]), np.concatenate([lone, after + 1])))
+        return solve_trajectory(
+            edges, self._frames, self._matcher.centre_mm, self._config.trajectory, with_covariance
+        )
 
-    def _path_of(self, poses: RigidTransform) -> FloatArray:
+    def _path(self, measured: list[_Measured], coherence: Coherence | None) -> FloatArray:
         """Elevational position of the image's centre and slope along x of every frame."""
-        centre = self._matcher.centre_mm
+        slopes, centre = self._evidence(measured, coherence), self._matcher.centre_mm
+        poses = self._trajectory(self._edges(measured, [slopes.applied(m.plane) for m in measured])).poses
         return np.column_stack([poses.apply(centre)[:, 2], poses.rotation.as_matrix()[:, 2, 0]])
 
     def _evidence(self, measured: list[_Measured], coherence: Coherence | None) -> SlopeEvidence:
         return weigh_slopes(
-            [self._walk.fitter.design(self._moved(m.row)) for m in measured],
+            self._walk.fitter.design(np.zeros(2)),
             [m.plane for m in measured],
             CURVES_SIGMA if coherence is None else coherence.scale_sigma,
             float(np.deg2rad(self._config.planes.turn_deg_per_mm)),
@@ -223,33 +291,44 @@ class Solution:
             return None, [m.plane.used for m in measured]
         then = time.perf_counter()
         planes = []
-        for m in measured:
-            relative = (sensed[m.first].inv() * sensed[m.second]).as_matrix()
-            slopes = direction * m.sign * relative[2, :2]
-            raised = self._walk.fitter.design(self._moved(m.row))[:, 1:] @ slopes
-            agreed = consistent_subset(m.distances, raised, self._config.planes.support_sigma)
+        first, second = ([getattr(m, name) for m in measured] for name in ("first", "second"))
+        relative = (sensed[first].inv() * sensed[second]).as_matrix()[:, 2, :2]
+        for m, each in zip(measured, relative, strict=True):
+            slopes, moved = direction * m.sign * each, self._moved(m.row)
+            raised = self._walk.fitter.design(moved)[:, 1:] @ slopes
+            distances = self._distances(m)
+            agreed = consistent_subset(distances, raised, self._config.planes.support_sigma)
             rho = self._rho[m.row].astype(float)
-            plane = self._walk.fitter.fit(rho, self._moved(m.row), m.model, agreed.support, slopes)
+            plane = self._walk.fitter.fit(
+                rho, moved, m.model, agreed.support, slopes, start_mm=m.plane.offset_mm
+            )
             planes.append(plane or m.plane)
         self._walk.times.add("distances and planes", then)
-        pairs = [self._signed(m, plane) for m, plane in zip(measured, planes, strict=True)]
-        return self._trajectory(pairs), [plane.used for plane in planes]
+        return self._trajectory(self._edges(measured, planes)).poses, [plane.used for plane in planes]
+
+    def _distances(self, measured: _Measured) -> PatchDistances:
+        return self._estimator.distances(self._rho[measured.row].astype(float), measured.model)
 
     def _rows(
-        self, measured: list[_Measured], signed: list[SignedPair], used: list[BoolArray], direction: int
+        self,
+        measured: list[_Measured],
+        pairs: RelativePoses,
+        some: slice,
+        used: list[BoolArray],
+        direction: int,
     ) -> FramePairs:
         """Rows for the reconstruction file."""
         centre = RigidTransform.from_translation(self._matcher.centre_mm)
-        poses = RigidTransform.concatenate([centre * s.pose * centre.inv() for s in signed])
-        turn = np.diag([1.0, 1.0, direction, direction, direction, 1.0])
         flip = np.diag([1.0, 1.0, direction, 1.0])
+        turn = np.diag([1.0, 1.0, direction, direction, direction, 1.0])
+        distances = [self._distances(m) for m in measured]
         return FramePairs(
-            first=np.array([s.first for s in signed]),
-            second=np.array([s.second for s in signed]),
-            first_from_second=flip @ poses.as_matrix() @ flip,
-            covariance=np.array([turn @ s.covariance @ turn for s in signed]),
-            distance_mm=np.array([m.distances.distance_mm for m in measured], dtype=np.float32),
-            sigma_mm=np.array([m.distances.sigma_mm for m in measured], dtype=np.float32),
+            first=pairs.first[some],
+            second=pairs.second[some],
+            first_from_second=flip @ (centre * pairs.poses[some] * centre.inv()).as_matrix() @ flip,
+            covariance=turn @ pairs.covariance[some] @ turn,
+            distance_mm=np.array([d.distance_mm for d in distances], dtype=np.float32),
+            sigma_mm=np.array([d.sigma_mm for d in distances], dtype=np.float32),
             used=np.array(used),
             patch_centre_mm=self._matcher.patches.centre_mm,
         )
@@ -264,10 +343,4 @@ class _Measured:
     second: int
     model: EchoModel | None
     plane: PairPlane
-    distances: PatchDistances
     sign: float = 1.0
-
-    @property
-    def known(self) -> BoolArray:
-        """Patches that hold a distance."""
-        return np.isfinite(self.distances.distance_mm)

@@ -18,9 +18,10 @@ from speckle3d.motion.inplane import InPlaneMotion, PatchMatch
 from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.motion.planes import PlaneFitter
+from speckle3d.motion.quality import FrameFeatures, FrameInspector
 from speckle3d.motion.signs import SignResolver
 from speckle3d.motion.table import CorrelationTable
-from speckle3d.motion.trajectory import PairSchedule
+from speckle3d.motion.schedule import PairSchedule
 
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
@@ -49,7 +50,8 @@ class Walk:
         self.times = StageTimes()
         self.table = CorrelationTable(len(matcher.patches))
         self.fitter = PlaneFitter(estimator, matcher.at_mm, config.planes)
-        self.unreliable: list[int] = []
+        self.unmatched: list[int] = []
+        self.features: list[FrameFeatures] = []
         self._schedule = PairSchedule(config.trajectory)
         self._signs = SignResolver(len(sweep))
         self._ready: dict[int, ReadyFrame] = {}
@@ -90,7 +92,7 @@ class Walk:
         near = [first for first, rho in correlations.items() if rho >= least]
         if not near:
             near = [max(correlations, key=lambda first: correlations[first])]
-            self.unreliable.append(frame)
+            self.unmatched.append(frame)
         planes = {}
         for first in near:
             motion = matches[first].motion
@@ -108,16 +110,17 @@ class Walk:
         self.times.add("distances and planes", then)
 
 
-def prefetch(
-    sweep: Sweep, matcher: FrameMatcher, times: StageTimes, images: ImageSink | None, ahead: int = 3
-) -> Iterator[ReadyFrame]:
-    """Frames made ready, a few ahead of their use, on a thread of their own."""
+def prefetch(walk: Walk, images: ImageSink | None, ahead: int = 3) -> Iterator[ReadyFrame]:
+    """Frames made ready, a few ahead of their use, on a thread of their own; their features go to the walk."""
+    sweep, matcher, times = walk.sweep, walk.matcher, walk.times
+    inspector = FrameInspector(sweep.signal, matcher.patches, walk.config.quality)
 
     def make(index: int) -> ReadyFrame:
         then = time.perf_counter()
         frame = sweep.frames[index]
         then = times.add("reading", then)
         echo = matcher.echo(frame)
+        walk.features.append(inspector.inspect(frame, echo.intensity))
         if images:
             images(index, echo.intensity)
         ready = matcher.prepare(echo)

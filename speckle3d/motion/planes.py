@@ -24,12 +24,17 @@ from speckle3d.motion.distances import DistanceEstimator, EchoModel
 
 CROSSING_EVIDENCE = 6.0
 """Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
+OUTLYING = 9.0
+"""Squared deviations beyond which a patch speaks no more against a plane. On the line where frames cross,
+correlation is known to a few thousandths; one patch there that lost it would outvote all others."""
 LOOSE_SLOPE = 0.05
 """Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
 SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 ROUNDS = 12
 LEAST_PATCHES = 6
+NEAR_MM, LOST_MM = 0.02, 0.5
+"""Where fits start at the least, correlation being flat at zero, and for frames without common speckle."""
 
 
 class PlaneSettings(BaseModel):
@@ -123,6 +128,7 @@ class PlaneFitter:
         model: EchoModel | None = None,
         subset: BoolArray | None = None,
         slopes: FloatArray | None = None,
+        start_mm: float | None = None,
     ) -> PairPlane | None:
         """Robust maximum likelihood; None if fewer than six patches can take part.
 
@@ -135,6 +141,8 @@ class PlaneFitter:
             Patches allowed to take part.
         slopes : ndarray, shape (2,), optional
             b and c as a sensor has them. The plane's sign is then theirs, and a may be negative.
+        start_mm : float, optional
+            About how far apart the frames are, if it is known.
         """
         used = np.isfinite(correlation) if subset is None else np.isfinite(correlation) & subset
         if used.sum() < LEAST_PATCHES:
@@ -142,8 +150,9 @@ class PlaneFitter:
         rho = np.where(used, correlation, np.nan).astype(float)
         model = model or EchoModel.fully_developed(rho.size)
         echo, design = model.table(), self.design(moved_mm)
+        middle = self._middle(rho, model) if start_mm is None else max(start_mm, NEAR_MM)
         best, least = np.zeros(3), np.inf
-        for number, (start, prior, precision) in enumerate(self._starts(rho, model, design, used, slopes)):
+        for number, (start, prior, precision) in enumerate(self._starts(middle, design, used, slopes)):
             plane = start.copy()
             information, standard, sensitivity = np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size)
             cost = fit_correlation_plane(
@@ -164,27 +173,30 @@ class PlaneFitter:
                 standard,
                 sensitivity,
             )
-            if cost + (CROSSING_EVIDENCE if number else 0.0) < least:
-                best, least, normal = plane, cost, information
+            misfit = float(np.nansum(np.minimum(standard**2, OUTLYING)))
+            misfit += CROSSING_EVIDENCE if number else 0.0
+            if misfit < least:
+                best, least, total, normal = plane, misfit, cost, information
                 sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan)
                 excess = -standard * sigma
-        covariance = np.linalg.inv(normal) * max(1.0, least / max(int(used.sum()) - 3, 1))
+        covariance = np.linalg.inv(normal) * max(1.0, total / max(int(used.sum()) - 3, 1))
         covariance[0, 0] += self.settings.bias_mm**2
         if best[0] < 0 and slopes is None:
             best = -best
         return PairPlane(float(best[0]), float(best[1]), float(best[2]), covariance, used, excess, sigma)
 
+    def _middle(self, rho: FloatArray, model: EchoModel) -> float:
+        d = self._estimator.distances(rho, model).distance_mm
+        return float(np.nanmedian(d)) if np.isfinite(d).any() else LOST_MM
+
     def _starts(
         self,
-        rho: FloatArray,
-        model: EchoModel,
+        middle: float,
         design: FloatArray,
         used: BoolArray,
         slopes: FloatArray | None,
     ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """Starts with their priors: all patches on one side, then frames that cross within the image."""
-        d = np.abs(self._estimator.distances(rho, model).distance_mm)
-        middle = float(np.nanmedian(d)) if np.isfinite(d).any() else 0.5
         if slopes is not None:
             known, sure = np.array([0.0, *slopes]), np.array([1e-6, SENSED_SLOPE**-2, SENSED_SLOPE**-2])
             return [(np.array([side * middle, *slopes]), known, sure) for side in (1.0, -1.0)]

@@ -53,7 +53,7 @@ class SlopeEvidence:
 
 
 def weigh_slopes(
-    designs: Sequence[FloatArray],
+    design: FloatArray,
     planes: Sequence[PairPlane],
     scale_sigma: float,
     expected_per_mm: float,
@@ -62,18 +62,18 @@ def weigh_slopes(
 
     Parameters
     ----------
-    designs : sequence of ndarray, shape (p, 3)
-        What each plane's coefficients are multiplied by.
+    design : ndarray, shape (p, 3)
+        What the planes' coefficients are multiplied by.
     scale_sigma : float
         Relative standard deviation of the scale of distances.
     expected_per_mm : float
         Slope per distance that sweeps have, standard deviation, rad/mm.
     """
     coefficients = np.array([plane.coefficients for plane in planes])
-    weight = np.zeros(designs[0].shape[0])
+    weight = np.zeros(design.shape[0])
     for plane in planes:
         weight += np.nan_to_num(1.0 / plane.sigma_mm**2)
-    lever = np.array([_deviation(designs[0][:, k], weight) for k in (1, 2)])
+    lever = np.array([_deviation(design[:, k], weight) for k in (1, 2)])
     false = UNEVENNESS * scale_sigma / np.maximum(lever, 1e-6)
     travelled = np.maximum((coefficients[:, 0] ** 2).sum(), 1e-12)
     seen = (coefficients[:, 1:] * coefficients[:, :1]).sum(axis=0) / travelled

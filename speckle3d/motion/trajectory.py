@@ -1,13 +1,11 @@
-"""Frame pairs to poses: which pairs to measure, and the least-squares trajectory of all of them."""
+"""From frame pairs to the poses of all frames: robust least squares on the graph of relative poses."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
@@ -15,115 +13,109 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles, skew
 from speckle3d.motion.inplane import InPlaneMotion
+from speckle3d.motion.patches import IntArray
 from speckle3d.motion.planes import PairPlane
+from speckle3d.motion.schedule import TrajectorySettings
 
-class TrajectorySettings(BaseModel):
-    """Which frame pairs are measured and how they are joined."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    recent: int = Field(2, ge=1, description="Frames just before each frame that it is measured against.")
-    key_frames: int = Field(4, ge=1, description="Key frames before each frame that it is measured against.")
-    far_key_frames: int = Field(
-        4, ge=0, description="Older key frames that every other frame is measured against, to see what stays."
-    )
-    key_correlation: float = Field(
-        0.9,
-        gt=0,
-        lt=1,
-        description="A frame becomes a key frame when its median correlation with the last is less.",
-    )
-    least_correlation: float = Field(
-        0.2,
-        gt=0,
-        lt=1,
-        description="Least median correlation that a pair must have, and that speckle at its distance would, "
-        "to be used.",
-    )
-    huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
-    join: Literal["graph", "chain"] = Field(
-        "graph",
-        description="graph: least squares over all pairs. chain: each frame by the one earlier frame that "
-        "tells its distance best, for comparison.",
-    )
+SETTLED = 1e-7
+ROUNDS = 6
+HELD_MM, HELD_RAD = 1.0, 0.05
+"""How far a probe may go between two frames: 25 mm and 70 degrees in a second at 25 frames."""
+KNOWN_FRAMES = 80
+"""Frames whose covariance is computed; those of the others are interpolated."""
 
 
 @dataclass(frozen=True)
-class PairMeasurement:
-    """One frame pair: in-plane motion and unsigned plane."""
+class RelativePoses:
+    """Edges of the graph: the second frame's pose in the first, about the image's centre.
 
-    first: int
-    second: int
-    motion: InPlaneMotion
-    plane: PairPlane
+    Attributes
+    ----------
+    first, second : ndarray, shape (e,)
+    poses : RigidTransform, length e
+    covariance : ndarray, shape (e, 6, 6)
+        Of (x, y, z, tilt, yaw, roll), mm and rad.
+    """
 
-
-@dataclass(frozen=True)
-class SignedPair:
-    """A frame pair with its relative pose about the image's centre."""
-
-    first: int
-    second: int
-    pose: RigidTransform
+    first: IntArray
+    second: IntArray
+    poses: RigidTransform
     covariance: FloatArray
-    """Of (x, y, z, tilt, yaw, roll), shape (6, 6), mm and rad."""
+
+    def __len__(self) -> int:
+        return int(self.first.size)
 
 
-class PairSchedule:
-    """Keeps the frames that the next one is measured against: a few recent ones and a few key frames."""
-
-    def __init__(self, settings: TrajectorySettings | None = None) -> None:
-        self.settings = settings or TrajectorySettings()
-        self._keys: list[int] = []
-
-    def references(self, frame: int) -> list[int]:
-        """Earlier frames to measure `frame` against, latest first."""
-        recent = range(max(0, frame - self.settings.recent), frame)
-        keys = self._keys if frame % 2 else self._keys[-self.settings.key_frames :]
-        return sorted({*recent, *keys}, reverse=True)
-
-    def settle(self, frame: int, correlations: dict[int, float]) -> None:
-        """Take note of the median correlations of `frame` with its references."""
-        last = self._keys[-1] if self._keys else None
-        if last is None or correlations.get(last, 0.0) < self.settings.key_correlation:
-            self._keys = [*self._keys, frame][-(self.settings.key_frames + self.settings.far_key_frames) :]
-
-    def needed(self, frame: int) -> set[int]:
-        """Frames up to `frame` that later ones may be measured against."""
-        return {*range(max(0, frame - self.settings.recent + 1), frame + 1), *self._keys}
-
-
-def sign_pair(pair: PairMeasurement, sign: float) -> SignedPair:
-    """Relative pose of a pair, about the image's centre, from in-plane motion and signed plane."""
-    plane = pair.plane
-    a, b, c = sign * plane.coefficients
+def relative_poses_of(
+    first: Sequence[int],
+    second: Sequence[int],
+    motions: Sequence[InPlaneMotion],
+    planes: Sequence[PairPlane],
+    signs: Sequence[float],
+) -> RelativePoses:
+    """Relative poses from in-plane motion and signed planes."""
+    a, b, c = (np.array([p.coefficients for p in planes]) * np.asarray(signs)[:, None]).T
     yaw = -np.arcsin(np.clip(b, -1, 1))
     tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
-    m = pair.motion
-    rotation = rotation_from_fixed_angles(m.roll_rad, yaw, tilt)
-    pose = RigidTransform.from_components([m.x_mm, m.y_mm, a], rotation)
-    covariance = np.zeros((6, 6))
-    inplane = m.covariance if m.covariance is not None else np.eye(3)
-    covariance[np.ix_([0, 1, 5], [0, 1, 5])] = inplane + np.diag([1e-6, 1e-6, 1e-9])
+    x, y, roll = np.array([(m.x_mm, m.y_mm, m.roll_rad) for m in motions]).T
+    rotation = rotation_from_fixed_angles(roll, yaw, tilt)
+    poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
+    covariance = np.zeros((len(planes), 6, 6))
+    inplane = [m.covariance if m.covariance is not None else np.eye(3) for m in motions]
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = np.array(inplane) + np.diag(INPLANE_FLOOR)
     # (a, b, c) is (z, -yaw, tilt) for small angles.
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
-    covariance[np.ix_([2, 3, 4], [2, 3, 4])] = order @ plane.covariance @ order.T
-    return SignedPair(pair.first, pair.second, pose, covariance)
+    covariance[:, 2:5, 2:5] = order @ np.array([p.covariance for p in planes]) @ order.T
+    return RelativePoses(np.asarray(first), np.asarray(second), poses, covariance)
+
+
+INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
+"""Variances of in-plane motion that interpolation leaves, however many patches agree: a micrometre squared."""
+
+
+def held(first: IntArray, second: IntArray) -> RelativePoses:
+    """Edges that say no more than that a probe does not jump: for frames that no pair joins to others."""
+    deviation = np.array([HELD_MM, HELD_MM, HELD_MM, HELD_RAD, HELD_RAD, HELD_RAD])
+    poses = RigidTransform.from_translation(np.zeros((first.size, 3)))
+    return RelativePoses(first, second, poses, np.tile(np.diag(deviation**2), (first.size, 1, 1)))
+
+
+def joined(*edges: RelativePoses) -> RelativePoses:
+    """All of several sets of edges, those without any left out."""
+    some = [e for e in edges if len(e)]
+    return RelativePoses(
+        np.concatenate([e.first for e in some]),
+        np.concatenate([e.second for e in some]),
+        RigidTransform.concatenate([e.poses for e in some]),
+        np.concatenate([e.covariance for e in some]),
+    )
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of all frames, and what the graph alone says of their errors.
+
+    Attributes
+    ----------
+    poses : RigidTransform, length n
+        ``world_from_image``, the first frame being the identity.
+    covariance : ndarray, shape (n, 6, 6)
+        Of each frame's (x, y, z, tilt, yaw, roll) about the image's centre, in the frame's own axes, as far
+        as the pairs' errors are independent of each other.
+    """
+
+    poses: RigidTransform
+    covariance: FloatArray
 
 
 def solve_trajectory(
-    pairs: Sequence[SignedPair],
+    pairs: RelativePoses,
     frames: int,
     centre_mm: FloatArray,
     settings: TrajectorySettings | None = None,
-    rounds: int = 6,
-) -> RigidTransform:
+    with_covariance: bool = False,
+) -> Trajectory:
     """Poses of all frames from all pairs: robust Gauss-Newton on the graph of relative poses.
-
-    Returns
-    -------
-    RigidTransform, length `frames`
-        ``world_from_image`` with the first frame at the identity.
 
     Raises
     ------
@@ -131,25 +123,27 @@ def solve_trajectory(
         If a frame is joined to no earlier one.
     """
     s = settings or TrajectorySettings()
-    first = np.array([p.first for p in pairs])
-    second = np.array([p.second for p in pairs])
-    _require_connected(second, frames)
-    measured = RigidTransform.concatenate([p.pose for p in pairs])
-    whitening = np.linalg.cholesky(np.linalg.inv(np.array([p.covariance for p in pairs]))).transpose(0, 2, 1)
+    _require_connected(pairs.second, frames)
+    whitening = np.linalg.cholesky(np.linalg.inv(pairs.covariance)).transpose(0, 2, 1)
     poses = _chain(pairs, frames, s.join == "chain")
-    for _ in range(rounds if s.join == "graph" else 0):
-        step = _gauss_newton_step(poses, first, second, measured, whitening, s.huber)
+    for _ in range(ROUNDS if s.join == "graph" else 0):
+        normal, gradient = _normal_equations(poses, pairs, whitening, s.huber)
+        step = np.concatenate([np.zeros((1, 6)), splu(normal).solve(-gradient).reshape(-1, 6)])
         poses = poses * RigidTransform.from_exp_coords(step)
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < SETTLED:
             break
+    covariance = np.zeros((frames, 6, 6))
+    if with_covariance:
+        normal, _ = _normal_equations(poses, pairs, whitening, s.huber)
+        covariance = _marginals(normal, frames)
     centre = RigidTransform.from_translation(centre_mm)
-    return centre * poses * centre.inv()
+    return Trajectory(centre * poses * centre.inv(), covariance)
 
 
-def _require_connected(second: FloatArray, frames: int) -> None:
+def _require_connected(second: IntArray, frames: int) -> None:
     joined = np.zeros(frames, dtype=bool)
     joined[0] = True
-    joined[second.astype(int)] = True
+    joined[second] = True
     if not joined.all():
         lost = int(np.flatnonzero(~joined)[0])
         raise InsufficientDataError(
@@ -158,35 +152,29 @@ def _require_connected(second: FloatArray, frames: int) -> None:
         )
 
 
-def _chain(pairs: Sequence[SignedPair], frames: int, relative: bool) -> RigidTransform:
+def _chain(pairs: RelativePoses, frames: int, relative: bool) -> RigidTransform:
     """Each frame from the pair whose distance is most certain, absolutely or relative to its size."""
-
-    def doubt(p: SignedPair) -> float:
-        variance = float(p.covariance[2, 2])
-        return variance / max(float(p.pose.translation[2]) ** 2, 1e-6) if relative else variance
-
-    best: dict[int, SignedPair] = {}
-    for p in pairs:
-        kept = best.get(p.second)
-        if kept is None or doubt(p) < doubt(kept):
-            best[p.second] = p
+    doubt = pairs.covariance[:, 2, 2]
+    if relative:
+        doubt = doubt / np.maximum(pairs.poses.translation[:, 2] ** 2, 1e-6)
+    best: dict[int, int] = {}
+    for row, second in enumerate(pairs.second.tolist()):
+        if second not in best or doubt[row] < doubt[best[second]]:
+            best[second] = row
+    step = pairs.poses.as_matrix()
     matrices = np.tile(np.eye(4), (frames, 1, 1))
     for frame in range(1, frames):
-        matrices[frame] = matrices[best[frame].first] @ best[frame].pose.as_matrix()
+        matrices[frame] = matrices[pairs.first[best[frame]]] @ step[best[frame]]
     return RigidTransform.from_matrix(matrices)
 
 
-def _gauss_newton_step(
-    poses: RigidTransform,
-    first: FloatArray,
-    second: FloatArray,
-    measured: RigidTransform,
-    whitening: FloatArray,
-    huber: float,
-) -> FloatArray:
-    """One step on right increments of every pose but the first; shape (n, 6), rotation then translation."""
+def _normal_equations(
+    poses: RigidTransform, pairs: RelativePoses, whitening: FloatArray, huber: float
+) -> tuple[sparse.csc_matrix, FloatArray]:
+    """For right increments of every pose but the first, each a rotation and a translation."""
+    first, second = pairs.first, pairs.second
     relative = poses[first].inv() * poses[second]
-    error = (measured.inv() * relative).as_exp_coords()
+    error = (pairs.poses.inv() * relative).as_exp_coords()
     # The covariance's order is translation, rotation; exponential coordinates' is rotation, translation.
     swap = [3, 4, 5, 0, 1, 2]
     w = whitening[:, :, swap]
@@ -215,8 +203,23 @@ def _gauss_newton_step(
         shape=(6 * edges, 6 * n),
     )[:, 6:]
     normal = (jacobian.T @ jacobian + 1e-9 * sparse.identity(6 * (n - 1))).tocsc()
-    step = splu(normal).solve(-(jacobian.T @ r.ravel()))
-    return np.concatenate([np.zeros((1, 6)), step.reshape(-1, 6)])
+    return normal, np.asarray(jacobian.T @ r.ravel())
+
+
+def _marginals(normal: sparse.csc_matrix, frames: int) -> FloatArray:
+    """Covariance of each frame's pose, shape (n, 6, 6), in the order of `RelativePoses`."""
+    solver = splu(normal)
+    known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(int))
+    blocks = np.zeros((known.size + 1, 36))
+    for k, frame in enumerate(known, start=1):
+        rows = 6 * (frame - 1) + np.arange(6)
+        unit = np.zeros((normal.shape[0], 6))
+        unit[rows, np.arange(6)] = 1.0
+        block = solver.solve(unit)[rows]
+        blocks[k] = (block + block.T)[np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])].ravel() / 2
+    at = np.concatenate([[0], known])
+    every = [np.interp(np.arange(frames), at, column) for column in blocks.T]
+    return np.stack(every, axis=1).reshape(frames, 6, 6)
 
 
 def _adjoint(pose: RigidTransform) -> FloatArray:

@@ -23,6 +23,7 @@ from speckle3d.correction.drift import DriftCorrection
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.hdf5 import make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.motion.quality import describe
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor
 from speckle3d.pipeline import Progress, correct, require_modes, track
 from speckle3d.solution import Tracked
@@ -142,7 +143,7 @@ def _summarise(
         "provenance": provenance,
         "estimates": estimates,
         "pairs": tracked.pairs,
-        "unreliable_frames": tracked.unreliable,
+        "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
         "direction": tracked.direction,
         "direction_from": tracked.direction_from,

@@ -1,0 +1,68 @@
+"""Which frame pairs are measured as a sweep is read."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class TrajectorySettings(BaseModel):
+    """Which frame pairs are measured and how they are joined."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recent: int = Field(2, ge=1, description="Frames just before each frame that it is measured against.")
+    key_frames: int = Field(4, ge=1, description="Key frames before each frame that it is measured against.")
+    far_key_frames: int = Field(
+        4, ge=0, description="Older key frames that every other frame is measured against, to see what stays."
+    )
+    key_correlation: float = Field(
+        0.9,
+        gt=0,
+        lt=1,
+        description="A frame becomes a key frame when its median correlation with the last is less.",
+    )
+    least_correlation: float = Field(
+        0.2,
+        gt=0,
+        lt=1,
+        description="Least median correlation that a pair must have, and that speckle at its distance would, "
+        "to be used.",
+    )
+    huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
+    revisit_mm: float = Field(
+        1.0,
+        ge=0,
+        description="Travel between the frames of a sweep that comes back at which they are matched with "
+        "those of its way there; 0: never.",
+    )
+    join: Literal["graph", "chain"] = Field(
+        "graph",
+        description="graph: least squares over all pairs. chain: each frame by the one earlier frame that "
+        "tells its distance best, for comparison.",
+    )
+
+
+class PairSchedule:
+    """Keeps the frames that the next one is measured against: a few recent ones and a few key frames."""
+
+    def __init__(self, settings: TrajectorySettings | None = None) -> None:
+        self.settings = settings or TrajectorySettings()
+        self._keys: list[int] = []
+
+    def references(self, frame: int) -> list[int]:
+        """Earlier frames to measure `frame` against, latest first."""
+        recent = range(max(0, frame - self.settings.recent), frame)
+        keys = self._keys if frame % 2 else self._keys[-self.settings.key_frames :]
+        return sorted({*recent, *keys}, reverse=True)
+
+    def settle(self, frame: int, correlations: dict[int, float]) -> None:
+        """Take note of the median correlations of `frame` with its references."""
+        last = self._keys[-1] if self._keys else None
+        if last is None or correlations.get(last, 0.0) < self.settings.key_correlation:
+            self._keys = [*self._keys, frame][-(self.settings.key_frames + self.settings.far_key_frames) :]
+
+    def needed(self, frame: int) -> set[int]:
+        """Frames up to `frame` that later ones may be measured against."""
+        return {*range(max(0, frame - self.settings.recent + 1), frame + 1), *self._keys}
