@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d.kernels.planes import predict_correlation
+
+STEP_MM, WIDTH_MM, CELLS = 0.01, 0.55, 60.0
+GRID_MM = np.arange(0, 3.0, STEP_MM)
+AMPLITUDE = 1 / (1 + (GRID_MM / WIDTH_MM) ** 2)
+"""Heavy-tailed and smooth: no beam's, so that no formula for a Gaussian one fits by chance."""
+
+shares = st.floats(0.0, 0.8)
+
+
+def amplitude(d):
+    return np.interp(d, GRID_MM, AMPLITUDE)
+
+
+def echo(staying=0.0, moving=1.0, gain=1.0, stretch=1.0, staying_sd=0.0, stretch_sd=0.0):
+    return np.array([staying, moving, gain, stretch, staying_sd, stretch_sd])
+
+
+def predict(d, model, of_echo=True):
+    return predict_correlation(d, AMPLITUDE, STEP_MM, model, CELLS, of_echo)
+
+
+def at_random(d):
+    """Between two knots of the table, where its slope is one number."""
+    return STEP_MM * (np.floor(d / STEP_MM) + 0.5)
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    d=st.floats(0.02, 1.5), c=shares, gain=st.floats(0.3, 1.0), stretch=st.sampled_from([1.0, 1.2, 1.4, 1.7])
+)
+def test_correlation_is_the_echo_models(d, c, gain, stretch):
+    model, _, _ = predict(d, echo(c, 1 - c, gain, stretch))
+    assert model == pytest.approx(gain * (c + (1 - c) * amplitude(d / stretch)) ** 2, rel=1e-12)
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    d=st.floats(0.02, 1.5), c=shares, gain=st.floats(0.3, 1.0), stretch=st.sampled_from([1.0, 1.2, 1.4, 1.7])
+)
+def test_derivative_is_that_of_the_correlation(d, c, gain, stretch):
+    model, d = echo(c, 1 - c, gain, stretch), stretch * at_random(d / stretch)
+    step = 1e-5
+    before, after = (predict(d + side * step, model)[0] for side in (-1, 1))
+    assert predict(d, model)[1] == pytest.approx((after - before) / (2 * step), rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize("of_echo", [True, False])
+@pytest.mark.parametrize("d", [0.1, 0.4, 0.9])
+def test_variance_of_phantom_speckle_is_that_of_its_cells(d, of_echo):
+    rho, _, variance = predict(d, echo(), of_echo)
+    law = (
+        2 * rho * (1 - rho) ** 2 / CELLS + (1 - rho) ** 2 / CELLS**2 if of_echo else (1 - rho**2) ** 2 / CELLS
+    )
+    # 0.002 in a correlation is what no number of cells removes.
+    assert variance == pytest.approx(law + 0.002**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("d", [0.1, 0.4, 0.9])
+def test_variance_holds_what_an_uncertain_share_and_stretch_do_to_the_correlation(d):
+    """To first order: both are moved by a little and the correlation computed anew."""
+    c, gain, stretch, tiny = 0.3, 0.9, 1.4, 1e-5
+    sure = predict(d, echo(c, 1 - c, gain, stretch))[2]
+
+    def change(**sd):
+        return predict(d, echo(c, 1 - c, gain, stretch, **sd))[2] - sure
+
+    share = [predict(d, echo(c + s, 1 - c - s, gain, stretch))[0] for s in (-tiny, tiny)]
+    relative = [predict(d, echo(c, 1 - c, gain, stretch * (1 + s)))[0] for s in (-tiny, tiny)]
+    by_share, by_stretch = (np.diff(both)[0] / (2 * tiny) for both in (share, relative))
+    assert change(staying_sd=0.07) == pytest.approx((0.07 * by_share) ** 2, rel=1e-3)
+    # The table's slope is a step function; a knot crossed changes it by a few percent.
+    assert change(stretch_sd=0.1) == pytest.approx((0.1 * by_stretch) ** 2, rel=0.05)
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.7])
+def test_beyond_the_table_the_correlation_stays_at_its_end(stretch):
+    far, _, variance = predict(50.0, echo(stretch=stretch))
+    assert far == pytest.approx(AMPLITUDE[-1] ** 2, rel=0.02)
+    assert np.isfinite(variance)
+
+
+def test_at_no_distance_nothing_is_lost_and_the_deviation_is_the_floor():
+    rho, slope, variance = predict(0.0, echo())
+    assert rho == 1.0
+    assert -0.1 < slope <= 0
+    assert 0 < variance < 0.0021**2
