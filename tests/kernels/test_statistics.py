@@ -1,4 +1,4 @@
-"""Sampling variances against draws: of independent cells, and of speckle fields with cells counted beforehand."""
+"""Sampling variances against draws: of independent cells, and of speckle whose cells are counted."""
 
 from functools import cache
 

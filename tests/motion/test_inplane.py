@@ -1,5 +1,7 @@
 """In-plane motion on speckle that is coarse laterally: 0.3 mm between vectors, 0.35 mm deviation."""
 
+from copy import copy
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,12 +12,14 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.correlation import patch_correlations
 from speckle3d.motion.inplane import CoarseMatcher, InPlaneMotion, InPlaneSettings, match_patches
+from speckle3d.motion.intensity import two_way_wavenumber
 from speckle3d.motion.patches import PatchSettings, lay_patches
 
 GRID = speckle.GRID
 PATCHES = lay_patches(GRID)
 SPECTRA = [speckle.gaussian, speckle.triangle]
 SIGMA_ELEVATION_MM = 0.45
+WAVENUMBER_PER_MM = two_way_wavenumber(speckle.RF)
 
 
 @cache
@@ -35,6 +39,37 @@ def pair(seed, motion=(0.0, 0.0, 0.0), rho=1.0, spectrum=speckle.gaussian):
 
 def match(images, start=(0.0, 0.0, 0.0), **settings):
     return match_patches(*images, PATCHES, InPlaneMotion(*start), GRID.centre_mm, InPlaneSettings(**settings))
+
+
+def parts(echo):
+    return np.stack([echo.real, echo.imag]).astype(np.float32)
+
+
+def echo_pair(seed, motion=(0.0, 0.0, 0.0), rho=1.0, spectrum=speckle.gaussian, strain=0.0):
+    """Two frames' demodulated echoes; the second moved, and its tissue pressed by `strain` about the top.
+
+    What lies deeper in the tissue than in the image comes with so much more phase.
+    """
+    common, first, other = speckle_of(seed, spectrum)
+    moved = copy(common)
+    moved.grid = replace(GRID, sample_spacing_mm=GRID.sample_spacing_mm * (1 + strain))
+    x_mm, y_mm, roll_rad = motion
+    across = np.arange(GRID.vectors)[:, None] * GRID.vector_pitch_mm - GRID.centre_mm[0]
+    steps = np.arange(GRID.samples) * moved.grid.sample_spacing_mm
+    down = steps + GRID.first_sample_depth_mm - moved.grid.centre_mm[1]
+    seen = np.sin(roll_rad) * across + np.cos(roll_rad) * down + y_mm + moved.grid.centre_mm[1]
+    shown = np.arange(GRID.samples) * GRID.sample_spacing_mm + GRID.first_sample_depth_mm
+    second = speckle.decorrelated(moved.seen(x_mm, y_mm, roll_rad), other, rho)
+    return first, second * np.exp(1j * WAVENUMBER_PER_MM * (seen - shown))
+
+
+def match_echoes(echoes, start=(0.0, 0.0, 0.0), wavenumber_per_mm=WAVENUMBER_PER_MM, **settings):
+    images = (speckle.intensity(echo) for echo in echoes)
+    made = InPlaneSettings(**settings)
+    complex_parts = tuple(parts(echo) for echo in echoes)
+    return match_patches(
+        *images, PATCHES, InPlaneMotion(*start), GRID.centre_mm, made, complex_parts, wavenumber_per_mm
+    )
 
 
 def searched(images, search_mm=3.0):
@@ -173,7 +208,7 @@ def through_vertex(before, at, after):
 )
 def test_half_a_pitch_does_not_read_as_elevation(true_mm, nearest_mm, parabola_mm, logarithm_mm):
     rho = np.exp(-(true_mm**2) / (2 * SIGMA_ELEVATION_MM**2))
-    read = {"nearest": [], "parabola": [], "ours": []}
+    read = {"nearest": [], "parabola": [], "ours": [], "echo": []}
     for seed in range(6):
         images = pair(seed, (GRID.vector_pitch_mm / 2, 0.0, 0.0), rho)
         lags = np.empty((len(PATCHES), 3, 1))
@@ -182,8 +217,12 @@ def test_half_a_pitch_does_not_read_as_elevation(true_mm, nearest_mm, parabola_m
         read["nearest"].append(distance(lags[:, 1, 0]))
         read["parabola"].append(distance(through_vertex(*lags[:, :, 0].T)))
         read["ours"].append(distance(match(images).correlation))
-    nearest, parabola, ours = (np.nanmean(read[name]) for name in ("nearest", "parabola", "ours"))
+        echoes = echo_pair(seed, (GRID.vector_pitch_mm / 2, 0.0, 0.0), rho)
+        read["echo"].append(distance(match_echoes(echoes).correlation))
+    nearest, parabola, ours, echo = (np.nanmean(values) for values in read.values())
     assert abs(ours - logarithm_mm) < 0.02
+    assert abs(echo - logarithm_mm) < 0.02
+    assert abs(echo - true_mm) < abs(parabola - true_mm)
     assert abs(ours - true_mm) < abs(parabola - true_mm) < abs(nearest - true_mm)
     if true_mm == 0:
         assert abs(nearest - nearest_mm) < 0.02
@@ -207,6 +246,65 @@ def test_correlation_left_is_the_elevational_one_whatever_the_in_plane_motion(sp
     # 56 patches of 80 cells, six times: a standard error of 0.005 at most. The rest is interpolation.
     assert abs(still - rho) < 0.025
     assert abs(moved - still) < 0.015
+
+
+@pytest.mark.parametrize("spectrum", SPECTRA)
+@pytest.mark.parametrize("rho", [0.9, 0.5, 0.25])
+def test_the_echos_correlation_left_is_the_elevational_one_too(spectrum, rho):
+    """A half-degree's roll turns an echo's phase by a third of a cycle over a patch: it is undone."""
+    means = []
+    for seed, motion in enumerate(motions(6, 0.5, seed=2)):
+        moved = np.nanmean(match_echoes(echo_pair(seed, motion, rho, spectrum), motion).correlation)
+        still = np.nanmean(match_echoes(echo_pair(seed, (0, 0, 0), rho, spectrum)).correlation)
+        means.append((moved, still))
+    moved, still = np.mean(means, axis=0)
+    # As for intensity; the squared coherence of N = 45 cells is (1 - rho)^2 / N high by nature.
+    assert abs(still - (1 - rho) ** 2 / 45 - rho) < 0.025
+    assert abs(moved - still) < 0.015
+
+
+@pytest.mark.parametrize(
+    ("roll_deg", "strain"), [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.005), (0.0, -0.005), (0.4, 0.004)]
+)
+def test_the_ramp_undoes_what_roll_and_axial_strain_do_to_the_echo(roll_deg, strain):
+    motion = (0.1, 0.2, np.deg2rad(roll_deg))
+    with_ramp, without, wrong, power = [], [], [], []
+    for seed in range(4):
+        echoes = echo_pair(seed, motion, 0.8, strain=strain)
+        start = (0.1, 0.2 + strain * GRID.depth_mm / 2, motion[2])
+        for found, turned in ((with_ramp, 1), (without, 0), (wrong, -1)):
+            got = match_echoes(echoes, start, turned * WAVENUMBER_PER_MM, passes=3)
+            found.append(np.nanmean(got.correlation))
+        power.append(
+            np.nanmean(match([speckle.intensity(echo) for echo in echoes], start, passes=3).correlation)
+        )
+    # Over a patch of 3.6 x 3.0 mm the phase turns evenly by 57/mm slope side; sinc^2 of half that is left.
+    turns = WAVENUMBER_PER_MM * np.array([np.deg2rad(roll_deg) * 3.6, strain * 3.0]) / (2 * np.pi)
+    kept = np.prod(np.sinc(turns) ** 2)
+    assert np.mean(with_ramp) == pytest.approx(0.8, abs=0.015)
+    assert np.mean(power) == pytest.approx(0.8, abs=0.02)
+    assert np.mean(without) == pytest.approx(0.8 * kept, abs=0.025)
+    assert np.mean(wrong) < np.mean(without) - 0.1
+
+
+def test_the_echo_moves_neither_the_frame_nor_its_patches():
+    """Motion is found from intensity in any case; only the correlation is the echo's."""
+    motion = (0.4, -0.2, 0.006)
+    echoes = echo_pair(1, motion, 0.7)
+    ours, plain = match_echoes(echoes, motion), match([speckle.intensity(echo) for echo in echoes], motion)
+    assert (ours.motion.x_mm, ours.motion.y_mm, ours.motion.roll_rad) == (
+        plain.motion.x_mm,
+        plain.motion.y_mm,
+        plain.motion.roll_rad,
+    )
+    np.testing.assert_array_equal(ours.shift_mm, plain.shift_mm)
+    assert not np.allclose(ours.correlation, plain.correlation, atol=1e-3)
+
+
+def test_independent_echoes_correlate_by_one_over_their_cells():
+    first, other = speckle_of(0, speckle.gaussian)[1], speckle_of(50, speckle.gaussian)[1]
+    # 56 values exponential about 1 / 45, 0.022: three standard errors are 0.009.
+    assert np.nanmean(match_echoes((first, other)).correlation) == pytest.approx(0.022, abs=0.009)
 
 
 def test_independent_speckle_does_not_correlate():
