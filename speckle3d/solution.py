@@ -116,9 +116,13 @@ class Solution:
         trajectory = self._trajectory(pairs, with_covariance=True)
         image = trajectory.poses
         direction, source = settle_direction(walk.sweep, image, self._config)
-        scale_sigma = CURVES_SIGMA if coherence is None else coherence.scale_sigma
         covariance = pose_covariance(
-            image, trajectory.covariance, self._matcher.centre_mm, scale_sigma, slopes
+            image,
+            trajectory.covariance,
+            self._matcher.centre_mm,
+            _scale_sigma(coherence),
+            slopes,
+            0.0 if coherence is None else float(coherence.share.mean()),
         )
         walk.times.add("trajectory", then)
         subset, used = self._consistent(measured, direction)
@@ -128,7 +132,7 @@ class Solution:
         if sink:
             for start in range(0, len(measured), SINK_PAIRS):
                 some = slice(start, start + SINK_PAIRS)
-                sink(self._rows(measured[some], pairs, some, used[some], direction))
+                sink(self._rows(measured[some], pairs, some, used[some], direction, _scale_sigma(coherence)))
         rejected = sum(int((m.plane.used & ~u).sum()) for m, u in zip(measured, used, strict=True))
         return Tracked(
             image,
@@ -278,7 +282,7 @@ class Solution:
         return weigh_slopes(
             self._walk.fitter.design(np.zeros(2)),
             [m.plane for m in measured],
-            CURVES_SIGMA if coherence is None else coherence.scale_sigma,
+            _scale_sigma(coherence),
             float(np.deg2rad(self._config.planes.turn_deg_per_mm)),
         )
 
@@ -297,10 +301,12 @@ class Solution:
             slopes, moved = direction * m.sign * each, self._moved(m.row)
             raised = self._walk.fitter.design(moved)[:, 1:] @ slopes
             distances = self._distances(m)
-            agreed = consistent_subset(distances, raised, self._config.planes.support_sigma)
+            # Only frames that cross, or nearly, leave the side open.
+            open_side = m.plane.offset_mm < np.ptp(raised)
+            agreed = consistent_subset(distances, raised, self._config.planes.support_sigma, open_side)
             rho = self._rho[m.row].astype(float)
             plane = self._walk.fitter.fit(
-                rho, moved, m.model, agreed.support, slopes, start_mm=m.plane.offset_mm
+                rho, moved, m.model, agreed.support, slopes, m.plane.offset_mm, open_side
             )
             planes.append(plane or m.plane)
         self._walk.times.add("distances and planes", then)
@@ -316,8 +322,9 @@ class Solution:
         some: slice,
         used: list[BoolArray],
         direction: int,
+        scale_sigma: float,
     ) -> FramePairs:
-        """Rows for the reconstruction file."""
+        """Rows for the reconstruction file; deviations include that of the scale, which patches share."""
         centre = RigidTransform.from_translation(self._matcher.centre_mm)
         flip = np.diag([1.0, 1.0, direction, 1.0])
         turn = np.diag([1.0, 1.0, direction, direction, direction, 1.0])
@@ -328,10 +335,16 @@ class Solution:
             first_from_second=flip @ (centre * pairs.poses[some] * centre.inv()).as_matrix() @ flip,
             covariance=turn @ pairs.covariance[some] @ turn,
             distance_mm=np.array([d.distance_mm for d in distances], dtype=np.float32),
-            sigma_mm=np.array([d.sigma_mm for d in distances], dtype=np.float32),
+            sigma_mm=np.array(
+                [np.hypot(d.sigma_mm, scale_sigma * d.distance_mm) for d in distances], dtype=np.float32
+            ),
             used=np.array(used),
             patch_centre_mm=self._matcher.patches.centre_mm,
         )
+
+
+def _scale_sigma(coherence: Coherence | None) -> float:
+    return CURVES_SIGMA if coherence is None else coherence.scale_sigma
 
 
 @dataclass(frozen=True)

@@ -42,9 +42,9 @@ LENGTHS_MM = np.array([NO_GAIN, 0.0, 4.0, 10.0, 40.0])
 """Of coherent structure; zero for none, and for neither structure nor noise."""
 GAIN_PRECISION = 40.0
 """Of the prior about gain one: a deviation of 0.16, noise some 10 dB below the echo."""
-CURVES_SIGMA = 0.004
+CURVES_SIGMA = 0.002
 """Relative error of all distances that curves from some twenty independent blocks of phantom have."""
-DEPARTURE_ERROR = 0.2
+DEPARTURE_ERROR = 0.165
 """Part of an adaptation - mean share and lost gain - that may be wrong as an error of all distances; measured
 on sweeps over simulated tissue and noise, from 3 to 6 % of length."""
 _EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])

@@ -14,8 +14,10 @@ from speckle3d.motion.patches import PatchGrid
 LEAST_CORRELATION = 0.03
 """A patch that correlates less than this holds no distance at all."""
 TABLE_STEPS = 400
-SHARE_ERROR = 0.3
+SHARE_ERROR = 0.35
 """Relative error of a coherent share: structure is neither quite frozen nor quite Gaussian."""
+INTERPOLATION = 0.003
+"""Standard deviation that interpolation between samples leaves in a correlation."""
 STRETCH_ERROR = 0.1
 """Relative error of a stretch, which is chosen from steps of a sixth."""
 
@@ -140,7 +142,7 @@ class DistanceEstimator:
         g = np.sqrt(rho)
         echo = m.staying + m.moving * g
         seen = np.minimum(m.gain * echo**2, 0.999)
-        noise = np.sqrt(correlation_variance(seen, self.cells, self.of_echo))
+        noise = np.sqrt(correlation_variance(seen, self.cells, self.of_echo) + INTERPOLATION**2)
         misfit = staying_sd * (1 - g) * 2 * echo * m.gain
         sigma_rho = np.hypot(noise, misfit) * g / np.maximum(m.gain * echo * m.moving, 1e-6)
         d = np.minimum(d, self._grid[-1])

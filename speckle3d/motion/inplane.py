@@ -33,6 +33,9 @@ class InPlaneSettings(BaseModel):
     least_overlap: float = Field(
         0.6, gt=0, le=1, description="Share of a patch that must still lie in the other image."
     )
+    interpolate: bool = Field(
+        True, description="Read correlations between samples; false: at the nearest, for comparison."
+    )
     passes: int = Field(2, ge=1, le=5, description="How often lags are centred anew on the fitted motion.")
 
 
@@ -157,7 +160,8 @@ def match_patches(
         lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
         ramp = wavenumber_per_mm * strain * patches.spacing_mm
         patch_coherences(*echoes, *place, lag, ramp, s.least_overlap, rho)
-    correlation = _read_at(rho, predicted / patches.spacing_mm - lag)
+    offset = predicted / patches.spacing_mm - lag
+    correlation = _read_at(rho, offset) if s.interpolate else rho[:, 1, 1]
     return PatchMatch(correlation, shift, motion)
 
 

@@ -129,6 +129,7 @@ class PlaneFitter:
         subset: BoolArray | None = None,
         slopes: FloatArray | None = None,
         start_mm: float | None = None,
+        either_side: bool = True,
     ) -> PairPlane | None:
         """Robust maximum likelihood; None if fewer than six patches can take part.
 
@@ -143,6 +144,8 @@ class PlaneFitter:
             b and c as a sensor has them. The plane's sign is then theirs, and a may be negative.
         start_mm : float, optional
             About how far apart the frames are, if it is known.
+        either_side : bool
+            Whether a plane of known slopes may have a < 0.
         """
         used = np.isfinite(correlation) if subset is None else np.isfinite(correlation) & subset
         if used.sum() < LEAST_PATCHES:
@@ -152,7 +155,7 @@ class PlaneFitter:
         echo, design = model.table(), self.design(moved_mm)
         middle = self._middle(rho, model) if start_mm is None else max(start_mm, NEAR_MM)
         best, least = np.zeros(3), np.inf
-        for number, (start, prior, precision) in enumerate(self._starts(middle, design, used, slopes)):
+        for number, (start, prior, precision) in enumerate(self._starts(middle, design, used, slopes, either_side)):
             plane = start.copy()
             information, standard, sensitivity = np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size)
             cost = fit_correlation_plane(
@@ -195,11 +198,13 @@ class PlaneFitter:
         design: FloatArray,
         used: BoolArray,
         slopes: FloatArray | None,
+        either_side: bool,
     ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """Starts with their priors: all patches on one side, then frames that cross within the image."""
         if slopes is not None:
             known, sure = np.array([0.0, *slopes]), np.array([1e-6, SENSED_SLOPE**-2, SENSED_SLOPE**-2])
-            return [(np.array([side * middle, *slopes]), known, sure) for side in (1.0, -1.0)]
+            sides = (1.0, -1.0) if either_side else (1.0,)
+            return [(np.array([side * middle, *slopes]), known, sure) for side in sides]
         loose = np.array([1e-6, LOOSE_SLOPE**-2, LOOSE_SLOPE**-2])
         starts = [np.array([middle, 0.0, 0.0])]
         lateral = design[used, 1]

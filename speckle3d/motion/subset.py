@@ -26,7 +26,7 @@ class ConsistentSubset:
 
 
 def consistent_subset(
-    distances: PatchDistances, raised_mm: FloatArray, support_sigma: float = 1.0
+    distances: PatchDistances, raised_mm: FloatArray, support_sigma: float = 1.0, either_side: bool = True
 ) -> ConsistentSubset:
     """Patches whose distances agree on one plane of the orientation that the sensor measured.
 
@@ -37,6 +37,8 @@ def consistent_subset(
     ----------
     raised_mm : ndarray, shape (p,)
         How much farther each patch is than the image's centre, by the sensor's relative rotation.
+    either_side : bool
+        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it.
 
     References
     ----------
@@ -49,7 +51,8 @@ def consistent_subset(
     if known.size == 0:
         return ConsistentSubset(support, np.ones(len(d)))
     raised = raised_mm[known]
-    offsets = np.concatenate([d[known] - raised, -d[known] - raised])
+    sides = (1.0, -1.0) if either_side else (1.0,)
+    offsets = np.concatenate([side * d[known] - raised for side in sides])
     distance = np.abs(offsets[:, None] + raised)
     error = np.abs(distance - d[known]) / sigma[known]
     agree = error <= support_sigma
