@@ -75,7 +75,9 @@ def calibrate_curves(
     samples, keys = [], []
     total, before = sum(len(sweep) for sweep in sweeps), 0
     for sweep in sweeps:
-        matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane, settings.matching)
+        matcher = FrameMatcher(
+            sweep, settings.intensity, settings.patches, settings.inplane, settings.matching
+        )
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
         samples.append(phantom_samples(sweep, matcher, settings.curves, _shifted(progress, before, total)))

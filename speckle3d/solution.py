@@ -21,8 +21,8 @@ from speckle3d.motion.patches import IntArray
 from speckle3d.motion.planes import PairPlane
 from speckle3d.motion.quality import FrameFlag, describe, flag_frames
 from speckle3d.motion.signs import SignResolver, pair_signs
-from speckle3d.motion.subset import consistent_subset
 from speckle3d.motion.slopes import SlopeEvidence, weigh_slopes
+from speckle3d.motion.subset import consistent_subset
 from speckle3d.motion.trajectory import (
     RelativePoses,
     Trajectory,
@@ -34,6 +34,7 @@ from speckle3d.motion.trajectory import (
 from speckle3d.motion.uncertainty import pose_covariance
 from speckle3d.revisit import find_revisits
 from speckle3d.walk import StageTimes, Walk
+
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 SINK_PAIRS = 1024
@@ -289,7 +290,7 @@ class Solution:
     def _consistent(
         self, measured: list[_Measured], direction: int
     ) -> tuple[RigidTransform | None, list[BoolArray]]:
-        """Trajectory from the orientation-consistent patches, and which those are, if orientation is sensed."""
+        """Trajectory from the orientation-consistent patches, and which they are, if orientation is sensed."""
         sensed = sensed_orientation(self._walk.sweep, self._config)
         if sensed is None:
             return None, [m.plane.used for m in measured]

@@ -19,9 +19,9 @@ from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.motion.planes import PlaneFitter
 from speckle3d.motion.quality import FrameFeatures, FrameInspector
+from speckle3d.motion.schedule import PairSchedule
 from speckle3d.motion.signs import SignResolver
 from speckle3d.motion.table import CorrelationTable
-from speckle3d.motion.schedule import PairSchedule
 
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
@@ -111,7 +111,7 @@ class Walk:
 
 
 def prefetch(walk: Walk, images: ImageSink | None, ahead: int = 3) -> Iterator[ReadyFrame]:
-    """Frames made ready, a few ahead of their use, on a thread of their own; their features go to the walk."""
+    """Frames made ready, a few ahead of use, on a thread of their own; their features go to the walk."""
     sweep, matcher, times = walk.sweep, walk.matcher, walk.times
     inspector = FrameInspector(sweep.signal, matcher.patches, walk.config.quality)
 

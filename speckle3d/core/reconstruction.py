@@ -63,6 +63,23 @@ class Provenance:
 
 
 @dataclass(frozen=True)
+class Trust:
+    """How far the poses of mode `image` may be trusted.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (n, 6, 6)
+        Of (x, y, z, tilt, yaw, roll) of every frame's pose about the image's centre, along the first frame's
+        axes, mm and rad.
+    flags : ndarray of int, shape (n,)
+        Zero for a frame that is as it should be; else bits of `speckle3d.motion.quality.FrameFlag`.
+    """
+
+    covariance: FloatArray
+    flags: IntArray
+
+
+@dataclass(frozen=True)
 class Reconstruction:
     """Poses of the frames of one sweep.
 
@@ -72,6 +89,8 @@ class Reconstruction:
         ``world_from_image`` by mode. In `image` the first frame is the identity.
     config_toml : str
         The effective configuration.
+    trust : Trust or None
+        None in files that were written before there was any.
     """
 
     frame_time_s: FloatArray
@@ -80,6 +99,7 @@ class Reconstruction:
     provenance: Provenance
     config_toml: str = ""
     pairs: FramePairs | None = field(default=None, repr=False)
+    trust: Trust | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if "image" not in self.poses:
@@ -91,3 +111,9 @@ class Reconstruction:
                 raise InvalidInputError(
                     f"mode {mode}: expected {self.frame_time_s.size} poses, got {len(poses)}"
                 )
+        if self.trust is not None:
+            n = self.frame_time_s.size
+            for name, shape in (("covariance", (n, 6, 6)), ("flags", (n,))):
+                got = np.shape(getattr(self.trust, name))
+                if got != shape:
+                    raise InvalidInputError(f"{name}: expected shape {shape}, got {got}")

@@ -56,9 +56,9 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         distance = read_checked(file, "distance_mm", ("k",))
         correlation = read_checked(file, "correlation", (depth.size, distance.size))
         cells = read_checked(file, "cells", (depth.size,))
-        numbers = (read_attribute(file, name) for name in KEY_NUMBERS)
+        pitch, width, height, equalise = (read_attribute(file, name) for name in KEY_NUMBERS)
         of = read_text(file, "correlation_of") if "correlation_of" in file.attrs else "intensity"
-        key = CurveKey(_read_signal(file), *numbers, of)
+        key = CurveKey(_read_signal(file), pitch, width, height, equalise, of)
         pairs = int(read_attribute(file, "pairs_used", 0))
         tilt = None
         if "tilt" in file:

@@ -18,7 +18,7 @@ from speckle3d.core.geometry import (
     require_increasing,
     transforms_from_matrices,
 )
-from speckle3d.core.reconstruction import MODES, FramePairs, Provenance, Reconstruction
+from speckle3d.core.reconstruction import MODES, FramePairs, Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import (
     PathLike,
@@ -115,15 +115,22 @@ class ReconstructionWriter:
             _extend(group[name], getattr(pairs, name))
 
     def finish(
-        self, poses: Mapping[str, RigidTransform], provenance: Provenance, config_toml: str = ""
+        self,
+        poses: Mapping[str, RigidTransform],
+        provenance: Provenance,
+        config_toml: str = "",
+        trust: Trust | None = None,
     ) -> None:
-        """Write the poses by mode, where they came from and the effective configuration."""
+        """Write the poses by mode, where they came from, the configuration and how far to trust them."""
         group = self._file.create_group("poses")
         with naming(str(self._path)):
             # The container's own rules, checked here so that no file breaks them.
-            Reconstruction(self._times, self._grid, dict(poses), provenance, config_toml)
+            Reconstruction(self._times, self._grid, dict(poses), provenance, config_toml, None, trust)
         for mode, world_from_image in poses.items():
             group[mode] = world_from_image.as_matrix()
+        if trust is not None:
+            self._file["pose_covariance/image"] = trust.covariance
+            self._file["frame_flags"] = trust.flags
         for name in _PROVENANCE_FIELDS:
             self._file.attrs[name] = getattr(provenance, name)
         self._file["config_toml"] = config_toml
@@ -155,6 +162,7 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
                 provenance=Provenance(**{name: read_text(file, name) for name in _PROVENANCE_FIELDS}),
                 config_toml=_read_config(file),
                 pairs=_read_pairs(file, times.size) if with_pairs else None,
+                trust=_read_trust(file, times.size),
             )
 
 
@@ -218,6 +226,15 @@ def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
 
 def _read_mode(group: h5py.Group, mode: str, frames: int) -> RigidTransform:
     return transforms_from_matrices(read_checked(group, mode, (frames, 4, 4)), locate(group, mode))
+
+
+def _read_trust(file: h5py.File, frames: int) -> Trust | None:
+    if "pose_covariance" not in file or "frame_flags" not in file:
+        return None
+    return Trust(
+        read_checked(file, "pose_covariance/image", (frames, 6, 6)),
+        read_checked(file, "frame_flags", (frames,), np.int64),
+    )
 
 
 def _read_config(file: h5py.File) -> str:

@@ -131,7 +131,9 @@ def fit_correlation_plane(
             weight = 1.0 if size <= huber else huber / size
             total += left * left if size <= huber else huber * (2.0 * size - huber)
             # Near no distance the correlation is flat; its curvature still tells one that is not small.
-            _, steep, _ = predict_correlation(max(d, _LEAST_MM), amplitude[p], step_mm, echo[p], cells[p], of_echo)
+            _, steep, _ = predict_correlation(
+                max(d, _LEAST_MM), amplitude[p], step_mm, echo[p], cells[p], of_echo
+            )
             side = 1.0 if z >= 0.0 else -1.0
             new_sensitivity[p] = -steep / sigma
             for i in range(3):

@@ -88,7 +88,9 @@ def fit_curves(
     fair = np.ones(depth.size, dtype=bool)
     # Frames that turn distort the curves a little, and the curves say what turning does.
     for turn in range(TILT_ROUNDS):
-        fitted = [_fit_row(row, grid, s.terms, of_echo, *_select(fair, depth, row, distance, rho)) for row in rows]
+        fitted = [
+            _fit_row(row, grid, s.terms, of_echo, *_select(fair, depth, row, distance, rho)) for row in rows
+        ]
         curves, cells = np.stack([curve for curve, _ in fitted]), np.array([count for _, count in fitted])
         if turn == TILT_ROUNDS - 1:
             break
@@ -108,9 +110,7 @@ def _wavenumber(key: CurveKey) -> float:
     return two_way_wavenumber(key.signal) if isinstance(key.signal, RFSettings) else 0.0
 
 
-def _select(
-    fair: BoolArray, depth: FloatArray, row: float, *columns: FloatArray
-) -> tuple[FloatArray, ...]:
+def _select(fair: BoolArray, depth: FloatArray, row: float, *columns: FloatArray) -> tuple[FloatArray, ...]:
     here = fair & (np.abs(depth - row) < 1e-5)
     return tuple(c[here & np.isfinite(columns[1])] for c in columns)
 
@@ -171,13 +171,17 @@ def _fitted_fall(grid: FloatArray, centre: FloatArray, rho: FloatArray, terms: i
     log_weight = rho * weight
     start = np.linalg.lstsq(design * log_weight[:, None], -np.log(rho) * log_weight, rcond=None)[0]
     # The logarithm of a mean is not the mean of logarithms: the last word has the correlation itself.
-    coefficients = least_squares(lambda c: (np.exp(-design @ c) - rho) * weight, start).x
+    coefficients = least_squares(_misfit, start, args=(design, rho, weight)).x
     coefficients[0] = max(coefficients[0], 1e-6)
     inside = grid <= reach
     fall = (grid[inside, None] / reach) ** (2 * np.arange(terms + 1)) @ coefficients
     slope = max((fall[-1] - fall[-6]) / (grid[1] * 5), 1e-3)
     fall = np.concatenate([fall, fall[-1] + slope * (grid[~inside] - grid[inside][-1])])
     return np.asarray(np.maximum.accumulate(fall + 1e-9 * np.arange(fall.size)))
+
+
+def _misfit(coefficients: FloatArray, design: FloatArray, rho: FloatArray, weight: FloatArray) -> FloatArray:
+    return np.asarray((np.exp(-design @ coefficients) - rho) * weight)
 
 
 def _bin_means(distance: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray]:

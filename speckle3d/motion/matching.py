@@ -73,9 +73,9 @@ class FrameMatcher:
         self.at_mm = self.patches.centre_mm - self.centre_mm[:2]
         self.inplane = inplane
         self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
-        rf = isinstance(sweep.signal, RFSettings)
-        self.of_echo = rf and (matching or MatchingSettings()).correlate == "echo"
-        self._wavenumber = two_way_wavenumber(sweep.signal) if rf else 0.0
+        rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
+        self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"
+        self._wavenumber = two_way_wavenumber(rf) if rf is not None else 0.0
         self.key = CurveKey(
             sweep.signal,
             self.grid.vector_pitch_mm,

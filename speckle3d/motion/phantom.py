@@ -86,7 +86,8 @@ def phantom_samples(
             f"{sweep.name}: expected phantom frames closer than {s.largest_mm:g} mm, got none"
         )
     table = np.concatenate(rows)
-    return PhantomSamples(*table.T, len(rows))
+    depth, offset, tilt, correlation = table.T
+    return PhantomSamples(depth, offset, tilt, correlation, len(rows))
 
 
 def _separations(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:

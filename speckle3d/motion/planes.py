@@ -155,7 +155,9 @@ class PlaneFitter:
         echo, design = model.table(), self.design(moved_mm)
         middle = self._middle(rho, model) if start_mm is None else max(start_mm, NEAR_MM)
         best, least = np.zeros(3), np.inf
-        for number, (start, prior, precision) in enumerate(self._starts(middle, design, used, slopes, either_side)):
+        for number, (start, prior, precision) in enumerate(
+            self._starts(middle, design, used, slopes, either_side)
+        ):
             plane = start.copy()
             information, standard, sensitivity = np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size)
             cost = fit_correlation_plane(
@@ -181,7 +183,7 @@ class PlaneFitter:
             if misfit < least:
                 best, least, total, normal = plane, misfit, cost, information
                 sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan)
-                excess = -standard * sigma
+                excess = np.asarray(-standard * sigma)
         covariance = np.linalg.inv(normal) * max(1.0, total / max(int(used.sum()) - 3, 1))
         covariance[0, 0] += self.settings.bias_mm**2
         if best[0] < 0 and slopes is None:

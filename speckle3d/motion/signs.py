@@ -105,7 +105,13 @@ class SignResolver:
         self._advance(frame, recent, parents, places, np.array(costs), here[parents, latest, 0])
 
     def _advance(
-        self, frame: int, recent: int, parents: IntArray, places: FloatArray, cost: FloatArray, before: FloatArray
+        self,
+        frame: int,
+        recent: int,
+        parents: IntArray,
+        places: FloatArray,
+        cost: FloatArray,
+        before: FloatArray,
     ) -> None:
         paths = self._paths[parents]
         paths[:, :recent] = self.path[:recent]

@@ -91,4 +91,4 @@ def _fit_pivot(
 
     starts = [least_squares(standard, [start], loss="soft_l1") for start in (-8.0, 0.0, 8.0)]
     fit = min(starts, key=lambda f: float(f.cost))
-    return float(fit.x[0]), float(1 / np.sqrt((fit.jac**2).sum() + 1e-9))
+    return float(fit.x[0]), float(1 / np.sqrt(np.square(np.asarray(fit.jac)).sum() + 1e-9))

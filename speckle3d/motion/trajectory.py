@@ -70,7 +70,7 @@ def relative_poses_of(
 
 
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
-"""Variances of in-plane motion that interpolation leaves, however many patches agree: a micrometre squared."""
+"""Variances of in-plane motion that interpolation leaves, however many patches agree."""
 
 
 def held(first: IntArray, second: IntArray) -> RelativePoses:

@@ -47,6 +47,7 @@ def figure_drift(
     covered: npt.ArrayLike | None = None,
     reference_name: str = "reference",
     title: str = "",
+    covariance: FloatArray | None = None,
 ) -> Figure:
     """Draw accumulated elevational offset and tilt over the frames, for every mode and the reference.
 
@@ -57,6 +58,8 @@ def figure_drift(
     reference : RigidTransform, length n or the number of covered frames, optional
     covered : array_like of bool, shape (n,), optional
         Frames that have a reference.
+    covariance : ndarray, shape (n, 6, 6), optional
+        Of the poses of mode `image`, which gets a band of its 95 % intervals.
 
     References
     ----------
@@ -68,6 +71,8 @@ def figure_drift(
     if reference is not None:
         shown = _reference_curves(reference, covered, next(iter(curves.values())), centre_mm)
         _draw(panels, shown, color="black", linewidth=2.2, alpha=0.55, label=reference_name)
+    if covariance is not None and "image" in curves:
+        _shade(panels, curves["image"], covariance)
     for mode, curve in curves.items():
         colour, dashes = MODE_COLOURS.get(mode, "#56B4E9"), _MODE_STYLES.get(mode, "-")
         label = MODE_LABELS.get(mode, mode)
@@ -77,6 +82,18 @@ def figure_drift(
     panels[0].legend(frameon=False, fontsize="small")
     figure.suptitle(title)
     return figure
+
+
+def _shade(panels: npt.NDArray[Any], curves: Any, covariance: FloatArray) -> None:
+    deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    for panel, curve, sigma in zip(
+        panels, curves, (deviation[:, 2], np.rad2deg(deviation[:, 3])), strict=True
+    ):
+        frames = np.arange(len(curve))
+        low, high = curve - 1.96 * sigma, curve + 1.96 * sigma
+        panel.fill_between(
+            frames, low, high, color=MODE_COLOURS["image"], alpha=0.15, linewidth=0, label="95 % of image"
+        )
 
 
 def figure_reslice(

@@ -16,15 +16,16 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.hdf5 import make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.motion.quality import describe
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor
+from speckle3d.motion.quality import describe
 from speckle3d.pipeline import Progress, correct, require_modes, track
 from speckle3d.solution import Tracked
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
@@ -90,10 +91,10 @@ def run_job(
         corrections = correct(tracked, sweep, drift, settings)
         poses = {"image": tracked.image} | {mode: c.poses for mode, c in corrections.items()}
         provenance = Provenance(str(source), sha256_of(source), version("speckle3d"))
-        writer.finish(poses, provenance, settings.to_toml())
+        writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     summary = _summarise(sweep, tracked, corrections, poses, compared, provenance)
     files = [path, *write_summary(directory, [summary])]
-    files += _draw(directory, sweep, poses, compared, strip)
+    files += _draw(directory, sweep, poses, compared, strip, tracked.covariance)
     return JobResult(directory, summary, table_text([summary]), tuple(files), time.perf_counter() - began)
 
 
@@ -183,6 +184,7 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
     return {
         "mean_share": float(found.share.mean()),
         "mean_gain": float(found.gain.mean()),
+        "mean_stretch": float(found.stretch.mean()),
         "length_over_phantom_reading": float(found.scale.mean()),
         "scale_sigma": found.scale_sigma,
     }
@@ -242,6 +244,7 @@ def _draw(
     poses: dict[str, RigidTransform],
     reference: Reference | None,
     strip: _Strip,
+    covariance: FloatArray,
 ) -> list[Path]:
     drift = figure_drift(
         poses,
@@ -250,6 +253,7 @@ def _draw(
         reference.covered if reference else None,
         reference.name if reference else "reference",
         sweep.name,
+        covariance,
     )
     shown = dict(poses)
     if reference is not None and reference.covered.all():

@@ -87,9 +87,7 @@ CASES = (
         {"image": (1.5, 0.5), "orientation": (None, 0.2), "pose": (1.0, 0.1)},
         ("ours", "plain", "chained"),
     ),
-    Case(
-        "phantom, turned 5 deg in yaw", "rotation", {**ONE_WAY, "turn_axis": "yaw"}, {"image": (4.0, 1.0)}
-    ),
+    Case("phantom, turned 5 deg in yaw", "rotation", {**ONE_WAY, "turn_axis": "yaw"}, {"image": (4.0, 1.0)}),
     Case("phantom, turned 5 deg in tilt", "rotation", ONE_WAY, {"image": (4.0, 1.0)}),
     Case(
         "phantom, wandering by 3 mm sideways",
@@ -218,11 +216,15 @@ def report(case: Case, results: list[Result]) -> None:
     """Print the table of one case, a row for each mode and method."""
     print(f"\n{case.name}: {len(results) // len(case.methods)} sweeps of {VECTORS} vectors")
     print(f"  {'':29}{'length error %':>29} {'tilt error deg':>29} {'yaw deg':>9}")
-    print(f"  {'':29}{'median   worst (seed)  target':>29} {'median   worst (seed)  target':>29} {'median':>9}")
+    print(
+        f"  {'':29}{'median   worst (seed)  target':>29} {'median   worst (seed)  target':>29} {'median':>9}"
+    )
     for mode in MODES:
         for method in case.methods:
             mine = [s for r in results for s in r.scores if s.mode == mode and s.method == method]
-            length_goal, tilt_goal = case.targets.get(mode, (None, None)) if method == "ours" else (None, None)
+            length_goal, tilt_goal = (
+                case.targets.get(mode, (None, None)) if method == "ours" else (None, None)
+            )
             length = _column([(abs(s.length_percent), s.seed) for s in mine], length_goal)
             tilt = _column([(abs(s.tilt_deg), s.seed) for s in mine], tilt_goal)
             yaw = np.median(np.abs([s.yaw_deg for s in mine]))
