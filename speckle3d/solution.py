@@ -290,7 +290,7 @@ class Solution:
     def _consistent(
         self, measured: list[_Measured], direction: int
     ) -> tuple[RigidTransform | None, list[BoolArray]]:
-        """Trajectory from the orientation-consistent patches, and which they are, if orientation is sensed."""
+        """Trajectory from the orientation-consistent patches, and which they are; None without a sensor."""
         sensed = sensed_orientation(self._walk.sweep, self._config)
         if sensed is None:
             return None, [m.plane.used for m in measured]

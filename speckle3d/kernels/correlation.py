@@ -22,6 +22,7 @@ def patch_correlations(
     shift: IntArray,
     least_overlap: float,
     out: FloatArray,
+    corners: bool = True,
 ) -> None:
     """Fill ``out[p, i, j]`` with Pearson's coefficient of patch p at lag ``shift[p] + (i, j) - radius``.
 
@@ -38,6 +39,8 @@ def patch_correlations(
         Share of a patch that must have a partner in `moving` at every lag; below it the patch is NaN.
     out : float64, shape (p, 2 * lateral radius + 1, 2 * axial radius + 1)
         NaN also where either patch is flat.
+    corners : bool
+        Whether to fill lags that are off the centre both ways; else they are NaN, for half the work.
     """
     rows, columns = fixed.shape
     lateral_radius = out.shape[1] // 2
@@ -68,6 +71,9 @@ def patch_correlations(
         a_var = aa_sum - a_sum * a_sum / n
         for i in range(out.shape[1]):
             for j in range(out.shape[2]):
+                if not corners and i != lateral_radius and j != axial_radius:
+                    out[p, i, j] = np.nan
+                    continue
                 b_sum = 0.0
                 bb_sum = 0.0
                 ab_sum = 0.0
@@ -103,6 +109,7 @@ def patch_coherences(
     ramp_rad: FloatArray,
     least_overlap: float,
     out: FloatArray,
+    corners: bool = True,
 ) -> None:
     """Fill ``out[p, i, j]`` with the squared coherence of patch p at lag ``shift[p] + (i, j) - radius``.
 
@@ -112,7 +119,7 @@ def patch_coherences(
         Real and imaginary parts of the echo.
     ramp_rad : float64, shape (2,)
         By how much the phase of `moving` falls behind from vector to vector and from sample to sample.
-    first, size, shift, least_overlap, out
+    first, size, shift, least_overlap, out, corners
         As for `patch_correlations`.
     """
     rows, columns = fixed.shape[1:]
@@ -149,6 +156,8 @@ def patch_coherences(
             power += row_power
             for i in range(out.shape[1]):
                 for j in range(out.shape[2]):
+                    if not corners and i != lateral_radius and j != axial_radius:
+                        continue
                     start = s0 + ds + j - axial_radius
                     row = v + dv + i - lateral_radius
                     b_real = moving[0, row, start : start + width]

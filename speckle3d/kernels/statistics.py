@@ -14,8 +14,8 @@ def correlation_variance(rho: Any, cells: Any, of_echo: bool) -> Any:
         Of intensity, or the squared magnitude of the complex echo's, which for speckle is the same.
     cells : float or ndarray
     of_echo : bool
-        The latter: 2 rho (1 - rho)^2 / N and what is left of it at rho = 0, the Cramer-Rao bound for two complex
-        Gaussian echoes of unknown power. Else (1 - rho^2)^2 / N.
+        The latter: 2 rho (1 - rho)^2 / N and what is left of it at rho = 0, the Cramer-Rao bound for two
+        complex Gaussian echoes of unknown power. Else (1 - rho^2)^2 / N.
     """
     left = (1.0 - rho) * (1.0 - rho) / cells
     if of_echo:

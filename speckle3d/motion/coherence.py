@@ -207,7 +207,7 @@ class _Problem:
         lengths_mm: FloatArray,
         evidence: float,
     ) -> tuple[FloatArray, FloatArray]:
-        """Costs, penalties included, of every block, shape (b, s, p, k, l), and the shares and gains fitted."""
+        """Costs of every block, shape (b, s, p, k, l), penalties included, and shares and gains fitted."""
         moved = path[self._second] - path[self._first]
         middle = (self._first + self._second) / 2
         patches = self._rho.shape[1]

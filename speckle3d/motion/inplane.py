@@ -65,7 +65,8 @@ class PatchMatch:
     Attributes
     ----------
     correlation : ndarray, shape (p,)
-        Of intensity, or the squared magnitude of the complex echo's, at the frame's in-plane shift; NaN where a patch left the image or is flat.
+        Of intensity, or the squared magnitude of the complex echo's, at the frame's in-plane shift; NaN where
+        a patch left the image or is flat.
     shift_mm : ndarray, shape (p, 2)
         Each patch's own shift, lateral and axial; NaN where it has no peak.
     motion : InPlaneMotion
@@ -151,7 +152,7 @@ def match_patches(
     for _ in range(s.passes):
         lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
         rho = np.empty((len(patches), 3, 3))
-        patch_correlations(fixed, moving, *place, lag, s.least_overlap, rho)
+        patch_correlations(fixed, moving, *place, lag, s.least_overlap, rho, echoes is None)
         shift, weight = _patch_peaks(rho, lag, patches)
         motion, predicted, strain = _fit_motion(shift, weight, at, start, predicted)
         if np.array_equal(np.rint(predicted / patches.spacing_mm), lag):
@@ -159,7 +160,9 @@ def match_patches(
     if echoes is not None:
         lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
         ramp = wavenumber_per_mm * strain * patches.spacing_mm
-        patch_coherences(*echoes, *place, lag, ramp, s.least_overlap, rho)
+        patch_coherences(*echoes, *place, lag, ramp, s.least_overlap, rho, False)
+        # Speckle's correlation is nearly the product of what it is along either axis.
+        rho[:, ::2, ::2] = rho[:, ::2, 1:2] * rho[:, 1:2, ::2] / rho[:, 1:2, 1:2]
     offset = predicted / patches.spacing_mm - lag
     correlation = _read_at(rho, offset) if s.interpolate else rho[:, 1, 1]
     return PatchMatch(correlation, shift, motion)

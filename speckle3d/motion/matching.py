@@ -30,8 +30,8 @@ class MatchingSettings(BaseModel):
 
     correlate: Literal["echo", "intensity"] = Field(
         "echo",
-        description="echo: the complex echo, whose distances reach the Cramer-Rao bound and in which structure "
-        "that stays weighs less. intensity: as published. B-mode images hold intensity alone.",
+        description="echo: the complex echo, whose distances reach the Cramer-Rao bound and in which "
+        "structure that stays weighs less. intensity: as published. B-mode images hold intensity alone.",
     )
 
 

@@ -7,7 +7,8 @@ where it has. Correlations know no sign; the plane returned has a >= 0, and the 
 
 Tilt is nearly invisible to decorrelation: a focused beam's wavefront is curved about the focus, so that
 turning moves speckle at every depth as it moves it there, and patches see a + c (y - yc - pivot) with a pivot
-that grows with depth just as y does. The fit keeps what little is seen; `speckle3d.motion.slopes` says what it is worth.
+that grows with depth just as y does. The fit keeps what little is seen, and `speckle3d.motion.slopes` says
+what it is worth.
 """
 
 from __future__ import annotations
@@ -182,7 +183,7 @@ class PlaneFitter:
             misfit += CROSSING_EVIDENCE if number else 0.0
             if misfit < least:
                 best, least, total, normal = plane, misfit, cost, information
-                sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan)
+                sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan).astype(float)
                 excess = np.asarray(-standard * sigma)
         covariance = np.linalg.inv(normal) * max(1.0, total / max(int(used.sum()) - 3, 1))
         covariance[0, 0] += self.settings.bias_mm**2
