@@ -135,11 +135,12 @@ def correct(
     settings = config or Config()
     require_modes(sweep, modes)
     done: dict[str, DriftCorrection] = {}
+    # Wander that the sensed orientation shows need not be made up for by cubics.
+    start = tracked.subset if tracked.subset is not None else tracked.image
     for mode in modes:
         if mode == "pose":
-            done[mode] = _correct_by_tracker(tracked.image, sweep, settings)
+            done[mode] = _correct_by_tracker(start, sweep, settings)
         else:
-            start = tracked.subset if tracked.subset is not None else tracked.image
             done[mode] = _correct_by_orientation(start, sweep, settings)
     return done
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Sweep
 from speckle3d.motion.distances import DistanceEstimator
@@ -23,6 +22,8 @@ from speckle3d.motion.schedule import PairSchedule
 from speckle3d.motion.signs import SignResolver
 from speckle3d.motion.table import CorrelationTable
 
+SEARCHED = 3
+"""References against which the in-plane motion of a frame is searched, if it resembles none before."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
 
@@ -65,8 +66,7 @@ class Walk:
     def advance(self, frame: int, ready: ReadyFrame) -> None:
         """Match a frame with its references, place it, and let go of what is no longer needed."""
         self._ready[frame] = ready
-        matches = {first: self._match(first, frame) for first in self._schedule.references(frame)}
-        correlations = {first: _median(match.correlation) for first, match in matches.items()}
+        matches, correlations = self._matches(frame)
         if frame:
             self._place(frame, matches, correlations)
         self._schedule.settle(frame, correlations)
@@ -74,16 +74,31 @@ class Walk:
         self._ready = {k: v for k, v in self._ready.items() if k in keep}
         self._motion = {k: v for k, v in self._motion.items() if k in keep}
 
-    def _match(self, first: int, second: int) -> PatchMatch:
+    def _matches(self, frame: int) -> tuple[dict[int, PatchMatch], dict[int, float]]:
+        """Match a frame with its references, from a start found against the first that it resembles."""
         then = time.perf_counter()
+        references = self._schedule.references(frame)
+        matches: dict[int, PatchMatch] = {}
+        correlations: dict[int, float] = {}
+        for anchor in references[:SEARCHED]:
+            found = self.matcher.search(self._ready[anchor], self._ready[frame])
+            self._motion[frame] = compose(self._motion[anchor], found)
+            matches = {first: self._match(first, frame) for first in references}
+            correlations = {first: _median(match.correlation) for first, match in matches.items()}
+            if max(correlations.values()) >= self.config.trajectory.least_correlation:
+                break
+        else:
+            if references:
+                self._motion[frame] = self._motion[frame - 1]
+        self.times.add("in-plane motion and correlation", then)
+        return matches, correlations
+
+    def _match(self, first: int, second: int) -> PatchMatch:
         fixed, moving = self._ready[first], self._ready[second]
-        if second not in self._motion:
-            self._motion[second] = compose(self._motion[first], self.matcher.search(fixed, moving))
         start = compose(inverse(self._motion[first]), self._motion[second])
         match = self.matcher.match(fixed, moving, start)
-        if second - first == 1:
+        if second - first == 1 and _median(match.correlation) >= self.config.trajectory.least_correlation:
             self._motion[second] = compose(self._motion[first], match.motion)
-        self.times.add("in-plane motion and correlation", then)
         return match
 
     def _place(self, frame: int, matches: dict[int, PatchMatch], correlations: dict[int, float]) -> None:
@@ -99,12 +114,10 @@ class Walk:
             plane = self.fitter.fit(matches[first].correlation, np.array([motion.x_mm, motion.y_mm]))
             if plane is not None:
                 planes[first] = plane
-        if not planes:
-            raise InsufficientDataError(
-                f"{self.sweep.name}: frame {frame}: expected speckle in common with an earlier frame, "
-                "found none"
-            )
-        self._signs.place(frame, list(planes), list(planes.values()))
+        if planes:
+            self._signs.place(frame, list(planes), list(planes.values()))
+        else:
+            self._signs.hold(frame)
         for first, match in sorted(matches.items()):
             self.table.append(first, frame, match)
         self.times.add("distances and planes", then)

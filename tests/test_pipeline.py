@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
@@ -16,6 +16,7 @@ from speckle3d.direction import settle_direction, smooth_rotations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.matching import FrameMatcher
+from speckle3d.motion.quality import FrameFlag
 from speckle3d.pipeline import correct, track
 from speckle3d.study.metrics import compare_modes
 
@@ -99,8 +100,8 @@ def test_two_runs_are_equal(sweep, curves):
 def test_few_frames_are_kept_however_long_the_sweep(sweep, curves, monkeypatch):
     made, most, plain = [], [], FrameMatcher.prepare
 
-    def prepare(matcher, intensity):
-        ready = plain(matcher, intensity)
+    def prepare(matcher, echo):
+        ready = plain(matcher, echo)
         made.append(weakref.ref(ready))
         return ready
 
@@ -135,7 +136,8 @@ def test_the_first_image_pose_is_the_identity(tracked):
 
 
 def test_a_tracker_settles_the_direction(sweep, tracked):
-    assert (tracked.direction_from, tracked.unreliable) == ("tracker", ())
+    assert tracked.direction_from == "tracker"
+    assert not tracked.flags.any()
     assert settle_direction(sweep, tracked.image, Config()) == (1, "tracker")
     assert settle_direction(sweep, mirrored(tracked.image), Config()) == (-1, "tracker")
 
@@ -215,13 +217,64 @@ class NoiseFrames:
         return np.random.default_rng(index).normal(0, 300, frame.shape).astype(frame.dtype)
 
 
-def test_frames_without_common_speckle_are_named_and_too_many_refused(sweep, curves):
+def test_frames_without_speckle_are_flagged_and_too_many_refused(sweep, curves):
     short = head(sweep, 20)
     # The last three share nothing with anything; with the last twelve it is no sweep any more.
     found = track(replace(short, frames=NoiseFrames(short.frames, 17)), curves)
-    assert found.unreliable == (17, 18, 19)
+    assert np.flatnonzero(found.flags).tolist() == [17, 18, 19]
+    assert (found.flags[17:] & (FrameFlag.NO_SPECKLE | FrameFlag.LIFTED)).all()
     with pytest.raises(InsufficientDataError, match="frames"):
         track(replace(short, frames=NoiseFrames(short.frames, 8)), curves)
+
+
+class SpoiltFrames:
+    """A sweep's frames, some of them changed by a function of the frame."""
+
+    def __init__(self, frames, spoilt, change):
+        self._frames, self._spoilt, self._change = frames, spoilt, change
+        self.shape, self.dtype = frames.shape, frames.dtype
+
+    def __getitem__(self, index):
+        frame = self._frames[index]
+        return self._change(frame) if index in self._spoilt else frame
+
+
+SPOILT = {
+    "saturated": (lambda f: np.clip(30 * f.astype(int), -8192, 8191).astype(f.dtype), FrameFlag.SATURATED),
+    "empty": (lambda f: 0 * f, FrameFlag.NO_SPECKLE),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, curves, kind):
+    change, flag = SPOILT[kind]
+    short = head(sweep, 24)
+    good = track(short, curves)
+    found = track(replace(short, frames=SpoiltFrames(short.frames, {11}, change)), curves)
+    assert found.flags[11] & flag
+    assert not np.delete(found.flags, 11).any()
+    centre = sweep.grid.centre_mm
+    z, expected = (each.image.apply(centre)[:, 2] for each in (found, good))
+    # Some eight frames to the millimetre: a frame between its neighbours is a tremor off.
+    assert np.abs(np.delete(z - expected, 11)).max() < 0.02
+    assert abs(z[11] - expected[11]) < 0.08
+    deviation = np.sqrt(found.covariance[:, 2, 2])
+    assert deviation[11] > 3 * np.delete(deviation, [0, 11]).max()
+
+
+def test_curves_of_intensity_do_not_serve_echoes(sweep, curves):
+    config = Config.model_validate({"matching": {"correlate": "intensity"}})
+    with pytest.raises(MismatchError, match="correlation_of is echo and intensity"):
+        track(sweep, curves, config)
+
+
+def test_the_errors_of_poses_are_those_claimed(sweep, tracked):
+    centre, true = sweep.grid.centre_mm, sweep.truth[0].inv() * sweep.truth
+    error = tracked.image.apply(centre)[:, 2] - true.apply(centre)[:, 2]
+    standard = error[1:] / np.sqrt(tracked.covariance[1:, 2, 2])
+    # One sweep is one draw of what its frames share: it may be two deviations off, hardly three.
+    assert np.abs(standard).max() < 3.0
+    assert np.abs(standard).max() > 0.05
 
 
 def test_the_orientation_mode_stays_with_the_images_length(errors):

@@ -189,7 +189,9 @@ class PlaneFitter:
         covariance[0, 0] += self.settings.bias_mm**2
         if best[0] < 0 and slopes is None:
             best = -best
-        return PairPlane(float(best[0]), float(best[1]), float(best[2]), covariance, used, excess, sigma)
+        return PairPlane(
+            float(best[0]), float(best[1]), float(best[2]), np.asarray(covariance, float), used, excess, sigma
+        )
 
     def _middle(self, rho: FloatArray, model: EchoModel) -> float:
         d = self._estimator.distances(rho, model).distance_mm

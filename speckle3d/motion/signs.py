@@ -22,6 +22,8 @@ TURNING_COST = 2.0
 """Squared deviations by which the planes must speak for turning back: hands turn back rarely."""
 CAP = 9.0
 """Squared deviations beyond which a pair disagrees altogether: it may be wrong."""
+PLACED = 2.0
+"""Variance of an offset between frames over a pair's own: the earlier frame was placed by such pairs, too."""
 SAME_MM, SAME_SLOPE = 0.05, 0.005
 """Paths that end this close to each other at all frames still of use are one."""
 OPEN_FRAMES = 400
@@ -70,9 +72,13 @@ class SignResolver:
             cost = np.where(candidates[:, :, 0] < 0, np.inf, cost)
         self._keep(frame, self._cost[:, None] + cost, here, moved, weight, candidates, int(np.argmax(at)))
 
+    def hold(self, frame: int) -> None:
+        """Leave a frame that no plane places where the one before it is."""
+        self._paths[:, frame] = self._paths[:, frame - 1]
+
     def _weights(self, planes: Sequence[PairPlane], moved: FloatArray) -> FloatArray:
         """Inverse covariances of offsets and slopes, shape (e, 2, 2)."""
-        covariance = np.array([p.covariance[:2, :2] for p in planes])
+        covariance = PLACED * np.array([p.covariance[:2, :2] for p in planes])
         covariance[:, [0, 1], [0, 1]] += (self._relative_error * moved) ** 2
         return np.asarray(np.linalg.inv(covariance))
 
