@@ -161,8 +161,10 @@ def match_patches(
         lag = np.rint(predicted / patches.spacing_mm).astype(np.int64)
         ramp = wavenumber_per_mm * strain * patches.spacing_mm
         patch_coherences(*echoes, *place, lag, ramp, s.least_overlap, rho, False)
-        # Speckle's correlation is nearly the product of what it is along either axis.
-        rho[:, ::2, ::2] = rho[:, ::2, 1:2] * rho[:, 1:2, ::2] / rho[:, 1:2, 1:2]
+        # Speckle's correlation is nearly the product of what it is along either axis; by chance there may be
+        # next to none at the centre.
+        centre = np.maximum(rho[:, 1:2, 1:2], LEAST_CORRELATION)
+        rho[:, ::2, ::2] = rho[:, ::2, 1:2] * rho[:, 1:2, ::2] / centre
     offset = predicted / patches.spacing_mm - lag
     correlation = _read_at(rho, offset) if s.interpolate else rho[:, 1, 1]
     return PatchMatch(correlation, shift, motion)

@@ -134,3 +134,27 @@ def test_one_call_leaves_nothing_behind_for_the_next_patch():
     together = cohere(fixed, moving, places, shifts, (0.2, -0.1))
     alone = [cohere(fixed, moving, [at], [by], (0.2, -0.1))[0] for at, by in zip(places, shifts, strict=True)]
     np.testing.assert_array_equal(together, alone)
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    first=patches,
+    radius=st.tuples(st.integers(0, 2), st.integers(0, 2)),
+    of_echo=st.booleans(),
+)
+def test_without_corners_the_lags_along_either_axis_are_the_same(seed, first, radius, of_echo):
+    frames = echoes(seed)
+    out = np.full((2, len(first), 2 * radius[0] + 1, 2 * radius[1] + 1), 7.0)
+    place = np.array(first), SIZE, np.zeros((len(first), 2), np.int64)
+    for corners in (False, True):
+        if of_echo:
+            kernel_arguments = *(parts(echo) for echo in frames), *place, np.array([0.1, 0.2])
+            patch_coherences(*kernel_arguments, 0.3, out[int(corners)], corners)
+        else:
+            images = ((np.abs(echo) ** 2).astype(np.float32) for echo in frames)
+            patch_correlations(*images, *place, 0.3, out[int(corners)], corners)
+    cross = np.zeros(out.shape[2:], bool)
+    cross[radius[0]], cross[:, radius[1]] = True, True
+    np.testing.assert_array_equal(out[0][:, cross], out[1][:, cross])
+    assert np.isnan(out[0][:, ~cross]).all()

@@ -307,6 +307,34 @@ def test_independent_echoes_correlate_by_one_over_their_cells():
     assert np.nanmean(match_echoes((first, other)).correlation) == pytest.approx(0.022, abs=0.009)
 
 
+def test_echoes_without_anything_in_common_at_the_centre_lag_stay_within_bounds():
+    """Their neighbouring lags agree: what is read between lags is divided by what is left at the centre."""
+    v, s = np.indices((GRID.vectors, GRID.samples))
+    black, white = ((v + s) % 2 == side for side in (0, 1))
+    flat = np.ones((GRID.vectors, GRID.samples), np.float32)
+    for left in (0.0, 1e-6, 1e-3):
+        echoes = parts(black + 0j), parts(white + left * black + 0j)
+        # Flat images leave the start as it is: a third of a lag off the centre, both ways.
+        found = match_patches(
+            flat, flat, PATCHES, InPlaneMotion(0.1, 0.02), GRID.centre_mm, InPlaneSettings(), echoes, 57.0
+        )
+        assert np.isfinite(found.correlation).all()
+        assert (np.abs(found.correlation) < 1.5).all()
+
+
+@pytest.mark.parametrize("rho", [0.9, 0.4])
+def test_without_interpolation_the_echo_is_read_at_the_nearest_lag(rho):
+    motion = (GRID.vector_pitch_mm / 3, 0.0, 0.0)
+    read = [
+        np.nanmean(
+            [match_echoes(echo_pair(seed, motion, rho), interpolate=on).correlation for seed in range(4)]
+        )
+        for on in (True, False)
+    ]
+    # A third of a pitch, 0.1 mm, costs exp(-0.1^2 / 2 0.35^2) of the correlation.
+    assert read[1] / read[0] == pytest.approx(0.96, abs=0.012)
+
+
 def test_independent_speckle_does_not_correlate():
     found = match((pair(0)[0], pair(50)[0]))
     # The frame's lag, not each patch's best, so the mean stays near zero: 56 patches of 80 cells, 0.015 each.
