@@ -6,14 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 
 FloatArray = npt.NDArray[np.float64]
 
 _variance = njit(correlation_variance)
 
-_VARIANCE_FLOOR = 4e-6
-"""Of what interpolation between samples leaves: 0.002 in a correlation."""
 _LEAST_MM = 0.05
 """Distance below which correlation is flat: sensitivities are not taken to be less than here."""
 
@@ -47,7 +45,7 @@ def predict_correlation(
     model = gain * field * field
     derivative = 2.0 * gain * field * moving * slope
     limited = min(model, 0.999)
-    noise = _variance(limited, cells, of_echo) + _VARIANCE_FLOOR
+    noise = _variance(limited, cells, of_echo) + INTERPOLATION**2
     share_error = staying_sd * (1.0 - g) * 2.0 * field * gain
     stretch_error = stretch_sd * derivative * distance_mm
     return model, derivative, noise + share_error * share_error + stretch_error * stretch_error

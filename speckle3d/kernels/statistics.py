@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 
+INTERPOLATION = 0.003
+"""Standard deviation that interpolation between samples leaves in a correlation."""
+
+
 def correlation_variance(rho: Any, cells: Any, of_echo: bool) -> Any:
     """Variance of a correlation over so many independent cells.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import FloatArray
-from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.motion.patches import PatchGrid
 
 LEAST_CORRELATION = 0.03
@@ -16,8 +16,6 @@ LEAST_CORRELATION = 0.03
 TABLE_STEPS = 400
 SHARE_ERROR = 0.35
 """Relative error of a coherent share: structure is neither quite frozen nor quite Gaussian."""
-INTERPOLATION = 0.003
-"""Standard deviation that interpolation between samples leaves in a correlation."""
 STRETCH_ERROR = 0.1
 """Relative error of a stretch, which is chosen from steps of a sixth."""
 

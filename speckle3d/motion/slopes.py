@@ -17,7 +17,7 @@ from speckle3d.motion.planes import PairPlane
 
 NEAR_MM = 0.1
 """Frames nearer than this may turn as if they were this far apart: a hand trembles in place."""
-UNEVENNESS = 0.5
+UNEVENNESS = 0.4
 """Variation of the error of distances over the image against its mean; measured on simulated sweeps."""
 BEYOND_DOUBT = 2.0
 """Deviations at which a turn is taken for deliberate, however large it is."""

@@ -33,10 +33,11 @@ from speckle3d.config import Config
 from speckle3d.io.load import load_sweep
 from speckle3d.kernels.correlation import patch_correlations
 from speckle3d.motion.inplane import InPlaneMotion
-from speckle3d.motion.matching import FrameMatcher
+from speckle3d.motion.matching import Echo, FrameMatcher, MatchingSettings
 from speckle3d.simulation.presets import SimulationSettings
 
 HAND_SEEDS = (21, 22)
+INTENSITY = MatchingSettings(correlate="intensity")
 COUNT, STEP_MM = STEPPED["steps"], STEPPED["step_mm"]
 TESTED_STEPS = (2, 4, 6, 8, 10)
 CURVE_STEPS = (*range(1, 11), *range(12, 23, 2))
@@ -88,7 +89,7 @@ class Reader:
     def __init__(self, **settings):
         self.sweep = load_sweep(simulated(SimulationSettings(**{"vectors": VECTORS, **settings})))
         c = Config()
-        self.matcher = FrameMatcher(self.sweep, c.intensity, c.patches, c.inplane)
+        self.matcher = FrameMatcher(self.sweep, c.intensity, c.patches, c.inplane, INTENSITY)
         self.patches, grid, signal = self.matcher.patches, self.matcher.grid, self.sweep.signal
         self.analytic = self.matcher.extractor.analytic
         self.per_mm = 4e-3 * np.pi * np.mean(signal.bandwidth_hz) / signal.speed_of_sound_m_s
@@ -111,7 +112,7 @@ class Reader:
         """One frame for the package's matching and for what reads each kind of echo, equalised."""
         analytic = self.analytic(self.sweep.frames[number])
         analytic = self.strained(analytic) if strained else analytic
-        frame = {"ready": self.matcher.prepare((np.abs(analytic) ** 2).astype(np.float32))}
+        frame = {"ready": self.matcher.prepare(Echo((np.abs(analytic) ** 2).astype(np.float32), None))}
         for kind, gain in (("plain", 1.0), ("white", self.whitening)):
             echo = fft.ifft(fft.fft(analytic) * gain)
             power = (np.abs(echo) ** 2).astype(np.float32)
