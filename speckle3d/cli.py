@@ -176,11 +176,22 @@ def calibrate_curves(
     half = [_half_distance(curves.distance_mm, row) for row in curves.correlation]
     if as_json:
         table = {"depth_mm": curves.depth_mm.tolist(), "half_mm": half, "cells": curves.cells.tolist()}
+        if curves.tilt is not None:
+            table |= {name: values.tolist() for name, values in vars(curves.tilt).items()}
         _emit(json.dumps(table | {"pairs": curves.pairs_used}, indent=2))
         return
     _emit(f"{curves.pairs_used} frame pairs; correlation falls to one half at")
     for depth, distance, cells in zip(curves.depth_mm, half, curves.cells, strict=True):
         _emit(f"  {depth:5.1f} mm depth: {distance:.2f} mm  ({cells:.0f} independent cells in a patch)")
+    if curves.tilt is None:
+        _note("the phantom sweeps hardly turned: tilt will be taken to be about the image's centre")
+    else:
+        pivots = [
+            f"{depth - pivot:.0f}" for depth, pivot in zip(curves.depth_mm, curves.tilt.pivot_mm, strict=True)
+        ]
+        _note(
+            f"tilted frames decorrelate as if they turned about a point {pivots[0]} to {pivots[-1]} mm deep"
+        )
 
 
 def _half_distance(distance_mm: Any, correlation: Any) -> float:
