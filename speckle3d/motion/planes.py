@@ -34,8 +34,9 @@ SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 ROUNDS = 12
 LEAST_PATCHES = 6
-NEAR_MM, LOST_MM = 0.02, 0.5
-"""Where fits start at the least, correlation being flat at zero, and for frames without common speckle."""
+NEAR_MM, LOST_MM = 0.15, 0.5
+"""Where fits start at the least, and for frames without common speckle. Correlation is flat at zero, and
+frames that are farther apart than supposed look tilted from there."""
 
 
 class PlaneSettings(BaseModel):

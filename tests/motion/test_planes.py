@@ -291,9 +291,9 @@ def test_frames_that_cross_are_told_by_their_v_of_distances(plane, of):
     for found in fits(fitter, plane, 40, of=of):
         assert crosses(found)
         sign = 1.0 if plane[0] > 0 or found.slope_x * plane[1] > 0 else -1.0
-        # Four or five deviations of one draw: 0.006 mm, and a sixteenth of that per millimetre aside.
+        # Four or five deviations of one draw: 0.006 mm, and a tenth of that per millimetre aside.
         assert abs(sign * found.offset_mm - plane[0]) < 0.03
-        assert abs(sign * found.slope_x - plane[1]) < 0.002
+        assert abs(sign * found.slope_x - plane[1]) < 0.003
 
 
 @pytest.mark.parametrize("law", ["gaussian", "heavy", "speckle"])
@@ -360,3 +360,34 @@ def test_a_side_that_a_sensor_has_wrong_is_not_forced():
     plane = np.array([0.1, 0.03, 0.0])
     mirrored = fitter_of().fit(correlations(plane), STILL, slopes=-plane[1:])
     np.testing.assert_allclose(mirrored.coefficients, -plane, atol=1e-3)
+
+
+@pytest.mark.parametrize("start_mm", [0.0, 0.1, 0.6])
+@pytest.mark.parametrize("plane", [*PLANES, (0.02, 0.0, 0.0), (0.6, 0.002, 0.0), (0.9, 0.0, 0.0)])
+def test_a_wrong_guess_of_the_distance_does_no_harm(plane, start_mm):
+    """A path may have frames together that are apart: from nothing, a tilt would explain it, too."""
+    rho = correlations(plane)
+    fitter = fitter_of()
+    for seed in range(5):
+        noisy = drawn(rho, np.random.default_rng(seed))
+        one, other = fitter.fit(noisy, STILL), fitter.fit(noisy, STILL, start_mm=start_mm)
+        # Steps end within a deviation, of 1.5 % of the distance, from the minimum.
+        assert abs(one.offset_mm - other.offset_mm) < 0.015 * plane[0] + 1e-3
+
+
+@pytest.mark.parametrize("start_mm", [0.0, 0.3])
+def test_a_guess_does_not_make_frames_cross(start_mm):
+    fitter = fitter_of()
+    for plane in PARALLEL[:4]:
+        rng = np.random.default_rng(7)
+        found = [fitter.fit(drawn(correlations(plane), rng), STILL, start_mm=start_mm) for _ in range(20)]
+        assert not any(crosses(f) and abs(f.slope_x) > 0.003 for f in found)
+
+
+def test_a_side_that_is_settled_is_held():
+    """The offset starts on the slopes' own side alone; a mirror image that fits better is not looked for."""
+    plane, fitter = np.array([0.3, 0.006, 0.0]), fitter_of()
+    turned = fitter.fit(correlations(plane), STILL, slopes=-plane[1:])
+    held = fitter.fit(correlations(plane), STILL, slopes=-plane[1:], either_side=False)
+    np.testing.assert_allclose(turned.coefficients, -plane, atol=1e-3)
+    assert held.offset_mm > 0.25

@@ -127,6 +127,18 @@ def test_frames_that_cross_are_placed_on_both_sides(truth):
     np.testing.assert_array_equal(subset.side[clear], np.sign(z)[clear])
 
 
+def test_a_side_that_is_settled_is_held():
+    truth = np.array([-0.1, 0.03, 0.01])
+    distances = PatchDistances(np.abs(on_plane(truth)), np.full(len(AT), 0.02))
+    held = consistent_subset(distances, AT @ truth[1:], either_side=False)
+    # Placed through +d alone, the plane still finds its supporters beyond the crossing, none before it.
+    assert held.support.mean() > 0.3
+    wrong = consistent_subset(distances, -AT @ truth[1:], either_side=False)
+    either = consistent_subset(distances, -AT @ truth[1:])
+    np.testing.assert_array_equal(either.support, np.ones(len(AT), bool))
+    assert wrong.support.sum() <= either.support.sum()
+
+
 def test_sides_hold_with_the_noise_of_correlations(estimator):
     rng = np.random.default_rng(9)
     truth = np.array([0.1, 0.03, 0.0])

@@ -1,0 +1,225 @@
+"""The response to tilt: a made law recovered, and what it is worth at the level of patch distances."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import speckle
+
+from speckle3d.core.sweep import BModeSettings, ImageGrid
+from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.motion.decorrelation import PhantomSamples, fit_curves
+from speckle3d.motion.distances import DistanceEstimator
+from speckle3d.motion.intensity import two_way_wavenumber
+from speckle3d.motion.patches import lay_patches
+from speckle3d.motion.planes import PlaneFitter
+from speckle3d.motion.tilt import effective_distance, fit_tilt_response
+
+DEPTHS_MM = np.arange(5.0, 36.0, 5.0)
+CELLS = 60
+ECHO = replace(speckle.KEY, correlation_of="echo")
+K_PER_MM = two_way_wavenumber(speckle.RF)
+
+
+def widths(depth_mm):
+    """Curve's standard deviation: faster decorrelation near the face, as off a lens' focus."""
+    return np.interp(depth_mm, (5.0, 15.0, 35.0), (0.25, 0.35, 0.45))
+
+
+def pivots(depth_mm):
+    """About a point near the focus at 20 mm, as a probe's curved wavefronts have it."""
+    return 0.75 * (np.asarray(depth_mm) - 20.0) - 0.01 * (np.asarray(depth_mm) - 20.0) ** 2
+
+
+def spreads(depth_mm):
+    """A Gaussian beam's: wavenumber times the width squared, where rho = exp(-d^2 / 2 sigma^2)."""
+    return K_PER_MM * widths(depth_mm) ** 2
+
+
+def correlation(depth, offset, tilt):
+    """ALGORITHMS D: d_eff^2 = (z - pivot theta)^2 + (spread theta)^2."""
+    d2 = (offset - pivots(depth) * tilt) ** 2 + (spreads(depth) * tilt) ** 2
+    return np.exp(-d2 / (2 * widths(depth) ** 2))
+
+
+def noisy(rho, rng):
+    return rho + np.sqrt(correlation_variance(rho, CELLS, True)) * rng.normal(size=rho.shape)
+
+
+def stepped(frames=40, step_mm=0.06, tilt_deg=0.0, wander_deg=0.0, seed=0, law=correlation):
+    """Pairs of one phantom sweep whose frames turn, steadily or as a hand does, as they move."""
+    rng = np.random.default_rng(seed)
+    z = step_mm * np.arange(frames)
+    angle = np.deg2rad(tilt_deg) * np.arange(frames)
+    waves = np.sin(
+        2 * np.pi * (rng.uniform(0.3, 2, 3)[:, None] * np.linspace(0, 1, frames) + rng.random((3, 1)))
+    )
+    angle = angle + np.deg2rad(wander_deg) * waves.sum(axis=0)
+    first, second = np.triu_indices(frames, 1)
+    near = z[second] - z[first] <= 2.0
+    first, second = first[near], second[near]
+    tilt = (angle[second] - angle[first])[:, None]
+    # Frames turn about the image's middle at 20 mm, as seen from the image's centre.
+    offset = (z[second] - z[first])[:, None] + tilt * (DEPTHS_MM - 20.0)
+    depth = np.broadcast_to(DEPTHS_MM, offset.shape)
+    tilt = np.broadcast_to(tilt, offset.shape)
+    rho = noisy(law(depth, offset, tilt), rng)
+    columns = (np.ravel(c) for c in (depth, offset, tilt, rho))
+    return PhantomSamples(*columns, first.size)
+
+
+def learn(samples, key=ECHO):
+    return fit_curves(key, samples)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    """Curves from two sweeps that do not turn and three of hands that do."""
+    still = [stepped(seed=seed) for seed in range(2)]
+    return learn([*still, *(stepped(wander_deg=1.0, seed=seed) for seed in (2, 3, 4))])
+
+
+# ---- the law ----------------------------------------------------------------------------------------------
+
+
+def test_effective_distance_is_that_of_the_closed_form():
+    """A degree about the patch at a wavelength of 0.205 mm, a beam of 0.45 mm: ALGORITHMS D's figures."""
+    spread = 4 * np.pi / 0.205 * 0.45**2
+    at = effective_distance(np.array([0.0, 0.3, -0.3]), np.deg2rad([1.0, 1.0, 0.0]), 0.0, spread)
+    rho = np.exp(-(at**2) / (2 * 0.45**2))
+    np.testing.assert_allclose(rho[:2], [0.891, 0.713], atol=0.002)
+    assert np.isclose(at[2], 0.3)
+
+
+def test_about_the_pivot_only_the_spread_is_seen():
+    tilt = np.array([0.02, -0.02])
+    np.testing.assert_allclose(effective_distance(7.0 * tilt, tilt, 7.0, 3.0), 0.06)
+    np.testing.assert_allclose(effective_distance(7.0 * tilt, tilt, 7.0, 0.0), 0.0, atol=1e-15)
+    # Turning the other way moves the patch the other way.
+    there, back = effective_distance(np.array([0.2, 0.2]), tilt, 7.0, 0.0)
+    np.testing.assert_allclose([there, back], [0.06, 0.34])
+
+
+# ---- fitting ----------------------------------------------------------------------------------------------
+
+
+def test_the_pivot_of_a_made_law_is_recovered(learnt):
+    assert learnt.tilt is not None
+    np.testing.assert_allclose(learnt.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
+
+
+def test_the_spread_follows_from_the_curves_width(learnt):
+    np.testing.assert_allclose(learnt.tilt.spread_mm, spreads(DEPTHS_MM), rtol=0.08)
+
+
+def test_the_curves_are_those_of_frames_that_do_not_turn(learnt):
+    d = learnt.distance_mm
+    for row, width in zip(learnt.correlation, widths(DEPTHS_MM), strict=True):
+        useful = (d > 0.1) & (d < 1.5 * width)
+        read = np.interp(-np.exp(-(d[useful] ** 2) / (2 * width**2)), -row, d)
+        np.testing.assert_allclose(read, d[useful], rtol=0.03)
+
+
+def test_frames_that_turn_do_not_bend_the_curves():
+    """Of hand-held sweeps alone, none of which moves without turning."""
+    made = learn([stepped(wander_deg=1.0, seed=seed) for seed in range(4)])
+    assert made.tilt is not None
+    width = np.array([np.interp(-0.5, -row, made.distance_mm) for row in made.correlation]) / np.sqrt(
+        2 * np.log(2)
+    )
+    np.testing.assert_allclose(width, widths(DEPTHS_MM), rtol=0.03)
+    # Told that nothing turned, the same samples bend them.
+    blind = [replace(stepped(wander_deg=1.0, seed=s)) for s in range(4)]
+    blind = [replace(s, tilt_rad=np.zeros_like(s.tilt_rad)) for s in blind]
+    bent = learn(blind)
+    bent = np.array([np.interp(-0.5, -row, bent.distance_mm) for row in bent.correlation]) / np.sqrt(
+        2 * np.log(2)
+    )
+    assert np.abs(bent / widths(DEPTHS_MM) - 1).max() > 0.06
+
+
+def test_the_pivots_sign_is_told():
+    """Mirrored tilt angles are another probe: the pivot that explains them is not the same."""
+    sweeps = [stepped(seed=0), *(stepped(wander_deg=1.0, seed=s) for s in (2, 3))]
+    mirrored = [replace(s, offset_mm=-s.offset_mm, tilt_rad=-s.tilt_rad) for s in sweeps]
+    for one in (sweeps, mirrored):
+        np.testing.assert_allclose(learn(one).tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
+
+
+def test_phantoms_that_do_not_turn_tell_nothing_of_it():
+    assert learn([stepped(seed=seed) for seed in range(2)]).tilt is None
+
+
+def test_phantoms_that_hardly_turn_tell_too_little_of_it():
+    """A hundredth of a degree, as of a linear stage's ways, is lost in the noise of the correlations."""
+    assert learn([stepped(wander_deg=0.003, seed=seed) for seed in range(2)]).tilt is None
+
+
+def test_few_pairs_that_turn_are_not_enough():
+    few = stepped(frames=6, wander_deg=1.0)
+    distance = np.linspace(0.0, 2.0, 201)
+    curves = np.array([speckle.gaussian_correlation(distance, w) for w in widths(DEPTHS_MM)])
+    samples = (few.depth_mm, few.offset_mm, few.tilt_rad, few.correlation)
+    cells = np.full(DEPTHS_MM.size, float(CELLS))
+    assert fit_tilt_response(DEPTHS_MM, curves, cells, distance, K_PER_MM, True, samples) is None
+
+
+def test_bmode_images_of_unknown_frequency_have_a_pivot_without_spread():
+    key = replace(speckle.KEY, signal=BModeSettings(60.0))
+
+    def no_spread(depth, offset, tilt):
+        return np.exp(-((offset - pivots(depth) * tilt) ** 2) / (2 * widths(depth) ** 2))
+
+    made = learn([stepped(wander_deg=1.0, seed=s, law=no_spread) for s in range(3)], key)
+    np.testing.assert_allclose(made.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
+    assert (made.tilt.spread_mm == 0).all()
+
+
+# ---- what it is worth -------------------------------------------------------------------------------------
+
+GRID = ImageGrid(vectors=127, samples=560, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
+PATCHES = lay_patches(GRID)
+AT = PATCHES.centre_mm - GRID.centre_mm[:2]
+
+
+def tilt_sweep(tilt_deg, step_mm=0.1, seed=0):
+    """Correlations of a pair that moves a step and tilts about the image's centre, for every patch."""
+    tilt = np.deg2rad(tilt_deg)
+    depth = PATCHES.centre_mm[:, 1]
+    rng = np.random.default_rng(seed)
+    return noisy(correlation(depth, step_mm + tilt * AT[:, 1], tilt), rng)
+
+
+def read_lengths(learnt, tilt_deg, step_mm):
+    """Relative error of length without the response, with it, and with it and a sensed orientation."""
+    depth = (5.0, 15.0, 35.0)
+    still = replace(speckle.curves(sigma_mm=widths(depth), depth_mm=depth, cells=CELLS), key=ECHO)
+    without, with_it = (PlaneFitter(DistanceEstimator(made, PATCHES), AT) for made in (still, learnt))
+    slopes, still_image = np.array([0.0, np.deg2rad(tilt_deg)]), np.zeros(2)
+    pairs = [tilt_sweep(tilt_deg, step_mm, seed) for seed in range(40)]
+    read = [
+        [
+            without.fit(rho, still_image),
+            with_it.fit(rho, still_image),
+            with_it.fit(rho, still_image, slopes=slopes),
+        ]
+        for rho in pairs
+    ]
+    return np.mean([[plane.offset_mm for plane in row] for row in read], axis=0) / step_mm - 1
+
+
+@pytest.mark.parametrize("step_mm", [0.2, 0.3])
+def test_a_degree_of_tilt_per_pair_no_longer_lengthens_the_sweep(learnt, step_mm):
+    """ALGORITHMS D: more than a fifth too long without, less than a twentieth off with the response."""
+    without, with_it, sensed = read_lengths(learnt, 1.0, step_mm)
+    assert without > 0.2
+    assert abs(sensed) < 0.05
+    # Images alone see little of the tilt itself, and the length is better for it all the same.
+    assert abs(with_it) < 0.06
+
+
+def test_tilt_the_other_way_is_as_good(learnt):
+    """There, turning brings half the depths nearer, and errors cancel in part even without."""
+    _, with_it, sensed = read_lengths(learnt, -1.0, 0.2)
+    assert abs(sensed) < 0.05
+    assert abs(with_it) < 0.1
