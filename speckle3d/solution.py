@@ -38,6 +38,7 @@ from speckle3d.walk import StageTimes, Walk
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 SINK_PAIRS = 1024
+ENOUGH_PAIRS = 3
 ADAPTED_ERROR = 0.1
 """Relative error of distances where coherence has been adapted to, for the choice of signs."""
 MOST_LOST = 0.3
@@ -207,8 +208,10 @@ class Solution:
         least = self._config.trajectory.least_correlation
         distance = np.abs(position_mm[self._second] - position_mm[self._first])
         left = np.array([np.median(self._estimator.fully_developed(d)) for d in distance])
-        near = (left >= least) & self._sound
-        # Every frame keeps its nearest pair, however little it tells.
+        near = (left >= self._config.trajectory.clear_correlation) & self._sound
+        # Frames without enough of them take those that tell less, and if need be one that tells little.
+        pairs = np.bincount(self._second[near], minlength=self._frames)
+        near |= (left >= least) & self._sound & (pairs[self._second] < ENOUGH_PAIRS)
         for frame in np.setdiff1d(self._second[self._sound], self._second[near]):
             rows = np.flatnonzero((self._second == frame) & self._sound)
             near[rows[np.argmax(left[rows])]] = True

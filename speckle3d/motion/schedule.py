@@ -30,6 +30,13 @@ class TrajectorySettings(BaseModel):
         description="Least median correlation that a pair must have, and that speckle at its distance would, "
         "to be used.",
     )
+    clear_correlation: float = Field(
+        0.4,
+        gt=0,
+        lt=1,
+        description="Median correlation that speckle at a pair's distance must have to be used, where frames "
+        "have enough such pairs: from there on what has decorrelated at the top of the image bends planes.",
+    )
     huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
     revisit_mm: float = Field(
         1.0,
