@@ -52,9 +52,7 @@ def main() -> None:
         for lever, name in (("pivot", "as the beam is"), ("depth", "if speckle turned with its depth")):
             speckle, curves = tilt_deviation(vectors, lever)
             print(f"  {vectors:3} vectors, {name:33} {speckle:5.2f}   with the curves' error {curves:5.2f}")
-    print(
-        f"  a hand's slow wander in the simulator: {wander:.2f} at any time, {2**0.5 * wander:.2f} between two"
-    )
+    print(f"  the simulated hand's slow wander: {wander:.2f} at any time, {2**0.5 * wander:.2f} between two")
 
 
 if __name__ == "__main__":
