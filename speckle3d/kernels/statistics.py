@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-
 INTERPOLATION = 0.003
 """Standard deviation that interpolation between samples leaves in a correlation."""
 

@@ -92,6 +92,7 @@ class DistanceEstimator:
         self.tilt = here.tilt
         self._grid = curves.distance_mm
         self._rho = here.correlation
+        self._typical = np.median(self.amplitude, axis=0)
         self._slope = -np.gradient(here.correlation, self.step_mm, axis=1)
         self._slope[:, 0] = 0.0
         root = np.sqrt(-np.log(here.correlation))
@@ -115,6 +116,11 @@ class DistanceEstimator:
         if model is not None:
             distance = distance * model.stretch
         return PatchDistances(distance, np.where(np.isnan(rho), np.nan, self.sigma(distance, model)))
+
+    def typical_distance(self, amplitude: float) -> float:
+        """Distance at which the median patch's fully developed speckle keeps this amplitude, mm."""
+        falling = self._typical[::-1]
+        return float(np.interp(amplitude, falling, self._grid[: self._typical.size][::-1]))
 
     def fully_developed(self, distance_mm: float) -> FloatArray:
         """Correlation that fully developed speckle would have at one distance, shape (p,)."""

@@ -32,11 +32,13 @@ LOOSE_SLOPE = 0.05
 """Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
 SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
+WELL_FITTED = 0.9
+"""Squared deviations per patch below which no other hypothesis can do better by enough to matter."""
 ROUNDS = 12
 LEAST_PATCHES = 6
-NEAR_MM, LOST_MM = 0.15, 0.5
-"""Where fits start at the least, and for frames without common speckle. Correlation is flat at zero, and
-frames that are farther apart than supposed look tilted from there."""
+NEAR_MM = 0.15
+"""Where fits start at the least: correlation is flat at zero, and frames that are farther apart than supposed
+look tilted from there."""
 
 
 class PlaneSettings(BaseModel):
@@ -186,6 +188,8 @@ class PlaneFitter:
                 best, least, total, normal = plane, misfit, cost, information
                 sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan).astype(float)
                 excess = np.asarray(-standard * sigma)
+            if slopes is None and misfit < WELL_FITTED * used.sum():
+                break
         covariance = np.linalg.inv(normal) * max(1.0, total / max(int(used.sum()) - 3, 1))
         covariance[0, 0] += self.settings.bias_mm**2
         if best[0] < 0 and slopes is None:
@@ -195,8 +199,10 @@ class PlaneFitter:
         )
 
     def _middle(self, rho: FloatArray, model: EchoModel) -> float:
-        d = self._estimator.distances(rho, model).distance_mm
-        return float(np.nanmedian(d)) if np.isfinite(d).any() else LOST_MM
+        known = rho[np.isfinite(rho)]
+        share = model.staying.mean()
+        left = (np.sqrt(max(float(np.median(known)), 0.0)) - share) / max(1.0 - share, 0.1)
+        return self._estimator.typical_distance(left)
 
     def _starts(
         self,
