@@ -6,7 +6,7 @@ import pytest
 import sweep_examples
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.reconstruction import FramePairs, Provenance
+from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
 
@@ -37,12 +37,15 @@ def pairs(first, seed=0):
 POSES = {"image": sweep_examples.poses(N), "pose": sweep_examples.poses(N, 1)}
 
 
-def write(path, chunks=(), poses=POSES, finish=True):
+TRUST = Trust(np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (N, 1, 1)), np.array([0, 0, 1, 0, 16, 0, 0, 8]))
+
+
+def write(path, chunks=(), poses=POSES, finish=True, trust=TRUST):
     with ReconstructionWriter(path, TIMES, GRID) as writer:
         for chunk in chunks:
             writer.append_pairs(chunk)
         if finish:
-            writer.finish(poses, PROVENANCE, CONFIG)
+            writer.finish(poses, PROVENANCE, CONFIG, trust)
 
 
 @pytest.fixture
@@ -64,6 +67,21 @@ def test_everything_a_reconstruction_holds_comes_back(path):
         expected = parts[0] if field.name == "patch_centre_mm" else np.concatenate(parts)
         np.testing.assert_array_equal(getattr(got.pairs, field.name), expected)
         assert getattr(got.pairs, field.name).dtype == expected.dtype
+
+
+def test_how_far_poses_may_be_trusted_comes_back(path, tmp_path):
+    got = read_reconstruction(path).trust
+    np.testing.assert_array_equal(got.covariance, TRUST.covariance)
+    np.testing.assert_array_equal(got.flags, TRUST.flags)
+    write(tmp_path / "older.h5", trust=None)
+    assert read_reconstruction(tmp_path / "older.h5").trust is None
+
+
+def test_covariances_of_other_frames_are_refused(tmp_path):
+    short = Trust(TRUST.covariance[1:], TRUST.flags)
+    with pytest.raises(InvalidInputError, match=r"covariance: expected shape \(8, 6, 6\), got \(7, 6, 6\)"):
+        write(tmp_path / "r.h5", trust=short)
+    assert not (tmp_path / "r.h5").exists()
 
 
 def test_pairs_may_be_left_out(path, tmp_path):

@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.motion.slopes import SlopeEvidence
+from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, pose_covariance
+
+CENTRE_MM = np.array([7.0, 22.0, 0.0])
+Z_MM = np.concatenate([np.linspace(0, 10, 51), np.linspace(10, 0, 51)[1:]])
+POSES = RigidTransform.from_translation(np.column_stack([0 * Z_MM, 0 * Z_MM, Z_MM]))
+X, Y, Z, TILT, YAW, ROLL = range(6)
+
+
+def covariance(scale=0.0, turn=(0.0, 0.0), share=0.0, independent=1e-8):
+    graph = np.tile(independent * np.eye(6), (len(POSES), 1, 1))
+    evidence = SlopeEvidence(np.ones(2), np.array(turn))
+    return pose_covariance(POSES, graph, CENTRE_MM, scale, evidence, share)
+
+
+def test_covariances_are_symmetric_and_positive():
+    found = covariance(0.03, (1e-3, 2e-3), 0.1)
+    np.testing.assert_allclose(found, found.transpose(0, 2, 1))
+    assert (np.linalg.eigvalsh(found) > 0).all()
+
+
+def test_an_error_of_scale_grows_on_the_way_and_mostly_comes_back():
+    deviation = np.sqrt(covariance(scale=0.02)[:, Z, Z])
+    # Two hundredths of ten millimetres; what changes along the way does not cancel on the way back.
+    assert deviation[50] == pytest.approx(0.02 * np.sqrt(100 + SCALE_CHANGE_MM * 10), rel=1e-3)
+    assert deviation[100] == pytest.approx(0.02 * np.sqrt(SCALE_CHANGE_MM * 20), rel=1e-2)
+
+
+def test_a_false_turn_bends_the_sweep():
+    yaw = covariance(turn=(1e-3, 0.0))
+    # Turned by z / 1000 at z, the centre is off by the mean turn times z.
+    assert np.sqrt(yaw[50, X, X]) == pytest.approx(1e-3 * 100 / 2, rel=1e-2)
+    assert yaw[50, X, YAW] > 0
+    tilt = covariance(turn=(0.0, 1e-3))
+    assert np.sqrt(tilt[50, Y, Y]) == pytest.approx(1e-3 * 100 / 2, rel=1e-2)
+    assert tilt[50, Y, TILT] < 0
+
+
+def test_structure_that_stays_makes_lateral_motion_and_roll_uncertain():
+    plain, tissue = covariance(independent=1e-4), covariance(share=0.1, independent=1e-4)
+    grown = np.diagonal(tissue[10]) / np.diagonal(plain[10])
+    assert grown[X] > 2
+    assert grown[ROLL] > 2
+    np.testing.assert_allclose(grown[[Y, Z, TILT, YAW]], 1.0)
