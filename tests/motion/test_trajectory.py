@@ -1,4 +1,4 @@
-"""Signs and poses from pair measurements made of known trajectories."""
+"""Poses from pair measurements made of known trajectories."""
 
 from dataclasses import replace
 
@@ -10,21 +10,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import relative_poses
+from speckle3d.motion import trajectory
 from speckle3d.motion.inplane import InPlaneMotion
 from speckle3d.motion.planes import PairPlane
-from speckle3d.motion.trajectory import (
-    PairMeasurement,
-    PairSchedule,
-    SignedPair,
-    SignResolver,
-    TrajectorySettings,
-    sign_pair,
-    solve_trajectory,
-)
+from speckle3d.motion.schedule import PairSchedule, TrajectorySettings
+from speckle3d.motion.signs import SignResolver, pair_signs
+from speckle3d.motion.trajectory import RelativePoses, held, joined, relative_poses_of, solve_trajectory
 
 CENTRE_MM = np.array([19.0, 20.0, 0.0])
 SIGMA_MM = 0.45
-STILL = np.ones(3, bool)
+NOTHING = np.zeros(1)
+PLAIN = TrajectorySettings(huber=1e6)
 
 
 def hand(z_mm, seed=0, turn_deg=0.4):
@@ -38,8 +34,12 @@ def hand(z_mm, seed=0, turn_deg=0.4):
     return poses[0].inv() * poses
 
 
+def plane_of(a, b, c, covariance):
+    return PairPlane(a, b, c, np.asarray(covariance), NOTHING == 0, NOTHING, NOTHING + 1)
+
+
 def measure(poses, first, second, rng, relative_noise=0.03, noise_mm=0.004):
-    """What the stages before would tell of one pair: in-plane motion, unsigned plane, correlation."""
+    """What the stages before would tell of one pair: in-plane motion and an unsigned plane."""
     pose = poses[first].inv() * poses[second]
     x, y, z = pose.translation
     roll, yaw, tilt = pose.rotation.as_euler("ZYX")
@@ -47,30 +47,34 @@ def measure(poses, first, second, rng, relative_noise=0.03, noise_mm=0.004):
     slopes = np.array([-np.sin(yaw), np.cos(yaw) * np.sin(tilt)]) + 2e-4 * rng.normal(size=2)
     side = 1.0 if a >= 0 else -1.0
     variance = [(relative_noise * z) ** 2 + noise_mm**2 + 0.02**2, 4e-8, 4e-8]
-    plane = PairPlane(side * a, *(side * slopes), np.diag(variance), STILL)
-    motion = InPlaneMotion(x, y, roll, np.diag([1e-5, 1e-6, 1e-8]))
-    return PairMeasurement(first, second, motion, plane)
+    plane = plane_of(side * a, *(side * slopes), np.diag(variance))
+    return InPlaneMotion(x, y, roll, np.diag([1e-5, 1e-6, 1e-8])), plane
 
 
-def correlation(pair):
-    return float(np.exp(-(pair.plane.offset_mm**2) / (2 * SIGMA_MM**2)))
+def correlation(plane):
+    return float(np.exp(-(plane.offset_mm**2) / (2 * SIGMA_MM**2)))
 
 
 def follow(poses, seed=1, settings=None, **noise):
-    """Read the sweep as it comes: schedule, measure, sign; returns the signed pairs."""
+    """Read the sweep as it comes: schedule, measure; then settle the signs; returns the edges."""
     rng = np.random.default_rng(seed)
     settings = settings or TrajectorySettings()
-    schedule, resolver, signed = PairSchedule(settings), SignResolver(), []
+    schedule, resolver, read = PairSchedule(settings), SignResolver(len(poses), 0.1), []
     for frame in range(len(poses)):
-        every = [measure(poses, first, frame, rng, **noise) for first in schedule.references(frame)]
-        usable = [p for p in every if correlation(p) >= settings.least_correlation]
-        schedule.settle(frame, {p.first: correlation(p) for p in every})
+        every = {first: measure(poses, first, frame, rng, **noise) for first in schedule.references(frame)}
+        usable = {k: v for k, v in every.items() if correlation(v[1]) >= settings.least_correlation}
+        schedule.settle(frame, {k: correlation(plane) for k, (_, plane) in every.items()})
         if frame:
             assert usable, f"frame {frame} is out of reach"
-            signs = resolver.place(usable)
-            signed += [sign_pair(p, p.plane, s) for p, s in zip(usable, signs, strict=True)]
-        resolver.forget(schedule.needed(frame))
-    return signed
+            resolver.place(frame, list(usable), [plane for _, plane in usable.values()])
+        read += [(first, frame, *usable[first]) for first in usable]
+    first, second, motions, planes = zip(*read, strict=True)
+    signs = pair_signs(resolver.path, np.array(first), np.array(second), planes)
+    return relative_poses_of(first, second, motions, planes, signs)
+
+
+def solved(pairs, frames, centre_mm=CENTRE_MM, settings=None):
+    return solve_trajectory(pairs, frames, np.asarray(centre_mm), settings).poses
 
 
 def elevation(poses):
@@ -111,14 +115,14 @@ TRAJECTORIES = {
 }
 
 
-# ---- signs and poses --------------------------------------------------------------------------------------
+# ---- whole sweeps ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", TRAJECTORIES)
 def test_poses_are_recovered(name):
     z = TRAJECTORIES[name]
     truth = about_centre(hand(z))
-    found = solve_trajectory(follow(hand(z)), len(z), CENTRE_MM)
+    found = solved(follow(hand(z)), len(z))
     np.testing.assert_allclose(found[0].as_matrix(), np.eye(4), atol=1e-12)
     travel = np.abs(np.diff(z)).sum()
     # Pairs of about 0.3 mm, right to 3 % and 0.004 mm each, make a random walk: 0.02 mm per root of mm.
@@ -135,7 +139,7 @@ def test_a_sweep_read_backwards_is_the_same_sweep_mirrored():
     z = uneven(60, 5.0)
     for direction in (1, -1):
         truth = hand(direction * z, turn_deg=0.0)
-        found = solve_trajectory(follow(truth), len(z), CENTRE_MM)
+        found = solved(follow(truth), len(z))
         assert (np.diff(elevation(found)) > -0.02).all()
         assert abs(elevation(found)[-1] / 5.0 - 1) < 0.05
 
@@ -143,9 +147,32 @@ def test_a_sweep_read_backwards_is_the_same_sweep_mirrored():
 def test_without_noise_poses_are_exact():
     z = TRAJECTORIES["reversal"]
     truth = about_centre(hand(z))
-    found = solve_trajectory(follow(hand(z), relative_noise=0.0, noise_mm=1e-9), len(z), CENTRE_MM)
+    found = solved(follow(hand(z), relative_noise=0.0, noise_mm=1e-9), len(z))
     # 2e-4 of slope noise per pair remains, over a centre that does not feel it.
     assert np.abs(elevation(found) - elevation(truth)).max() < 0.02
+
+
+@pytest.mark.parametrize("heavy", [False, True], ids=["normal", "heavy tails"])
+def test_the_graph_jitters_less_than_the_chain(heavy):
+    """Steps between frames, from pairs whose errors are not those their covariance has it."""
+    z = uneven(120, 12.0)
+    truth, rms = about_centre(hand(z)), {}
+    rng = np.random.default_rng(11)
+    pairs = follow(hand(z), relative_noise=0.0, noise_mm=1e-9)
+    size = 0.02 + 0.06 * np.abs(pairs.poses.translation[:, 2])
+    draws = rng.standard_t(3, len(pairs)) / np.sqrt(3) if heavy else rng.normal(size=len(pairs))
+    error = np.column_stack([np.zeros((len(pairs), 2)), size * draws])
+    noisy = replace(pairs, poses=RigidTransform.from_translation(error) * pairs.poses)
+    for join in ("graph", "chain"):
+        found = elevation(solved(noisy, len(z), settings=TrajectorySettings(join=join)))
+        rms[join] = np.std(np.diff(found) - np.diff(elevation(truth)))
+    # A chained step is the difference of two pairs' errors; six to ten pairs share one in the graph.
+    assert rms["graph"] < 0.6 * rms["chain"]
+    # And the chain is as noisy as what it was given: long pairs, whose key frames are chained themselves.
+    assert 0.5 * size.mean() < rms["chain"] < 5 * size.mean()
+
+
+# ---- the schedule ------------------------------------------------------------------------------------------
 
 
 def test_key_frames_are_farther_apart_where_the_probe_is_slow():
@@ -174,9 +201,10 @@ def test_key_frames_are_farther_apart_where_the_probe_is_slow():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_signed_pair_lies_on_its_plane(sign):
-    plane = PairPlane(0.3, 0.011, -0.017, np.diag([1e-4, 1e-8, 2e-8]), STILL)
-    pair = PairMeasurement(3, 5, InPlaneMotion(0.2, -0.1, 0.03, np.eye(3) * 1e-6), plane)
-    pose = sign_pair(pair, plane, sign).pose
+    plane = plane_of(0.3, 0.011, -0.017, np.diag([1e-4, 1e-8, 2e-8]))
+    pairs = relative_poses_of([3], [5], [InPlaneMotion(0.2, -0.1, 0.03, np.eye(3) * 1e-6)], [plane], [sign])
+    assert (pairs.first.tolist(), pairs.second.tolist()) == ([3], [5])
+    pose = pairs.poses[0]
     for x, y in ((0, 0), (10, -5), (-15, 15)):
         z = pose.apply([x, y, 0.0])[2]
         assert abs(z - sign * (0.3 + 0.011 * x - 0.017 * y)) < 1e-12
@@ -185,20 +213,19 @@ def test_a_signed_pair_lies_on_its_plane(sign):
 
 
 def test_the_other_sign_is_the_mirror_image_in_the_first_frames_plane():
-    plane = PairPlane(0.3, 0.011, -0.017, np.eye(3), STILL)
-    pair = PairMeasurement(0, 1, InPlaneMotion(0.2, -0.1, 0.03), plane)
+    plane, motion = plane_of(0.3, 0.011, -0.017, np.eye(3)), InPlaneMotion(0.2, -0.1, 0.03)
+    pairs = relative_poses_of([0, 0], [1, 1], [motion] * 2, [plane] * 2, [1.0, -1.0])
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
-    plus, minus = (sign_pair(pair, plane, s).pose.as_matrix() for s in (1.0, -1.0))
+    plus, minus = pairs.poses.as_matrix()
     np.testing.assert_allclose(mirror @ plus @ mirror, minus, atol=1e-12)
 
 
 def test_covariance_is_in_the_order_x_y_z_tilt_yaw_roll():
     inplane = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]) * 1e-4
     plane_cov = np.array([[4.0, 0.4, 0.5], [0.4, 5.0, 0.6], [0.5, 0.6, 6.0]]) * 1e-6
-    plane = PairPlane(0.3, 0.0, 0.0, plane_cov, STILL)
-    signed = sign_pair(PairMeasurement(0, 1, InPlaneMotion(0, 0, 0, inplane), plane), plane, 1.0)
+    motion, plane = InPlaneMotion(0, 0, 0, inplane), plane_of(0.3, 0.0, 0.0, plane_cov)
+    (c,) = relative_poses_of([0], [1], [motion], [plane], [1.0]).covariance
     x, y, z, tilt, yaw, roll = range(6)
-    c = signed.covariance
     np.testing.assert_allclose(c, c.T)
     # In-plane variances carry a floor of a micrometre and a few hundredths of a milliradian.
     np.testing.assert_allclose(c[[x, y, roll], [x, y, roll]], [1e-4, 2e-4, 3e-4], rtol=0.02)
@@ -216,6 +243,13 @@ def pose_of(x, y, z, tilt, yaw, roll):
     return RigidTransform.from_components([x, y, z], Rotation.from_euler("xyz", [tilt, yaw, roll]))
 
 
+def edges_of(rows):
+    """Edges from (first, second, pose, covariance)."""
+    first, second, poses, covariance = zip(*rows, strict=True)
+    poses = RigidTransform.concatenate(list(poses))
+    return RelativePoses(np.array(first), np.array(second), poses, np.array(covariance))
+
+
 def random_covariance(rng, scale=(0.02, 0.02, 0.03, 0.003, 0.003, 0.002)):
     root = (0.3 * rng.normal(size=(6, 6)) + np.eye(6)) * np.array(scale)[:, None]
     return root @ root.T
@@ -227,22 +261,28 @@ def random_graph(seed, frames=6, turn=0.15):
     steps = rng.normal(size=(frames, 6)) * [3, 3, 3, turn, turn, turn]
     truth = [pose_of(*s) for s in steps]
     edges = [(i, j) for j in range(1, frames) for i in range(j) if i == j - 1 or rng.uniform() < 0.6]
-    pairs = []
+    rows = []
     for i, j in edges:
         covariance = random_covariance(rng)
         error = rng.multivariate_normal(np.zeros(6), covariance)
-        pairs.append(SignedPair(i, j, truth[i].inv() * truth[j] * pose_of(*error), covariance))
-    return pairs, truth
+        rows.append((i, j, truth[i].inv() * truth[j] * pose_of(*error), covariance))
+    return edges_of(rows), RigidTransform.concatenate(truth)
+
+
+def kept(pairs, which):
+    """Some of the edges."""
+    return RelativePoses(pairs.first[which], pairs.second[which], pairs.poses[which], pairs.covariance[which])
 
 
 def dense_residuals(pairs, matrices):
     """Weighted twists, by matrix logarithms, of every pair's disagreement."""
     out = []
-    for pair in pairs:
-        relative = np.linalg.inv(matrices[pair.first]) @ matrices[pair.second]
-        log = np.real(logm(np.linalg.inv(pair.pose.as_matrix()) @ relative))
+    for i, j, pose, covariance in zip(
+        pairs.first, pairs.second, pairs.poses.as_matrix(), pairs.covariance, strict=True
+    ):
+        log = np.real(logm(np.linalg.inv(pose) @ np.linalg.inv(matrices[i]) @ matrices[j]))
         twist = np.array([log[0, 3], log[1, 3], log[2, 3], log[2, 1], log[0, 2], log[1, 0]])
-        out.append(np.linalg.cholesky(np.linalg.inv(pair.covariance)).T @ twist)
+        out.append(np.linalg.cholesky(np.linalg.inv(covariance)).T @ twist)
     return np.concatenate(out)
 
 
@@ -251,12 +291,13 @@ def matrices_of(x):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_poses_are_the_least_squares_ones(seed):
+def test_poses_are_the_least_squares_ones(seed, monkeypatch):
     pairs, truth = random_graph(seed)
-    start = [truth[0].inv() * pose for pose in truth[1:]]
-    x0 = np.concatenate([[*p.translation, *p.rotation.as_euler("xyz")] for p in start])
+    start = truth[0].inv() * truth[1:]
+    x0 = np.column_stack([start.translation, start.rotation.as_euler("xyz")]).ravel()
     dense = least_squares(lambda x: dense_residuals(pairs, matrices_of(x)), x0, method="lm", xtol=1e-12)
-    found = solve_trajectory(pairs, len(truth), np.zeros(3), TrajectorySettings(huber=1e6), rounds=20)
+    monkeypatch.setattr(trajectory, "ROUNDS", 20)
+    found = solved(pairs, len(truth), np.zeros(3), PLAIN)
     # Gauss-Newton drops the curvature of the logarithm, of the size of the residuals: the minimum is the
     # same to a few micrometres, and its cost to second order in that.
     np.testing.assert_allclose(found.as_matrix(), matrices_of(dense.x), atol=2e-3)
@@ -264,23 +305,27 @@ def test_poses_are_the_least_squares_ones(seed):
     assert cost < dense.cost * 1.001
 
 
-def test_a_few_rounds_are_enough():
+def test_a_few_rounds_are_enough(monkeypatch):
     pairs, truth = random_graph(7)
-    settings = TrajectorySettings(huber=1e6)
-    found, longer = (solve_trajectory(pairs, len(truth), np.zeros(3), settings, n) for n in (6, 40))
+    found = solved(pairs, len(truth), np.zeros(3), PLAIN)
+    monkeypatch.setattr(trajectory, "ROUNDS", 40)
+    longer = solved(pairs, len(truth), np.zeros(3), PLAIN)
     np.testing.assert_allclose(found.as_matrix(), longer.as_matrix(), atol=1e-4)
 
 
 def test_pairs_that_agree_are_met_exactly_wherever_the_centre_is():
     _, truth = random_graph(1)
-    local = RigidTransform.concatenate(truth)
-    local = local[0].inv() * local
-    edges = [(i, j) for j in range(1, 6) for i in range(j)]
-    pairs = [SignedPair(i, j, local[i].inv() * local[j], 1e-4 * np.eye(6)) for i, j in edges]
+    local = truth[0].inv() * truth
+    first, second = np.triu_indices(6, 1)
+    exact = np.tile(1e-4 * np.eye(6), (first.size, 1, 1))
+    pairs = RelativePoses(first, second, local[first].inv() * local[second], exact)
     for centre in (np.zeros(3), CENTRE_MM):
         shift = RigidTransform.from_translation(centre)
-        found = solve_trajectory(pairs, 6, centre)
-        np.testing.assert_allclose(found.as_matrix(), (shift * local * shift.inv()).as_matrix(), atol=1e-8)
+        for join in ("graph", "chain"):
+            found = solved(pairs, 6, centre, TrajectorySettings(join=join))
+            np.testing.assert_allclose(
+                found.as_matrix(), (shift * local * shift.inv()).as_matrix(), atol=1e-8
+            )
 
 
 @pytest.mark.parametrize("axis", range(6), ids=["x", "y", "z", "tilt", "yaw", "roll"])
@@ -291,35 +336,138 @@ def test_a_pair_uncertain_in_one_direction_gives_way_in_that_direction_alone(axi
     unsure[axis, axis] *= 1e6
     gap = np.zeros(6)
     gap[axis] = 0.02
-    pairs = [
-        SignedPair(0, 1, pose_of(0, 0, 0, 0, 0, 0), unsure),
-        SignedPair(1, 2, pose_of(0, 0, 0, 0, 0, 0), sure),
-        SignedPair(0, 2, pose_of(*gap), sure),
-    ]
-    found = solve_trajectory(pairs, 3, np.zeros(3), TrajectorySettings(huber=1e6))
-    first, second = relative_poses(found)
+    still = np.zeros(6)
+    pairs = edges_of(
+        [(0, 1, pose_of(*still), unsure), (1, 2, pose_of(*still), sure), (0, 2, pose_of(*gap), sure)]
+    )
+    first, second = relative_poses(solved(pairs, 3, np.zeros(3), PLAIN))
     np.testing.assert_allclose(first.as_matrix(), pose_of(*gap).as_matrix(), atol=1e-5)
     np.testing.assert_allclose(second.as_matrix(), np.eye(4), atol=1e-5)
 
 
 def test_one_false_pair_among_many_is_overruled():
     z = uneven(40, 4.0)
-    truth = hand(z)
-    pairs = follow(truth)
-    worst = next(k for k, p in enumerate(pairs) if p.first == 17 and p.second == 19)
-    false = RigidTransform.from_translation([0, 0, 1.0]) * pairs[worst].pose
-    wrong = [*pairs[:worst], replace(pairs[worst], pose=false), *pairs[worst + 1 :]]
+    pairs = follow(hand(z))
+    wrong = (pairs.first == 17) & (pairs.second == 19)
+    assert wrong.sum() == 1
+    false = RigidTransform.from_translation(np.outer(wrong, [0, 0, 1.0])) * pairs.poses
     clean, robust, plain = (
-        elevation(solve_trajectory(p, len(z), CENTRE_MM, TrajectorySettings(huber=h)))[-1]
-        for p, h in ((pairs, 2.0), (wrong, 2.0), (wrong, 1e6))
+        elevation(solved(p, len(z), settings=TrajectorySettings(huber=h)))[-1]
+        for p, h in ((pairs, 2.0), (replace(pairs, poses=false), 2.0), (replace(pairs, poses=false), 1e6))
     )
     assert abs(robust - clean) < 0.25 * abs(plain - clean)
 
 
 def test_a_frame_out_of_reach_is_named():
     pairs, truth = random_graph(0)
-    cut = [p for p in pairs if p.second != 3]
+    cut = kept(pairs, pairs.second != 3)
     with pytest.raises(InsufficientDataError, match=r"frame 3: .* \(1 of 6 frames so\)"):
-        solve_trajectory(cut, len(truth), CENTRE_MM)
+        solved(cut, len(truth))
     with pytest.raises(InsufficientDataError, match="frame 6: "):
-        solve_trajectory(pairs, 8, CENTRE_MM)
+        solved(pairs, 8)
+
+
+def test_the_chain_takes_the_pair_whose_distance_is_surest_for_its_size():
+    near, far = pose_of(0, 0, 0.1, 0, 0, 0), pose_of(0, 0, 0.5, 0, 0, 0)
+    covariance = np.tile(1e-6 * np.eye(6), (3, 1, 1))
+    # 0.01 mm of 0.1 mm, then 0.02 of 0.5: surer for its size, and the two do not agree.
+    covariance[:, 2, 2] = [1e-6, 0.01**2, 0.02**2]
+    pairs = edges_of(zip([0, 1, 0], [1, 2, 2], [near, near, far], covariance, strict=True))
+    found = solved(pairs, 3, np.zeros(3), TrajectorySettings(join="chain"))
+    np.testing.assert_allclose(found.translation[:, 2], [0, 0.1, 0.5], atol=1e-12)
+
+
+# ---- covariance --------------------------------------------------------------------------------------------
+
+
+def test_marginal_covariance_is_that_of_many_draws():
+    """Errors in each frame's own axes, over draws of all pairs' errors."""
+    draws, frames = 800, 6
+    pairs, _ = random_graph(4, frames)
+    truth = solved(pairs, frames, np.zeros(3), PLAIN)
+    # The same graph without misfit, pairs right but for what is drawn.
+    exact = truth[pairs.first].inv() * truth[pairs.second]
+    claimed = solve_trajectory(
+        replace(pairs, poses=exact), frames, np.zeros(3), PLAIN, with_covariance=True
+    ).covariance
+    rng = np.random.default_rng(12)
+    root = np.linalg.cholesky(pairs.covariance)
+    errors = np.empty((draws, frames, 6))
+    for k in range(draws):
+        twist = np.einsum("eij,ej->ei", root, rng.normal(size=(len(pairs), 6)))
+        off = RigidTransform.from_exp_coords(twist[:, [3, 4, 5, 0, 1, 2]])
+        found = solved(replace(pairs, poses=exact * off), frames, np.zeros(3), PLAIN)
+        errors[k] = (truth.inv() * found).as_exp_coords()[:, [3, 4, 5, 0, 1, 2]]
+    assert (claimed[0] == 0).all()
+    for covariance, error in zip(claimed[1:], errors.transpose(1, 0, 2)[1:], strict=True):
+        seen = np.cov(error.T)
+        deviation = np.sqrt(np.diag(covariance))
+        # A deviation from 800 draws is itself right to 2.5 %, a correlation to 0.035.
+        np.testing.assert_allclose(np.sqrt(np.diag(seen)), deviation, rtol=0.15)
+        np.testing.assert_allclose(
+            seen / np.outer(deviation, deviation), covariance / np.outer(deviation, deviation), atol=0.25
+        )
+
+
+def test_a_chain_of_equal_steps_is_a_random_walk():
+    """More frames than covariances are computed for; those between are interpolated."""
+    frames, step = 250, np.diag([4e-4, 1e-4, 9e-4, 1e-8, 1e-8, 1e-8])
+    assert frames > 2 * trajectory.KNOWN_FRAMES
+    first = np.arange(frames - 1)
+    still = RigidTransform.from_translation(np.zeros((frames - 1, 3)))
+    pairs = RelativePoses(first, first + 1, still, np.tile(step, (frames - 1, 1, 1)))
+    found = solve_trajectory(pairs, frames, CENTRE_MM, with_covariance=True)
+    assert found.covariance.shape == (frames, 6, 6)
+    np.testing.assert_allclose(
+        found.covariance, np.arange(frames)[:, None, None] * step, rtol=1e-3, atol=1e-12
+    )
+    np.testing.assert_allclose(found.covariance, found.covariance.transpose(0, 2, 1))
+
+
+def test_covariance_is_computed_only_if_asked_for():
+    pairs, truth = random_graph(0)
+    assert not solve_trajectory(pairs, len(truth), CENTRE_MM).covariance.any()
+
+
+# ---- frames that no pair places ----------------------------------------------------------------------------
+
+
+def test_a_frame_that_is_held_alone_lies_between_its_neighbours_and_is_not_trusted():
+    z, lone = uneven(40, 4.0), 17
+    pairs = follow(hand(z))
+    measured = kept(pairs, (pairs.first != lone) & (pairs.second != lone))
+    with pytest.raises(InsufficientDataError, match=f"frame {lone}: "):
+        solved(measured, len(z))
+    tied = joined(measured, held(np.array([lone - 1, lone]), np.array([lone, lone + 1])))
+    assert len(tied) == len(measured) + 2
+    found = solve_trajectory(tied, len(z), CENTRE_MM, with_covariance=True)
+    before, at, after = elevation(found.poses)[lone - 1 : lone + 2]
+    # Midway, as both edges say the same; to a micrometre, a hundredth of the step.
+    assert abs(at - (before + after) / 2) < 1e-3
+    assert after - before > 0.05
+    full = solve_trajectory(pairs, len(z), CENTRE_MM, with_covariance=True)
+    others = np.delete(np.arange(len(z)), lone)
+    # Its neighbours lose nothing but the pairs with it.
+    assert np.abs(elevation(found.poses) - elevation(full.poses))[others].max() < 0.03
+    deviation = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    # Two edges of 1 mm and 0.05 rad side by side.
+    np.testing.assert_allclose(deviation[lone, :3], 1 / np.sqrt(2), rtol=0.05)
+    np.testing.assert_allclose(deviation[lone, 3:], 0.05 / np.sqrt(2), rtol=0.05)
+    assert (deviation[lone] > 4 * deviation[others].max(axis=0)).all()
+
+
+def test_held_edges_do_not_move_frames_that_pairs_place():
+    pairs, truth = random_graph(3)
+    alone = solved(pairs, len(truth), np.zeros(3), PLAIN)
+    tied = solved(joined(pairs, held(np.array([0]), np.array([5]))), len(truth), np.zeros(3))
+    # Its jump of several mm is many deviations of 1 mm: robust weights leave little of it.
+    assert np.abs(tied.as_matrix() - alone.as_matrix()).max() < 0.02
+
+
+def test_joining_leaves_out_what_is_empty():
+    pairs, _ = random_graph(2)
+    none = held(np.array([], dtype=int), np.array([], dtype=int))
+    assert len(none) == 0
+    whole = joined(none, pairs, none)
+    np.testing.assert_array_equal(whole.poses.as_matrix(), pairs.poses.as_matrix())
+    np.testing.assert_array_equal(whole.covariance, pairs.covariance)
