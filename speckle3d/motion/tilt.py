@@ -25,7 +25,7 @@ TURNED_RAD = 1e-5
 def effective_distance(
     offset_mm: FloatArray, tilt_rad: FloatArray, pivot_mm: FloatArray | float, spread_mm: FloatArray | float
 ) -> FloatArray:
-    """Distance without tilt at which speckle would have decorrelated as much (ALGORITHMS: rotation)."""
+    """Distance without tilt at which speckle would have decorrelated as much."""
     return np.asarray(np.hypot(offset_mm - pivot_mm * tilt_rad, spread_mm * tilt_rad))
 
 

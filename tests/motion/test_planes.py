@@ -32,7 +32,7 @@ def fitter_of(of="echo", tilt=TILT, bias_mm=0.02):
 
 
 def patch_distances(plane, tilt=TILT):
-    """Distance without tilt at which each patch's speckle would decorrelate as much: ALGORITHMS D."""
+    """Distance without tilt at which each patch's speckle would decorrelate as much."""
     a, b, c = plane
     z = a + b * AT[:, 0] + c * AT[:, 1]
     if tilt is None:

@@ -37,7 +37,7 @@ def spreads(depth_mm):
 
 
 def correlation(depth, offset, tilt):
-    """ALGORITHMS D: d_eff^2 = (z - pivot theta)^2 + (spread theta)^2."""
+    """A Gaussian beam: d_eff^2 = (z - pivot theta)^2 + (spread theta)^2."""
     d2 = (offset - pivots(depth) * tilt) ** 2 + (spreads(depth) * tilt) ** 2
     return np.exp(-d2 / (2 * widths(depth) ** 2))
 
@@ -83,7 +83,7 @@ def learnt():
 
 
 def test_effective_distance_is_that_of_the_closed_form():
-    """A degree about the patch at a wavelength of 0.205 mm, a beam of 0.45 mm: ALGORITHMS D's figures."""
+    """A degree about the patch at a wavelength of 0.205 mm, a beam of 0.45 mm."""
     spread = 4 * np.pi / 0.205 * 0.45**2
     at = effective_distance(np.array([0.0, 0.3, -0.3]), np.deg2rad([1.0, 1.0, 0.0]), 0.0, spread)
     rho = np.exp(-(at**2) / (2 * 0.45**2))
@@ -210,7 +210,7 @@ def read_lengths(learnt, tilt_deg, step_mm):
 
 @pytest.mark.parametrize("step_mm", [0.2, 0.3])
 def test_a_degree_of_tilt_per_pair_no_longer_lengthens_the_sweep(learnt, step_mm):
-    """ALGORITHMS D: more than a fifth too long without, less than a twentieth off with the response."""
+    """More than a fifth too long without, less than a twentieth off with the response."""
     without, with_it, sensed = read_lengths(learnt, 1.0, step_mm)
     assert without > 0.2
     assert abs(sensed) < 0.05
