@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import (
     FloatArray,
+    require_finite,
     require_increasing,
     transforms_from_matrices,
 )
@@ -231,10 +232,9 @@ def _read_mode(group: h5py.Group, mode: str, frames: int) -> RigidTransform:
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
     if "pose_covariance" not in file or "frame_flags" not in file:
         return None
-    return Trust(
-        read_checked(file, "pose_covariance/image", (frames, 6, 6)),
-        read_checked(file, "frame_flags", (frames,), np.int64),
-    )
+    covariance = read_checked(file, "pose_covariance/image", (frames, 6, 6))
+    require_finite(covariance, locate(file, "pose_covariance/image"))
+    return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64))
 
 
 def _read_config(file: h5py.File) -> str:

@@ -77,11 +77,24 @@ def test_how_far_poses_may_be_trusted_comes_back(path, tmp_path):
     assert read_reconstruction(tmp_path / "older.h5").trust is None
 
 
-def test_covariances_of_other_frames_are_refused(tmp_path):
-    short = Trust(TRUST.covariance[1:], TRUST.flags)
-    with pytest.raises(InvalidInputError, match=r"covariance: expected shape \(8, 6, 6\), got \(7, 6, 6\)"):
-        write(tmp_path / "r.h5", trust=short)
-    assert not (tmp_path / "r.h5").exists()
+@pytest.mark.parametrize(
+    ("trust", "message"),
+    [
+        (
+            Trust(TRUST.covariance[1:], TRUST.flags),
+            r"covariance: expected shape \(8, 6, 6\), got \(7, 6, 6\)",
+        ),
+        (
+            Trust(TRUST.covariance[..., 0], TRUST.flags),
+            r"covariance: expected shape \(8, 6, 6\), got \(8, 6\)",
+        ),
+        (Trust(TRUST.covariance, TRUST.flags[:3]), r"flags: expected shape \(8,\), got \(3,\)"),
+    ],
+)
+def test_trust_of_other_frames_is_refused(tmp_path, trust, message):
+    with pytest.raises(InvalidInputError, match=message):
+        write(tmp_path / "r.h5", trust=trust)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_pairs_may_be_left_out(path, tmp_path):
@@ -157,6 +170,14 @@ def edit_entry(node, index, value):
     return lambda file: file[node].__setitem__(index, value)
 
 
+def replace_entry(node, values):
+    def edit(file):
+        del file[node]
+        file[node] = values
+
+    return edit
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
@@ -177,6 +198,12 @@ def edit_entry(node, index, value):
             lambda file: file.attrs.__setitem__("vector_pitch_mm", 0),
             r"r\.h5: vector_pitch_mm: expected a value",
         ),
+        (replace_entry("frame_flags", np.zeros(3, int)), r"/frame_flags: expected .*\(8,\).*\(3,\)"),
+        (
+            replace_entry("pose_covariance/image", np.eye(6)),
+            r"/pose_covariance/image: expected .*\(8, 6, 6\)",
+        ),
+        (edit_entry("pose_covariance/image", (3, 2, 2), np.nan), r"/pose_covariance/image\[.*3, 2, 2"),
         (lambda file: file.attrs.__setitem__("version", 9), r"speckle3d.reconstruction version 1, got 9"),
     ],
 )

@@ -1,9 +1,11 @@
+"""What poses' covariance is made of: the graph's own, the scale, false turns, structure."""
+
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.motion.slopes import SlopeEvidence
-from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, pose_covariance
+from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, SHARED, pose_covariance
 
 CENTRE_MM = np.array([7.0, 22.0, 0.0])
 Z_MM = np.concatenate([np.linspace(0, 10, 51), np.linspace(10, 0, 51)[1:]])
@@ -46,3 +48,31 @@ def test_structure_that_stays_makes_lateral_motion_and_roll_uncertain():
     assert grown[X] > 2
     assert grown[ROLL] > 2
     np.testing.assert_allclose(grown[[Y, Z, TILT, YAW]], 1.0)
+
+
+def test_without_other_errors_what_is_left_is_the_graphs():
+    found = covariance(independent=1e-4)
+    np.testing.assert_allclose(found, np.tile(1e-4 * np.diag(SHARED**2), (len(POSES), 1, 1)), atol=1e-15)
+
+
+def test_parts_add_up():
+    """Independent of each other: variances of all errors are the sums of each one's."""
+    none = covariance()
+    parts = [covariance(scale=0.02), covariance(turn=(1e-3, 0.0)), covariance(turn=(0.0, 2e-3))]
+    whole = covariance(0.02, (1e-3, 2e-3))
+    np.testing.assert_allclose(whole - none, sum(part - none for part in parts), atol=1e-15)
+
+
+def test_a_turned_frames_own_errors_are_given_along_the_first_frames_axes():
+    """A quarter turn of yaw: what the frame calls across is the sweep's elevation."""
+    turns = Rotation.from_rotvec([[0, 0, 0], [0, np.pi / 2, 0]])
+    poses = RigidTransform.from_rotation(turns)
+    graph = np.zeros((2, 6, 6))
+    graph[:, X, X], graph[:, Z, Z], graph[:, TILT, TILT] = 4e-4, 1e-6, 1e-8
+    quiet = SlopeEvidence(np.ones(2), np.zeros(2))
+    first, turned = pose_covariance(poses, graph, np.zeros(3), 0.0, quiet)
+    assert first[X, X] == pytest.approx(4e-4 * SHARED[X] ** 2)
+    assert turned[Z, Z] == pytest.approx(4e-4 * SHARED[X] ** 2)
+    assert turned[X, X] == pytest.approx(1e-6 * SHARED[Z] ** 2)
+    assert turned[ROLL, ROLL] == pytest.approx(1e-8 * SHARED[TILT] ** 2)
+    assert turned[TILT, TILT] == pytest.approx(0, abs=1e-20)

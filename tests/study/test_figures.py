@@ -28,6 +28,34 @@ def test_drift_figure_draws_every_mode_and_the_reference_in_both_panels(sweep):
     assert offset.lines[1].get_color() == MODE_COLOURS["image"] == tilt.lines[1].get_color()
 
 
+def test_the_images_95_percent_interval_is_drawn_in_both_panels(sweep):
+    image, tracker = sweep
+    deviation = np.linspace(0.0, 0.8, 60)
+    covariance = np.zeros((60, 6, 6))
+    # Along z, mm, and tilt, rad: the panels' own.
+    covariance[:, 2, 2], covariance[:, 3, 3] = deviation**2, (0.01 * deviation) ** 2
+    covariance[:, 0, 0] = 1e6
+    drawn = {"image": image, "pose": image}
+    plain, shaded = (figure_drift(drawn, CENTRE_MM, tracker, covariance=c) for c in (None, covariance))
+    assert [len(panel.collections) for panel in plain.axes] == [0, 0]
+    assert [len(panel.collections) for panel in shaded.axes] == [1, 1]
+    motion = accumulated(image, CENTRE_MM)
+    curves = (motion.length_mm, np.rad2deg(motion.tilt_rad))
+    widths = (1.96 * deviation, np.rad2deg(1.96 * 0.01 * deviation))
+    for panel, curve, width in zip(shaded.axes, curves, widths, strict=True):
+        outline = panel.collections[0].get_paths()[0].vertices
+        for frame in (0, 20, 59):
+            at = outline[np.isclose(outline[:, 0], frame), 1]
+            assert at.max() == pytest.approx(curve[frame] + width[frame], abs=1e-9)
+            assert at.min() == pytest.approx(curve[frame] - width[frame], abs=1e-9)
+    assert "95 % of image" in [text.get_text() for text in shaded.axes[0].get_legend().get_texts()]
+
+
+def test_no_interval_is_drawn_without_the_images_curve(sweep):
+    figure = figure_drift({"pose": sweep[0]}, CENTRE_MM, covariance=np.tile(np.eye(6), (60, 1, 1)))
+    assert not figure.axes[0].collections
+
+
 def test_reference_trace_has_gaps_and_does_not_hang_on_its_first_reading(sweep):
     image, tracker = sweep
     covered = np.ones(60, dtype=bool)
