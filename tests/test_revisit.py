@@ -143,7 +143,7 @@ def test_nothing_is_looked_for_where_it_is_not_wanted(walk):
     assert find_revisits(quiet, positions(walk.sweep), None) == []
 
 
-def test_candidates_are_of_other_visits_few_and_nearest_first():
+def test_candidates_are_of_an_earlier_visit_few_and_nearest_first():
     there = np.arange(0, 12, 0.02)
     position = np.concatenate([there, there[::-1], there])
     travel = np.concatenate([[0], np.cumsum(np.abs(np.diff(position)))])
@@ -153,8 +153,8 @@ def test_candidates_are_of_other_visits_few_and_nearest_first():
         assert 4 <= len(found) <= MOST_CANDIDATES
         assert (np.diff(off) >= 0).all()
         assert (travel[second] - travel[found] > AWAY_MM).all()
-    # Both earlier visits have a say.
-    assert len({i // there.size for i in found}) == 2
+    # The latest visit before has a say, be it with or without those before it.
+    assert 1 in {i // there.size for i in found}
     assert _candidates(599, position, travel) == []
 
 
