@@ -24,8 +24,8 @@ AWAY_MM = 3.0
 REACH_MM, REACH_PER_MM = 0.4, 0.02
 """How far off a return may be found: speckle's range, and drift with travel."""
 SPACING_MM = 0.15
-MOST_CANDIDATES = 24
-KEPT_FRAMES = 48
+MOST_CANDIDATES = 16
+KEPT_FRAMES = 24
 LEAST_PAIRS = 4
 CAP, MARGIN = 9.0, 6.0
 """Squared deviations at which a pair counts as wrong, and by which a place must beat any other."""
@@ -75,10 +75,10 @@ def _candidates(second: int, position_mm: FloatArray, travel: FloatArray) -> lis
     between = travel[second] - travel[:second]
     off = np.abs(position_mm[:second] - position_mm[second])
     near = np.flatnonzero((between > AWAY_MM) & (off < REACH_MM + REACH_PER_MM * between))
-    # One frame of each visit in every bin of position.
+    # The latest visit is tied to those before it already; one of its frames in every bin of position.
     visit = np.cumsum(np.diff(near, prepend=-2) > 1)
-    bins = np.round(position_mm[near] / SPACING_MM).astype(int)
-    _, one = np.unique(np.stack([visit, bins]), axis=1, return_index=True)
+    near = near[visit == visit.max(initial=0)]
+    _, one = np.unique(np.round(position_mm[near] / SPACING_MM), return_index=True)
     thinned = near[one]
     return [int(i) for i in thinned[np.argsort(off[thinned])][:MOST_CANDIDATES]]
 
