@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from speckle3d.core.geometry import FloatArray
 from speckle3d.motion.coherence import Coherence
+from speckle3d.motion.distances import EchoModel
 from speckle3d.motion.inplane import PatchMatch
 from speckle3d.motion.matching import ReadyFrame
 from speckle3d.motion.planes import PairPlane
-from speckle3d.walk import Walk
+from speckle3d.walk import Walk, median_correlation
 
 AWAY_MM = 3.0
 """Travel between two visits: less is within reach of the pairs measured anyway."""
@@ -36,11 +37,13 @@ RELATIVE_ERROR, FIXED_ERROR_MM = 0.1, 0.02
 
 @dataclass(frozen=True)
 class Revisit:
-    """A pair of frames from two visits, and the sign of its plane."""
+    """A pair of frames from two visits: how its echoes are read, its plane and the plane's sign."""
 
     first: int
     second: int
     match: PatchMatch
+    model: EchoModel | None
+    plane: PairPlane
     sign: float
 
 
@@ -93,28 +96,27 @@ def _tie(
     coherence: Coherence | None,
 ) -> list[Revisit]:
     """Pairs of one frame with those it came back to, if they agree on one place for it."""
-    matches, planes = {}, {}
+    read = {}
     for first in earlier:
         match = reader.match(first, second)
-        matches[first] = match
-        known = match.correlation[np.isfinite(match.correlation)]
-        if known.size and np.median(known) >= walk.config.trajectory.least_correlation:
-            moved = np.array([match.motion.x_mm, match.motion.y_mm])
+        if median_correlation(match.correlation) >= walk.config.trajectory.least_correlation:
             model = None
             if coherence is not None:
                 apart = np.array([position_mm[second] - position_mm[first]])
                 model = coherence.models(np.array([float(first)]), apart)[0]
+            moved = np.array([match.motion.x_mm, match.motion.y_mm])
             plane = walk.fitter.fit(match.correlation, moved, model)
             if plane is not None:
-                planes[first] = plane
-    if len(planes) < LEAST_PAIRS:
+                read[first] = Revisit(first, second, match, model, plane, 1.0)
+    if len(read) < LEAST_PAIRS:
         return []
     reach = REACH_MM + REACH_PER_MM * float(np.ptp(travel[[*earlier, second]]))
-    shift = _place(position_mm[second] - position_mm[list(earlier)], [planes.get(i) for i in earlier], reach)
+    planes = [read[i].plane if i in read else None for i in earlier]
+    shift = _place(position_mm[second] - position_mm[list(earlier)], planes, reach)
     if shift is None:
         return []
     at = position_mm[second] + shift
-    return [Revisit(i, second, matches[i], 1.0 if at >= position_mm[i] else -1.0) for i in planes]
+    return [replace(r, sign=1.0 if at >= position_mm[i] else -1.0) for i, r in read.items()]
 
 
 def _place(apart_mm: FloatArray, planes: Sequence[PairPlane | None], reach_mm: float) -> float | None:

@@ -242,16 +242,12 @@ class Solution:
         for r in revisits:
             self._walk.table.append(r.first, r.second, r.match)
         self._take_table()
-        for row, r in enumerate(revisits, start=rows):
-            model = None
-            if coherence is not None:
-                apart = path[[r.second], 0] - path[[r.first], 0]
-                model = coherence.models(np.array([(r.first + r.second) / 2]), np.minimum(apart, 0.5))[0]
-            plane = self._walk.fitter.fit(self._rho[row].astype(float), self._moved(row), model)
-            if plane is not None:
-                measured = [*measured, _Measured(row, r.first, r.second, model, plane, r.sign)]
+        tied = [
+            _Measured(row, r.first, r.second, r.model, r.plane, r.sign)
+            for row, r in enumerate(revisits, start=rows)
+        ]
         self._walk.times.add("revisits", then)
-        return sorted(measured, key=lambda m: (m.second, m.first))
+        return sorted([*measured, *tied], key=lambda m: (m.second, m.first))
 
     def _moved(self, row: int) -> FloatArray:
         motion = self._walk.table.motion(row)

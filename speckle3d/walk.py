@@ -84,7 +84,7 @@ class Walk:
             found = self.matcher.search(self._ready[anchor], self._ready[frame])
             self._motion[frame] = compose(self._motion[anchor], found)
             matches = {first: self._match(first, frame) for first in references}
-            correlations = {first: _median(match.correlation) for first, match in matches.items()}
+            correlations = {first: median_correlation(match.correlation) for first, match in matches.items()}
             if max(correlations.values()) >= self.config.trajectory.least_correlation:
                 break
         else:
@@ -97,7 +97,10 @@ class Walk:
         fixed, moving = self._ready[first], self._ready[second]
         start = compose(inverse(self._motion[first]), self._motion[second])
         match = self.matcher.match(fixed, moving, start)
-        if second - first == 1 and _median(match.correlation) >= self.config.trajectory.least_correlation:
+        if (
+            second - first == 1
+            and median_correlation(match.correlation) >= self.config.trajectory.least_correlation
+        ):
             self._motion[second] = compose(self._motion[first], match.motion)
         return match
 
@@ -153,6 +156,7 @@ def prefetch(walk: Walk, images: ImageSink | None, ahead: int = 3) -> Iterator[R
             worker.shutdown(wait=True, cancel_futures=True)
 
 
-def _median(correlation: FloatArray) -> float:
+def median_correlation(correlation: FloatArray) -> float:
+    """Median over the patches that have any; zero if none has."""
     known = correlation[np.isfinite(correlation)]
     return float(np.median(known)) if known.size else 0.0
