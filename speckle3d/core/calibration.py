@@ -1,0 +1,140 @@
+"""A calibration: where the image is relative to a sensor, how well it is known, and what it was made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+
+SENSORS = ("tracker", "orientation")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One estimated number with its standard error; zero where it was given and not estimated."""
+
+    name: str
+    value: float
+    standard_error: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class FramesUsed:
+    """Which frames a calibration stands on, and why the others do not count.
+
+    Attributes
+    ----------
+    given : int
+        Frames in the recordings.
+    used : tuple of int
+        Numbers of the frames used, ascending.
+    dropped : dict of int to str
+        Why each other frame was dropped.
+    """
+
+    given: int
+    used: tuple[int, ...]
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    def reasons(self) -> dict[str, int]:
+        """How many frames were dropped for each reason, most frequent first."""
+        counted: dict[str, int] = {}
+        for reason in self.dropped.values():
+            counted[reason] = counted.get(reason, 0) + 1
+        return dict(sorted(counted.items(), key=lambda item: -item[1]))
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a calibration was made from."""
+
+    input_path: str = ""
+    input_sha256: str = ""
+    package_version: str = ""
+    settings_json: str = ""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the image is relative to a sensor.
+
+    Parameters
+    ----------
+    method : str
+        ``"plane"``, ``"orientation"``, ``"cross-wire"``, ``"three-wire"``, ``"n-wire"`` or ``"images"``.
+    sensor : str
+        ``"tracker"`` or ``"orientation"``: which of a sweep's sensors it is for.
+    rotation : Rotation
+        ``sensor_from_image``, without the translation.
+    translation_mm : ndarray, shape (3,), optional
+        The image's origin in the sensor's frame; None for an orientation sensor.
+    pixel_mm : ndarray, shape (2,), optional
+        Distance between columns and between rows, mm, where it was measured or needed.
+    covariance : ndarray, shape (6, 6) or (3, 3)
+        Of the image's pose in its own frame: rotations about the image's x, y, z (tilt, yaw, roll) in rad, then
+        displacements along them in mm.
+    parameters : tuple of Parameter
+        All that was estimated, the phantom's own included.
+    rms : float
+        Root mean square residual, in `rms_unit`.
+    condition_number : float
+        Of the Jacobian with scaled columns.
+    time_offset_s : float, optional
+        The sensor's clock offset that was used or found; None where it was neither.
+    verdict : str
+        One sentence: whether the motion was sufficient.
+    """
+
+    method: str
+    sensor: str
+    rotation: Rotation
+    translation_mm: FloatArray | None
+    pixel_mm: FloatArray | None
+    covariance: FloatArray
+    parameters: tuple[Parameter, ...]
+    rms: float
+    rms_unit: str
+    condition_number: float
+    frames: FramesUsed
+    time_offset_s: float | None = None
+    verdict: str = ""
+    source: Source = field(default_factory=Source)
+
+    def __post_init__(self) -> None:
+        if self.sensor not in SENSORS:
+            raise InvalidInputError(f"sensor: expected one of {', '.join(SENSORS)}, got {self.sensor!r}")
+        size = 3 if self.translation_mm is None else 6
+        if self.covariance.shape != (size, size):
+            raise InvalidInputError(f"covariance: expected shape {(size, size)}, got {self.covariance.shape}")
+        if self.pixel_mm is not None and not (np.isfinite(self.pixel_mm).all() and (self.pixel_mm > 0).all()):
+            raise InvalidInputError(f"pixel_mm: expected values above zero, got {self.pixel_mm}")
+
+    @property
+    def sensor_from_image(self) -> RigidTransform:
+        """Pose of the image in the sensor's frame.
+
+        Raises
+        ------
+        InsufficientDataError
+            If only the rotation is known.
+        """
+        if self.translation_mm is None:
+            raise InsufficientDataError(
+                f"expected a calibration with a translation, got one of an orientation sensor ({self.method})"
+            )
+        return RigidTransform.from_components(self.translation_mm, self.rotation)
+
+    def pixel_matrix(self) -> FloatArray:
+        """Affine matrix from pixels (column, row, slice, 1) to the sensor's frame in mm, shape (4, 4).
+
+        The form that PLUS and 3D Slicer call ``ImageToProbe``; the slice is as thick as a pixel is on average.
+        """
+        if self.pixel_mm is None:
+            raise InsufficientDataError("expected a calibration with a pixel size, got one without")
+        scale = np.diag([*self.pixel_mm, float(self.pixel_mm.mean()), 1.0])
+        return np.asarray(self.sensor_from_image.as_matrix() @ scale)
