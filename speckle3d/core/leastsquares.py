@@ -11,11 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
 
+IntArray = npt.NDArray[np.int64]
 Residuals = Callable[[FloatArray], FloatArray]
 
 
@@ -121,6 +123,31 @@ def levenberg_marquardt(
     return _diagnose(
         found.x, found.fun, np.asarray(found.jac), labels, found.nfev, found.success, found.message
     )
+
+
+def clustered_covariance(jacobian: FloatArray, residuals: FloatArray, cluster: IntArray) -> FloatArray:
+    """Covariance of least squares whose residuals are correlated within clusters.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (m, p)
+    residuals : ndarray, shape (m,)
+        Some to each point, in the order of the points.
+    cluster : ndarray of int, shape (n,)
+        Of each point.
+
+    References
+    ----------
+    .. [1] K.-Y. Liang and S. L. Zeger, "Longitudinal data analysis using generalized linear models",
+       Biometrika, 1986 (the sandwich estimator), with the usual correction for few clusters.
+    """
+    labels, index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)
+    scores = np.zeros((len(labels), jacobian.shape[1]))
+    np.add.at(scores, index, jacobian * residuals[:, None])
+    bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-15, hermitian=True)
+    m, p, g = len(residuals), jacobian.shape[1], len(labels)
+    correction = g / max(g - 1, 1) * (m - 1) / max(m - p, 1)
+    return np.asarray(correction * bread @ (scores.T @ scores) @ bread)
 
 
 def _diagnose(

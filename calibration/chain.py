@@ -1,0 +1,183 @@
+"""From a pixel to a phantom: the chain of transforms that every calibration with a phantom solves for.
+
+A pixel (u, v) is carried through ``target_from_world * world_from_sensor * sensor_from_image`` to the
+phantom's frame C, where the phantom says which components must vanish (Prager et al. 1997, equations 3, 7
+and 8). The fourteen parameters keep that report's names; those that a phantom leaves undetermined are held.
+
+References
+----------
+.. [1] Prager et al., "Automatic calibration for 3-D free-hand ultrasound", CUED/F-INFENG/TR 303, 1997.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from calibration.mirror import canonical
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import (
+    FloatArray,
+    require_finite,
+    roll_yaw_tilt,
+    rotation_from_fixed_angles,
+    skew,
+)
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+SCALES = ("s_x", "s_y")
+PROBE = (*SCALES, "x", "y", "z", "alpha", "beta", "gamma")
+"""Pixel size, mm, and ``sensor_from_image`` (the report's R_T_P): position, mm, and fixed angles, rad."""
+TARGET = ("x_c", "y_c", "z_c", "alpha_c", "beta_c", "gamma_c")
+"""``target_from_world`` (the report's C_T_T)."""
+CHAIN = (*PROBE, *TARGET)
+
+
+@dataclass(frozen=True)
+class ImagePoints:
+    """Points of a phantom in the images, and where the sensor was.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (n, 2)
+        Column u and row v, fractional.
+    frame : ndarray of int, shape (n,)
+        The frame each point is in; points of a frame are used or dropped together.
+    world_from_sensor : RigidTransform, length n
+        Translation in mm.
+    wire : ndarray of int, shape (n,), optional
+        The wire each point lies on.
+    """
+
+    pixels: FloatArray
+    frame: IntArray
+    world_from_sensor: RigidTransform
+    wire: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 2 or self.pixels.shape[1] != 2:
+            raise InvalidInputError(f"pixels: expected shape (n, 2), got {self.pixels.shape}")
+        require_finite(self.pixels, "pixels")
+        counts = {len(self.pixels), len(self.frame), len(self.world_from_sensor)}
+        if self.wire is not None:
+            counts.add(len(self.wire))
+        if len(counts) > 1:
+            raise MismatchError(f"expected as many points as frames, poses and wires, got {sorted(counts)}")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, chosen: BoolArray | IntArray) -> ImagePoints:
+        wire = None if self.wire is None else self.wire[chosen]
+        return ImagePoints(self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire)
+
+    @cached_property
+    def turns(self) -> FloatArray:
+        """Rotation matrices of the poses, shape (n, 3, 3)."""
+        return np.asarray(self.world_from_sensor.rotation.as_matrix())
+
+    @cached_property
+    def shifts_mm(self) -> FloatArray:
+        """Translations of the poses, shape (n, 3)."""
+        return np.asarray(self.world_from_sensor.translation)
+
+    @classmethod
+    def of_lines(
+        cls, frame: IntArray, points_px: FloatArray, world_from_sensor: RigidTransform
+    ) -> ImagePoints:
+        """Two points of a line in each frame: m frames and poses, `points_px` of shape (m, 2, 2)."""
+        twice = np.repeat(np.arange(len(frame)), 2)
+        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], world_from_sensor[twice])
+
+
+class Phantom(Protocol):
+    """What must vanish in the phantom's frame."""
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Those of `TARGET` that images of the phantom determine."""
+
+    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
+        """Rows, shape (n, r, 3), and offsets, (n, r): ``rows @ position - offsets`` is the residual, mm."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """An estimate of the whole chain.
+
+    Attributes
+    ----------
+    pixel_mm : ndarray, shape (2,)
+        Column pitch and row spacing.
+    """
+
+    pixel_mm: FloatArray
+    sensor_from_image: RigidTransform
+    target_from_world: RigidTransform
+
+    def parameters(self) -> FloatArray:
+        """The fourteen parameters in the order of `CHAIN`, angles in the canonical form."""
+        probe, target = self.sensor_from_image, self.target_from_world
+        angles = [roll_yaw_tilt(t.rotation) for t in (probe, target)]
+        return np.concatenate([self.pixel_mm, probe.translation, angles[0], target.translation, angles[1]])
+
+    @classmethod
+    def from_parameters(cls, parameters: FloatArray) -> Chain:
+        """Inverse of `parameters`; negative pixel sizes are brought into the canonical form."""
+        angles, pixel_mm = canonical(parameters[5:8], parameters[:2])
+        return cls(
+            pixel_mm,
+            RigidTransform.from_components(parameters[2:5], rotation_from_fixed_angles(*angles)),
+            RigidTransform.from_components(parameters[8:11], rotation_from_fixed_angles(*parameters[11:14])),
+        )
+
+
+def residuals_and_jacobian(
+    parameters: FloatArray, points: ImagePoints, phantom: Phantom
+) -> tuple[FloatArray, FloatArray]:
+    """Carry pixels to the phantom's frame and see what does not vanish there.
+
+    Parameters
+    ----------
+    parameters : ndarray, shape (14,)
+        In the order of `CHAIN`.
+
+    Returns
+    -------
+    residuals : ndarray, shape (n, r)
+        In mm.
+    jacobian : ndarray, shape (n, r, 14)
+        Their derivatives with respect to the parameters.
+    """
+    probe, probe_turns = _turned(parameters[5:8])
+    target, target_turns = _turned(parameters[11:14])
+    flat = points.pixels * parameters[:2]
+    sensor = flat @ probe[:, :2].T + parameters[2:5]
+    world = np.einsum("nij,nj->ni", points.turns, sensor) + points.shifts_mm
+    rows, offsets = phantom.vanishing(points)
+    in_sensor = rows @ target @ points.turns
+    jacobian = np.empty((*offsets.shape, len(CHAIN)))
+    jacobian[..., :2] = (in_sensor @ probe[:, :2]) * points.pixels[:, None]
+    jacobian[..., 2:5] = in_sensor
+    jacobian[..., 8:11] = rows
+    for k in range(3):
+        moved = flat @ probe_turns[k][:, :2].T
+        jacobian[..., 5 + k] = np.einsum("nri,ni->nr", in_sensor, moved)
+        jacobian[..., 11 + k] = np.einsum("nri,ni->nr", rows, world @ target_turns[k].T)
+    where = world @ target.T + parameters[8:11]
+    return np.einsum("nri,ni->nr", rows, where) - offsets, jacobian
+
+
+def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation by x-y-z fixed angles (alpha, beta, gamma), and its derivatives, shape (3, 3, 3)."""
+    x, y, z = skew(np.eye(3))
+    rotation = rotation_from_fixed_angles(*angles).as_matrix()
+    about_y = np.cos(angles[0]) * y - np.sin(angles[0]) * x
+    return rotation, np.stack([z @ rotation, about_y @ rotation, rotation @ x])

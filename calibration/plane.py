@@ -1,0 +1,416 @@
+"""The plane module: the solver that all calibrations with a phantom share, and the one with a plane.
+
+References
+----------
+.. [1] Prager et al., "Automatic calibration for 3-D free-hand ultrasound", CUED/F-INFENG/TR 303, 1997:
+   sections 3.3, 4.2 and appendix A.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.chain import (
+    CHAIN,
+    PROBE,
+    SCALES,
+    BoolArray,
+    Chain,
+    ImagePoints,
+    IntArray,
+    Phantom,
+    residuals_and_jacobian,
+)
+from calibration.stages import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.leastsquares import Fit, clustered_covariance, levenberg_marquardt
+
+_FEWEST_LINES = 6
+"""Two equations each: the fewest for eleven unknowns."""
+
+_SOME_LINES = 100
+"""Lines that choose among starting points, all of them refining the answer afterwards."""
+
+OUTLIER_SIGMA = 4.0
+"""Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals one
+in 16,000, so that nothing is lost where nothing is wrong."""
+
+MAD_TO_SIGMA = 1.4826
+_CAUCHY = 2.385
+"""Tuning of the Cauchy weights, in standard deviations: 95 % efficient for Gaussian residuals."""
+_REWEIGHTINGS = 5
+_ROUNDS = 20
+_SMALLEST_SIGMA = 1e-7
+"""Residuals of exact data are rounding; nothing in them is an outlier."""
+
+Stages = Literal["three", "one"]
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane at z = 0 of its own frame: one equation for each point (TR 303, equation 8)."""
+
+    determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
+
+    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
+        """Height above the plane."""
+        n = len(points)
+        return np.broadcast_to(np.array([[0.0, 0.0, 1.0]]), (n, 1, 3)), np.zeros((n, 1))
+
+
+@dataclass(frozen=True)
+class LineDirections:
+    """A plane known by the directions of its lines alone: lines lie in it, wherever it is (appendix A).
+
+    `ImagePoints.pixels` then holds directions and the poses of the sensor are used without their translation.
+
+    Parameters
+    ----------
+    pixel_mm : ndarray, shape (2,)
+        For the length of a direction, which is brought to one.
+    level : bool
+        The plane's normal is the world's z axis.
+    """
+
+    pixel_mm: FloatArray
+    level: bool = False
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """The two angles of the plane, unless it is level."""
+        return () if self.level else ("beta_c", "gamma_c")
+
+    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
+        """Sine of the angle between line and plane."""
+        lengths = np.linalg.norm(points.pixels * self.pixel_mm, axis=1)
+        rows = np.zeros((len(points), 1, 3))
+        rows[:, 0, 2] = 1.0 / lengths
+        return rows, np.zeros((len(points), 1))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A calibration as the solver leaves it.
+
+    Attributes
+    ----------
+    chain : Chain
+    free : tuple of str, length p
+        The parameters estimated, among `CHAIN`.
+    fit : Fit
+        Of the points used, in frames that lie on the image and on the phantom: there the angles are
+        small rotations about the image's z, y and x, wherever the sensor is mounted.
+    covariance : ndarray, shape (p, p)
+        In the same frames, in the order of `free`; residuals of one frame may be correlated (a sensor's error
+        moves all its points), so that they count as one piece of evidence.
+    points : ImagePoints
+        All that were given.
+    used : ndarray of bool, shape (n,)
+    residuals : ndarray, shape (n, r)
+        Of all points, mm (sines of angles for directions).
+    sigma : float
+        Robust standard deviation of the residuals of the points used.
+    condition_number : float
+        Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2).
+    """
+
+    chain: Chain
+    phantom: Phantom
+    free: tuple[str, ...]
+    fit: Fit
+    covariance: FloatArray
+    points: ImagePoints
+    used: BoolArray
+    residuals: FloatArray
+    sigma: float
+    condition_number: float
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual of the points used."""
+        return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
+
+    def image_covariance(self, names: tuple[str, ...]) -> FloatArray:
+        """Covariance of some of the parameters, zero for those held."""
+        index = [self.free.index(name) if name in self.free else -1 for name in names]
+        known = np.array([i >= 0 for i in index])
+        picked = self.covariance[np.ix_(index, index)]
+        return np.where(np.outer(known, known), picked, 0.0)
+
+
+def solve(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    probe: tuple[str, ...] = PROBE,
+    outlier_sigma: float = OUTLIER_SIGMA,
+) -> Solution:
+    """Refine a chain until the phantom's residuals are least, leaving out frames that contradict the others.
+
+    Parameters
+    ----------
+    points : ImagePoints
+    phantom : Phantom
+    start : Chain
+        From which the solution is reached; its held parameters stay.
+    probe : tuple of str
+        Which of `PROBE` to estimate; all that the phantom determines of `TARGET` are estimated besides.
+    outlier_sigma : float
+        Frames whose largest residual exceeds so many robust standard deviations are dropped.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are too few points, or fewer than half of them agree.
+    """
+    free = (*probe, *phantom.determined)
+    chain, used = _first_guess(points, phantom, start, free), np.ones(len(points), dtype=bool)
+    for _ in range(_ROUNDS):
+        chain, fit, jacobian = _refined(points[used], phantom, chain, free)
+        residuals = _residuals(points, phantom, chain)
+        sigma = robust_sigma(residuals[used])
+        agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
+        if (agreeing == used).all():
+            break
+        used = agreeing
+        _require_majority(used, points)
+    return Solution(
+        chain,
+        phantom,
+        free,
+        fit,
+        clustered_covariance(jacobian, fit.residuals, points.frame[used]),
+        points,
+        used,
+        residuals,
+        sigma,
+        condition_number(points[used], phantom, chain, free),
+    )
+
+
+def robust_sigma(residuals: FloatArray) -> float:
+    """Standard deviation of Gaussian residuals of the same median size."""
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), _SMALLEST_SIGMA)
+
+
+def condition_number(points: ImagePoints, phantom: Phantom, chain: Chain, free: Iterable[str]) -> float:
+    """Ratio of the Jacobian's extreme singular values, columns of unit norm (TR 303, section 4.2)."""
+    columns = [CHAIN.index(name) for name in free]
+    _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
+    matrix = jacobian.reshape(-1, len(CHAIN))[:, columns]
+    norms = np.linalg.norm(matrix, axis=0)
+    singular = np.linalg.svd(matrix / np.where(norms > 0, norms, 1.0), compute_uv=False)
+    return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
+
+
+def _first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
+    """Least squares with weights that fall with the residual, so that wrong frames pull little."""
+    chain = start
+    for _ in range(_REWEIGHTINGS):
+        residuals = _residuals(points, phantom, chain)
+        weights = 1.0 / np.sqrt(1.0 + (residuals / (_CAUCHY * robust_sigma(residuals))) ** 2)
+        chain, _, _ = _refined(points, phantom, chain, free, weights, tolerance=1e-3)
+    return chain
+
+
+def _residuals(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatArray:
+    return residuals_and_jacobian(chain.parameters(), points, phantom)[0]
+
+
+def _refined(
+    points: ImagePoints,
+    phantom: Phantom,
+    chain: Chain,
+    free: tuple[str, ...],
+    weights: FloatArray | None = None,
+    tolerance: float = 1e-9,
+) -> tuple[Chain, Fit, FloatArray]:
+    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
+
+    There all angles start at zero: far from where fixed angles become singular, and well scaled.
+    """
+    world_from_sensor = chain.target_from_world * points.world_from_sensor * chain.sensor_from_image
+    near = replace(points, world_from_sensor=world_from_sensor)
+    columns = np.array([CHAIN.index(name) for name in free])
+    origin = np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
+    scale = 1.0 if weights is None else weights
+
+    @lru_cache(maxsize=2)
+    def at(x: bytes) -> tuple[FloatArray, FloatArray]:
+        full = origin.copy()
+        full[columns] = np.frombuffer(x)
+        values, jacobian = residuals_and_jacobian(full, near, phantom)
+        kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
+        return (values * scale).ravel(), kept.reshape(-1, len(columns))
+
+    def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return at(x.tobytes())
+
+    fit = levenberg_marquardt(
+        lambda x: both(x)[0].copy(), origin[columns], lambda x: both(x)[1].copy(), free, tolerance=tolerance
+    )
+    found = origin.copy()
+    found[columns] = fit.parameters
+    step = Chain.from_parameters(found)
+    moved = Chain(
+        step.pixel_mm,
+        chain.sensor_from_image * step.sensor_from_image,
+        step.target_from_world * chain.target_from_world,
+    )
+    return moved, fit, both(fit.parameters)[1]
+
+
+def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
+    """Points of the frames none of whose residuals exceeds `limit`."""
+    wrong = np.unique(frame[(np.abs(residuals) > limit).any(axis=1)])
+    return ~np.isin(frame, wrong)
+
+
+def _require_majority(used: BoolArray, points: ImagePoints) -> None:
+    frames, agreeing = len(np.unique(points.frame)), len(np.unique(points.frame[used]))
+    if 2 * agreeing <= frames:
+        raise InsufficientDataError(
+            f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the images and "
+            "the sensor readings belong together, and is the phantom the one named?"
+        )
+
+
+def calibrate_plane(
+    lines: ImagePoints,
+    pixel_mm: FloatArray | None = None,
+    fit_pixels: bool = True,
+    stages: Stages = "three",
+    outlier_sigma: float = OUTLIER_SIGMA,
+) -> Solution:
+    """Calibrate a 6-DOF sensor from lines of a plane: the floor of a water bath, or the Cambridge phantom.
+
+    Parameters
+    ----------
+    lines : ImagePoints
+        Two points of the plane's line in each frame (`ImagePoints.of_lines`).
+    pixel_mm : ndarray, shape (2,), optional
+        Column pitch and row spacing from the scanner's calipers; needed unless they are fitted, and then a
+        start for one stage only.
+    fit_pixels : bool
+        Estimate the pixel size too: eleven parameters, else nine.
+    stages : str
+        ``"three"``: angles from line directions, then distances, then all. ``"one"``: all at once, from
+        mountings all over the sphere.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are too few lines, or they contradict each other. Whether the motion determines the answer
+        is for `calibration.adequacy` to say.
+    """
+    if len(lines) < 2 * _FEWEST_LINES:
+        raise InsufficientDataError(
+            f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
+        )
+    if not fit_pixels and pixel_mm is None:
+        raise InvalidInputError(
+            "expected pixel_mm, the scanner's pixel size, where it is not fitted, got none"
+        )
+    held = None if fit_pixels else np.asarray(pixel_mm, dtype=float)
+    probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
+    start = _three_stages(lines, held) if stages == "three" else _mountings(lines, pixel_mm, probe)
+    return facing_up(solve(lines, Plane(), start, probe, outlier_sigma))
+
+
+def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
+    """Angles from some directions, refined; then distances; the third stage is the caller's."""
+    some = _some(lines)
+    first, second = some[0::2], some[1::2]
+    turns = first.world_from_sensor.rotation
+    ratio = None if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
+    directions = second.pixels - first.pixels
+    found = []
+    for start in angle_starts(directions, turns, ratio, hemisphere()):
+        angles = refined_angles(directions, first.frame, turns, start, fit_ratio=pixel_mm is None)
+        mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
+        found += [distance_start(lines, either, pixel_mm) for either in (angles, mirror)]
+    return min(found, key=lambda pair: pair[1])[0]
+
+
+def _some(lines: ImagePoints) -> ImagePoints:
+    """Lines from all over the recording, enough to choose among starting points."""
+    picked = np.unique(np.linspace(0, len(lines) // 2 - 1, _SOME_LINES).astype(int))
+    return lines[np.ravel(2 * picked[:, None] + [0, 1])]
+
+
+def refined_angles(
+    directions_px: FloatArray, frame: IntArray, world_from_sensor: Rotation, start: Angles, fit_ratio: bool
+) -> Angles:
+    """First stage: the angles that make all line directions lie in the plane."""
+    solution = solve_directions(directions_px, frame, world_from_sensor, start, fit_ratio=fit_ratio)
+    chain = solution.chain
+    normal = chain.target_from_world.rotation.as_matrix()[2]
+    ratio = float(chain.pixel_mm[0] / chain.pixel_mm[1])
+    return Angles(chain.sensor_from_image.rotation, normal, ratio, solution.sigma)
+
+
+def solve_directions(
+    directions_px: FloatArray,
+    frame: IntArray,
+    world_from_sensor: Rotation,
+    start: Angles,
+    fit_ratio: bool = False,
+    level: bool = False,
+    outlier_sigma: float = OUTLIER_SIGMA,
+) -> Solution:
+    """Refine angles from line directions: the first of three stages, and all that orientation allows.
+
+    Residuals are sines of the angle between line and plane.
+    """
+    upright = Rotation.align_vectors([[0.0, 0.0, 1.0]], [start.normal])[0]
+    rotations = (start.sensor_from_image, Rotation.identity() if level else upright)
+    size = np.array([start.ratio, 1.0])
+    chain = Chain(size, *(RigidTransform.from_rotation(rotation) for rotation in rotations))
+    points = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
+    probe = PROBE[5:]
+    return solve(
+        points, LineDirections(size, level), chain, ("s_x", *probe) if fit_ratio else probe, outlier_sigma
+    )
+
+
+def _mountings(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
+    """One stage: the best of all-at-once solutions of some lines, from mountings all over the sphere."""
+    size = np.ones(2) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
+    some = _some(lines)
+    starts = [_lying_flat(some, size, turn) for turn in Rotation.create_group("O")]
+    settled = [solve(some, Plane(), start, probe, outlier_sigma=np.inf) for start in starts]
+    return min(settled, key=lambda solution: solution.sigma).chain
+
+
+def _lying_flat(lines: ImagePoints, pixel_mm: FloatArray, turn: Rotation) -> Chain:
+    """An image turned against the sensor by `turn`, and the plane nearest to where its lines then are."""
+    flat = np.column_stack([lines.pixels * pixel_mm, np.zeros(len(lines))])
+    world = (lines.world_from_sensor * RigidTransform.from_rotation(turn)).apply(flat)
+    middle = world.mean(axis=0)
+    normal = np.linalg.svd(world - middle, full_matrices=False)[2][2]
+    target = Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0]
+    height = RigidTransform.from_components([0.0, 0.0, -normal @ middle], target)
+    return Chain(pixel_mm, RigidTransform.from_rotation(turn), height)
+
+
+def facing_up(solution: Solution) -> Solution:
+    """The same solution with the plane's normal on the probe's side: heights of images are positive."""
+    target = solution.chain.target_from_world
+    heights = (target * solution.points.world_from_sensor * solution.chain.sensor_from_image).translation[
+        :, 2
+    ]
+    if np.median(heights) >= 0:
+        return solution
+    over = RigidTransform.from_rotation(Rotation.from_euler("x", np.pi))
+    return replace(
+        solution,
+        chain=replace(solution.chain, target_from_world=over * target),
+        residuals=-solution.residuals,
+    )
