@@ -1,0 +1,208 @@
+"""Edges along the columns of an image, and the straight line most of them agree on."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def edge_response(samples: Float32Array, spans: IntArray, taps: Float32Array, out: Float32Array) -> None:
+    """Correlate each span of a column with an odd filter; beyond its ends a span goes on at their level.
+
+    Parameters
+    ----------
+    samples : float32, shape (n, r)
+        Columns of an image.
+    spans : int64, shape (s, 3)
+        Column, first and last row.
+    taps : float32, shape (h,)
+        Weights of the differences between rows 1, 2, ... h below and above.
+    out : float32, shape (n, r)
+        Zero outside the spans.
+    """
+    out[:] = 0.0
+    reach = taps.size
+    padded = np.empty(samples.shape[1] + 2 * reach, np.float32)
+    for s in range(spans.shape[0]):
+        c, first, last = spans[s]
+        size = last - first + 1
+        padded[:reach] = samples[c, first]
+        padded[reach : reach + size] = samples[c, first : last + 1]
+        padded[reach + size : size + 2 * reach] = samples[c, last]
+        line = out[c, first : last + 1]
+        for t in range(1, reach + 1):
+            weight = taps[t - 1]
+            below = padded[reach + t : reach + t + size]
+            above = padded[reach - t : reach - t + size]
+            for j in range(size):
+                line[j] += weight * (below[j] - above[j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_edges(
+    response: Float32Array, spans: IntArray, threshold: float, rows: FloatArray, found: IntArray
+) -> None:
+    """First maximum of each column's response above a threshold, or else its largest maximum.
+
+    Parameters
+    ----------
+    response : float32, shape (n, r)
+    spans : int64, shape (s, 3)
+        By column, then by row.
+    rows : float64, shape (n,)
+        Of the maximum, between samples by a parabola; NaN without any.
+    found : int64, shape (n,)
+        The span it lies in; -1 without any.
+    """
+    rows[:] = np.nan
+    found[:] = -1
+    largest = np.zeros(rows.size)
+    for s in range(spans.shape[0]):
+        c, first, last = spans[s]
+        line = response[c]
+        for j in range(first + 1, last):
+            here = line[j]
+            if here <= largest[c] or here <= line[j - 1] or here < line[j + 1]:
+                continue
+            if largest[c] > threshold:
+                break
+            largest[c] = here
+            found[c] = s
+            bend = line[j - 1] - 2.0 * here + line[j + 1]
+            rows[c] = j + 0.5 * (line[j - 1] - line[j + 1]) / bend
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def echo_fronts(
+    samples: Float32Array,
+    spans: IntArray,
+    found: IntArray,
+    edges: FloatArray,
+    taps: Float32Array,
+    sigma: float,
+    fronts: FloatArray,
+    peaks: FloatArray,
+) -> None:
+    """Where the echo behind each edge has risen half way, and where it is brightest.
+
+    Parameters
+    ----------
+    samples : float32, shape (n, r)
+    spans : int64, shape (s, 3)
+    found : int64, shape (n,)
+        The span each edge lies in; -1 where there is none.
+    edges : float64, shape (n,)
+        Rows of the edges, seen through a Gaussian of `sigma` rows: up to so far above the echo.
+    taps : float32, shape (h + 1,)
+        Half of the even filter that profiles are smoothed with, its middle first.
+    fronts, peaks : float64, shape (n,)
+        Rows; NaN without an echo.
+    """
+    reach = taps.size - 1
+    profile = np.empty(int(5.0 * sigma) + 8)
+    for c in range(edges.size):
+        fronts[c] = peaks[c] = np.nan
+        if found[c] < 0:
+            continue
+        _, first, last = spans[found[c]]
+        top = max(first, int(np.floor(edges[c] - 2.5 * sigma)))
+        size = min(last, int(np.ceil(edges[c] + 2.0 * sigma))) - top + 1
+        for k in range(size):
+            level = taps[0] * samples[c, top + k]
+            for t in range(1, reach + 1):
+                below, above = min(last, top + k + t), max(first, top + k - t)
+                level += taps[t] * (samples[c, below] + samples[c, above])
+            profile[k] = level
+        before = min(max(1, int(edges[c] - sigma) - top + 1), size)
+        k = min(max(0, int(edges[c] - 0.5 * sigma) - top), size - 1)
+        k += np.argmax(profile[k:size])
+        half = 0.5 * (profile[:before].mean() + profile[k])
+        if not profile[k] > half:
+            continue
+        peaks[c] = top + k
+        if 0 < k < size - 1:
+            bend = profile[k - 1] - 2.0 * profile[k] + profile[k + 1]
+            if bend < 0.0:
+                peaks[c] += 0.5 * (profile[k - 1] - profile[k + 1]) / bend
+        while k > 0 and profile[k - 1] >= half:
+            k -= 1
+        if k > 0:
+            fronts[c] = top + k - (profile[k] - half) / (profile[k] - profile[k - 1])
+
+
+@njit(cache=True, nogil=True)
+def agreeing(
+    column: FloatArray,
+    row: FloatArray,
+    inside: BoolArray,
+    start: float,
+    slope: float,
+    tolerance: float,
+    agree: BoolArray,
+) -> tuple[int, int, float]:
+    """Which points lie within a tolerance above or below a line where the region holds it.
+
+    Parameters
+    ----------
+    column, row : float64, shape (n,)
+        Points; row NaN where there is none.
+    inside : bool, shape (n, r)
+        Which rows of each column belong to the region.
+    start, slope : float
+        The line's row in column 0, and rows per column.
+    agree : bool, shape (n,)
+
+    Returns
+    -------
+    tuple of int, int and float
+        How many agree, how many could, and the sum of the squared deviations of those that do.
+    """
+    agreed, possible, squares = 0, 0, 0.0
+    for i in range(column.size):
+        agree[i] = False
+        at = start + slope * column[i]
+        if not -0.5 <= at < inside.shape[1] - 0.5 or not inside[i, int(at + 0.5)]:
+            continue
+        possible += 1
+        off = row[i] - at
+        if abs(off) <= tolerance:
+            agree[i] = True
+            agreed += 1
+            squares += off * off
+    return agreed, possible, squares
+
+
+@njit(cache=True, nogil=True)
+def best_pair(
+    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float
+) -> tuple[int, float, float]:
+    """The line through two points that most points agree with, the closest of equals.
+
+    Parameters are those of `agreeing`.
+
+    Returns
+    -------
+    tuple of int, float and float
+        How many agree (0 without two points), the line's row in column 0, and its slope.
+    """
+    agree = np.empty(column.size, np.bool_)
+    most, least, best_start, best_slope = 0, np.inf, 0.0, 0.0
+    for j in range(column.size):
+        if np.isnan(row[j]):
+            continue
+        for k in range(j + 1, column.size):
+            if np.isnan(row[k]):
+                continue
+            slope = (row[k] - row[j]) / (column[k] - column[j])
+            start = row[j] - slope * column[j]
+            agreed, _, squares = agreeing(column, row, inside, start, slope, tolerance, agree)
+            if agreed > most or (agreed == most and squares < least):
+                most, least, best_start, best_slope = agreed, squares, start, slope
+    return most, best_start, best_slope
