@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,7 @@ from speckle3d.core.geometry import (
     skew,
 )
 
+Seen = Literal["line", "direction", "dot"]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -101,6 +102,10 @@ class Phantom(Protocol):
     """What must vanish in the phantom's frame."""
 
     @property
+    def seen_as(self) -> Seen:
+        """What two or one of the points are: the ends of a line, the direction of one, or a dot."""
+
+    @property
     def determined(self) -> tuple[str, ...]:
         """Those of `TARGET` that images of the phantom determine."""
 
@@ -121,6 +126,10 @@ class Chain:
     pixel_mm: FloatArray
     sensor_from_image: RigidTransform
     target_from_world: RigidTransform
+
+    def target_from_image(self, points: ImagePoints) -> RigidTransform:
+        """Pose of the image of each point in the phantom's frame."""
+        return self.target_from_world * points.world_from_sensor * self.sensor_from_image
 
     def parameters(self) -> FloatArray:
         """The fourteen parameters in the order of `CHAIN`, angles in the canonical form."""

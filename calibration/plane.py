@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.adequacy import require_adequate
 from calibration.chain import (
     CHAIN,
     PROBE,
@@ -25,8 +26,10 @@ from calibration.chain import (
     ImagePoints,
     IntArray,
     Phantom,
+    Seen,
     residuals_and_jacobian,
 )
+from calibration.solution import Solution
 from calibration.stages import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
@@ -58,6 +61,7 @@ class Plane:
     """A plane at z = 0 of its own frame: one equation for each point (TR 303, equation 8)."""
 
     determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
+    seen_as: Seen = "line"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Height above the plane."""
@@ -81,6 +85,7 @@ class LineDirections:
 
     pixel_mm: FloatArray
     level: bool = False
+    seen_as: Seen = "direction"
 
     @property
     def determined(self) -> tuple[str, ...]:
@@ -93,56 +98,6 @@ class LineDirections:
         rows = np.zeros((len(points), 1, 3))
         rows[:, 0, 2] = 1.0 / lengths
         return rows, np.zeros((len(points), 1))
-
-
-@dataclass(frozen=True)
-class Solution:
-    """A calibration as the solver leaves it.
-
-    Attributes
-    ----------
-    chain : Chain
-    free : tuple of str, length p
-        The parameters estimated, among `CHAIN`.
-    fit : Fit
-        Of the points used, in frames that lie on the image and on the phantom: there the angles are
-        small rotations about the image's z, y and x, wherever the sensor is mounted.
-    covariance : ndarray, shape (p, p)
-        In the same frames, in the order of `free`; residuals of one frame may be correlated (a sensor's error
-        moves all its points), so that they count as one piece of evidence.
-    points : ImagePoints
-        All that were given.
-    used : ndarray of bool, shape (n,)
-    residuals : ndarray, shape (n, r)
-        Of all points, mm (sines of angles for directions).
-    sigma : float
-        Robust standard deviation of the residuals of the points used.
-    condition_number : float
-        Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2).
-    """
-
-    chain: Chain
-    phantom: Phantom
-    free: tuple[str, ...]
-    fit: Fit
-    covariance: FloatArray
-    points: ImagePoints
-    used: BoolArray
-    residuals: FloatArray
-    sigma: float
-    condition_number: float
-
-    @property
-    def rms(self) -> float:
-        """Root mean square residual of the points used."""
-        return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
-
-    def image_covariance(self, names: tuple[str, ...]) -> FloatArray:
-        """Covariance of some of the parameters, zero for those held."""
-        index = [self.free.index(name) if name in self.free else -1 for name in names]
-        known = np.array([i >= 0 for i in index])
-        picked = self.covariance[np.ix_(index, index)]
-        return np.where(np.outer(known, known), picked, 0.0)
 
 
 def solve(
@@ -236,8 +191,7 @@ def _refined(
 
     There all angles start at zero: far from where fixed angles become singular, and well scaled.
     """
-    world_from_sensor = chain.target_from_world * points.world_from_sensor * chain.sensor_from_image
-    near = replace(points, world_from_sensor=world_from_sensor)
+    near = replace(points, world_from_sensor=chain.target_from_image(points))
     columns = np.array([CHAIN.index(name) for name in free])
     origin = np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
     scale = 1.0 if weights is None else weights
@@ -277,8 +231,8 @@ def _require_majority(used: BoolArray, points: ImagePoints) -> None:
     frames, agreeing = len(np.unique(points.frame)), len(np.unique(points.frame[used]))
     if 2 * agreeing <= frames:
         raise InsufficientDataError(
-            f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the images and "
-            "the sensor readings belong together, and is the phantom the one named?"
+            f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the images "
+            "and the sensor readings belong together, and is the phantom the one named?"
         )
 
 
@@ -307,8 +261,8 @@ def calibrate_plane(
     Raises
     ------
     InsufficientDataError
-        If there are too few lines, or they contradict each other. Whether the motion determines the answer
-        is for `calibration.adequacy` to say.
+        If there are too few lines, they contradict each other, or the motion does not determine the answer;
+        then the missing motion is named.
     """
     if len(lines) < 2 * _FEWEST_LINES:
         raise InsufficientDataError(
@@ -321,7 +275,7 @@ def calibrate_plane(
     held = None if fit_pixels else np.asarray(pixel_mm, dtype=float)
     probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
     start = _three_stages(lines, held) if stages == "three" else _mountings(lines, pixel_mm, probe)
-    return facing_up(solve(lines, Plane(), start, probe, outlier_sigma))
+    return facing_up(require_adequate(solve(lines, Plane(), start, probe, outlier_sigma)))
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:

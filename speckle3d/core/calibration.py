@@ -76,8 +76,8 @@ class Calibration:
     pixel_mm : ndarray, shape (2,), optional
         Distance between columns and between rows, mm, where it was measured or needed.
     covariance : ndarray, shape (6, 6) or (3, 3)
-        Of the image's pose in its own frame: rotations about the image's x, y, z (tilt, yaw, roll) in rad, then
-        displacements along them in mm.
+        Of the image's pose in its own frame: rotations about the image's x, y, z (tilt, yaw, roll) in rad,
+        then displacements along them in mm.
     parameters : tuple of Parameter
         All that was estimated, the phantom's own included.
     rms : float
@@ -132,7 +132,7 @@ class Calibration:
     def pixel_matrix(self) -> FloatArray:
         """Affine matrix from pixels (column, row, slice, 1) to the sensor's frame in mm, shape (4, 4).
 
-        The form that PLUS and 3D Slicer call ``ImageToProbe``; the slice is as thick as a pixel is on average.
+        The form that PLUS and 3D Slicer call ``ImageToProbe``; a slice is as thick as the average pixel.
         """
         if self.pixel_mm is None:
             raise InsufficientDataError("expected a calibration with a pixel size, got one without")

@@ -138,16 +138,20 @@ def clustered_covariance(jacobian: FloatArray, residuals: FloatArray, cluster: I
 
     References
     ----------
-    .. [1] K.-Y. Liang and S. L. Zeger, "Longitudinal data analysis using generalized linear models",
-       Biometrika, 1986 (the sandwich estimator), with the usual correction for few clusters.
+    .. [1] R. M. Bell and D. F. McCaffrey, "Bias reduction in standard errors for linear regression with
+       multi-stage samples", Survey Methodology, 2002 (the jackknife form, CR3).
     """
-    labels, index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)
-    scores = np.zeros((len(labels), jacobian.shape[1]))
-    np.add.at(scores, index, jacobian * residuals[:, None])
+    index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
     bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-15, hermitian=True)
-    m, p, g = len(residuals), jacobian.shape[1], len(labels)
-    correction = g / max(g - 1, 1) * (m - 1) / max(m - p, 1)
-    return np.asarray(correction * bread @ (scores.T @ scores) @ bread)
+    order = np.argsort(index, kind="stable")
+    scores = np.zeros((index.max() + 1, jacobian.shape[1]))
+    for members in np.split(order, np.flatnonzero(np.diff(index[order])) + 1):
+        rows = jacobian[members]
+        # What the residuals would be, had the cluster not pulled the solution towards itself.
+        left = np.eye(len(rows)) - rows @ bread @ rows.T
+        unpulled = np.linalg.lstsq(left, residuals[members], rcond=1e-9)[0]
+        scores[index[members[0]]] = rows.T @ unpulled
+    return np.asarray(bread @ (scores.T @ scores) @ bread)
 
 
 def _diagnose(

@@ -1,0 +1,124 @@
+"""Calibration of an orientation sensor from lines of a plane: the plane module's first stage, and gravity.
+
+References
+----------
+.. [1] R. J. Housden et al., "Calibration of an orientation sensor for freehand 3D ultrasound and its use in a
+   hybrid acquisition system", BioMedical Engineering OnLine, 2008, "Calibrating the MT9-B position sensor".
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.adequacy import require_adequate
+from calibration.chain import IntArray
+from calibration.plane import OUTLIER_SIGMA, solve_directions
+from calibration.solution import Solution
+from calibration.stages import angle_starts, hemisphere, in_plane_mirror
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+
+Viewed = Literal["above", "below"]
+
+FEWEST_LINES = 6
+
+MIRROR_LIMIT = 0.2
+"""Mean vertical part of the beam direction below which gravity cannot tell the image from its mirror: with
+the beam within 12 degrees of level on average, hand and floor may be tilted as much."""
+
+_STARTS = 4
+_CERTAIN_RAD = np.deg2rad(5.0)
+
+STEEPEST_PLANE = np.deg2rad(45.0)
+"""A plane steeper than this is not a floor: the sensor's world has no z axis up, or the lines are not its."""
+
+
+def calibrate_orientation(
+    directions_px: FloatArray,
+    frame: IntArray,
+    world_from_sensor: Rotation,
+    pixel_mm: FloatArray,
+    level: bool = False,
+    viewed_from: Viewed = "above",
+    outlier_sigma: float = OUTLIER_SIGMA,
+) -> Solution:
+    """Find ``sensor_from_image`` of a sensor that knows its orientation only.
+
+    Parameters
+    ----------
+    directions_px : ndarray, shape (m, 2)
+        Columns and rows from one point of the plane's line to another.
+    frame : ndarray of int, shape (m,)
+    world_from_sensor : Rotation, length m
+        With the world's z axis up. Its heading may be wrong where the plane is level: only the vertical
+        counts then.
+    pixel_mm : ndarray, shape (2,)
+        Column pitch and row spacing; only their ratio matters.
+    level : bool
+        The plane is level: three unknowns instead of five.
+    viewed_from : str
+        ``"above"``: on average the beam points down, as over the floor of a water bath; ``"below"``: up. It
+        tells the image from its in-plane mirror, which the lines alone cannot.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are too few lines; they contradict each other; gravity cannot tell the image from its
+        mirror; or the motion does not determine the answer, and then the missing motion is named.
+    """
+    if len(directions_px) < FEWEST_LINES:
+        raise InsufficientDataError(f"expected lines in at least {FEWEST_LINES} frames, got {len(frame)}")
+    if viewed_from not in ("above", "below"):
+        raise InvalidInputError(f"viewed_from: expected 'above' or 'below', got {viewed_from!r}")
+    ratio = float(pixel_mm[0] / pixel_mm[1])
+    normals = hemisphere()
+    normals = normals[:1] if level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
+    starts = angle_starts(directions_px, world_from_sensor, ratio, normals, _STARTS)
+    solutions = [
+        solve_directions(
+            directions_px, frame, world_from_sensor, start, level=level, outlier_sigma=outlier_sigma
+        )
+        for start in starts
+    ]
+    best = require_adequate(min(solutions, key=lambda solution: solution.sigma))
+    _require_floor(best)
+    return upright(best, viewed_from)
+
+
+def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
+    """Of a solution and its in-plane mirror, choose the one whose beams point down (up, if from below).
+
+    Raises
+    ------
+    InsufficientDataError
+        If the beams are level on average.
+    """
+    used = solution.points[solution.used].world_from_sensor.rotation
+    beams = (used * solution.chain.sensor_from_image.rotation).as_matrix()[:, :, 1]
+    down = -float(beams[:, 2].mean())
+    if abs(down) < MIRROR_LIMIT:
+        raise InsufficientDataError(
+            f"expected beams that point down on average, got {np.rad2deg(np.arcsin(down)):.0f} degrees "
+            "below level: gravity cannot tell the image from its mirror; scan a level plane from above, or "
+            "say it is seen from below"
+        )
+    if (down > 0) == (viewed_from == "above"):
+        return solution
+    mirror = in_plane_mirror(solution.chain.sensor_from_image.rotation)
+    chain = replace(solution.chain, sensor_from_image=RigidTransform.from_rotation(mirror))
+    return replace(solution, chain=chain, residuals=-solution.residuals)
+
+
+def _require_floor(solution: Solution) -> None:
+    """Refuse a plane that is certainly not a floor; one that is not determined is for `adequacy` to name."""
+    certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
+    slope = float(np.arccos(min(abs(solution.chain.target_from_world.rotation.as_matrix()[2, 2]), 1.0)))
+    if certain and slope > STEEPEST_PLANE:
+        raise InsufficientDataError(
+            f"expected a plane within {np.rad2deg(STEEPEST_PLANE):.0f} degrees of level, got one at "
+            f"{np.rad2deg(slope):.0f}: is the world's z axis up, and are the lines those of the floor?"
+        )
