@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import FloatArray
 
@@ -35,8 +36,20 @@ class Medium(Protocol):
     def attenuation_db_cm_mhz(self) -> float:
         """One-way attenuation, proportional to frequency."""
 
-    def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
-        """Blocks of scatterers that together hold all those between the corners, and perhaps more."""
+    def seen(
+        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
+    ) -> list[Scatterers]:
+        """Blocks of scatterers, in the medium, with all those in a box of the image and perhaps more."""
+
+
+def bounds_in_medium(
+    medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Opposite corners, in the medium, of the upright box about a box of the image."""
+    x, y, z = np.stack([low_mm, high_mm], axis=-1)
+    corners = np.stack(np.meshgrid(x, y, z), axis=-1)
+    seen = medium_from_image.apply(corners.reshape(-1, 3))
+    return seen.min(axis=0), seen.max(axis=0)
 
 
 @dataclass(frozen=True)
@@ -47,7 +60,9 @@ class PointMedium:
     strength: Float32Array
     attenuation_db_cm_mhz: float = 0.0
 
-    def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
+    def seen(
+        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
+    ) -> list[Scatterers]:
         """All of them: there are few."""
         return [(self.position_mm, self.strength)]
 
@@ -202,6 +217,12 @@ class TiledMedium:
     _tiles: OrderedDict[tuple[int, int], Scatterers] = field(
         default_factory=OrderedDict, repr=False, compare=False
     )
+
+    def seen(
+        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
+    ) -> list[Scatterers]:
+        """Tiles that together hold all scatterers in a box of the image."""
+        return self.within(*bounds_in_medium(medium_from_image, low_mm, high_mm))
 
     def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
         """Tiles that together hold all scatterers between the corners."""

@@ -85,15 +85,17 @@ class Trajectory:
                 f"time_s: expected {self.knot_s[0]:.3f} to {self.knot_s[-1]:.3f} s, "
                 f"got {t.min():.3f} to {t.max():.3f} s"
             )
-        x, y, z, tilt, yaw, roll = np.moveaxis(self._spline(t), -1, 0)
-        rotation = rotation_from_fixed_angles(roll, yaw, tilt)
-        moved = np.stack([x, y, z], axis=-1)
-        start_from_image = RigidTransform.from_components(moved - rotation.apply(self.pivot_mm), rotation)
-        return self.medium_from_start * start_from_image
+        return self.medium_from_start * self._start_from_image(self._spline(t))
 
     def world_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the world at any times within the knots."""
         return self.world_from_medium * self.medium_from_image(time_s)
+
+    def _start_from_image(self, columns: FloatArray) -> RigidTransform:
+        x, y, z, tilt, yaw, roll = np.moveaxis(columns, -1, 0)
+        rotation = rotation_from_fixed_angles(roll, yaw, tilt)
+        moved = np.stack([x, y, z], axis=-1)
+        return RigidTransform.from_components(moved - rotation.apply(self.pivot_mm), rotation)
 
     @cached_property
     def _spline(self) -> BSpline[np.float64]:
@@ -105,6 +107,12 @@ def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s:
     """Frame clock with uniform jitter of at most `jitter_s` either way."""
     jitter = min(jitter_s, 0.2 / rate_hz)
     return np.arange(frames) / rate_hz + rng.uniform(-jitter, jitter, frames)
+
+
+def hand_knots(duration_s: float) -> FloatArray:
+    """Times of a trajectory's knots, from a little before the first frame to a little after the last."""
+    knots = round((duration_s + 2 * _LEAD_S) * _KNOT_RATE_HZ) + 1
+    return np.linspace(-_LEAD_S, duration_s + _LEAD_S, knots)
 
 
 def hand_sweep(
@@ -123,12 +131,11 @@ def hand_sweep(
     face_mm : float
         Width of the image; the probe turns about the middle of its face.
     """
-    knots = round((duration_s + 2 * _LEAD_S) * _KNOT_RATE_HZ) + 1
-    time = np.linspace(-_LEAD_S, duration_s + _LEAD_S, knots)
+    time = hand_knots(duration_s)
     inside = (time >= 0.0) & (time <= duration_s)
     along = _progress(time, inside, motion, rng) * length_mm
     pivot = np.array([face_mm / 2.0, 0.0, 0.0])
-    columns = np.zeros((knots, 6))
+    columns = np.zeros((time.size, 6))
     columns[:, :3] = pivot
     columns[:, 2] += along
     phase = np.clip(time / duration_s, 0.0, 1.0)
@@ -137,8 +144,8 @@ def hand_sweep(
         slow = motion.drift_mm if axis < 3 else motion.wander_rad
         fast = motion.tremor_mm if axis < 3 else motion.tremor_rad
         if axis != 2:
-            columns[:, axis] += slow * _band_noise(time, (0.0, 1.0 / duration_s), rng)
-        columns[:, axis] += fast * _band_noise(time, motion.tremor_band_hz, rng)
+            columns[:, axis] += slow * band_noise(time, (0.0, 1.0 / duration_s), rng)
+        columns[:, axis] += fast * band_noise(time, motion.tremor_band_hz, rng)
     return Trajectory(time, columns, pivot, medium_from_start, world_from_medium)
 
 
@@ -165,7 +172,7 @@ def _progress(
 ) -> FloatArray:
     """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
     duration = float(time[inside][-1])
-    speed = 1.0 + motion.speed_variation * np.tanh(_band_noise(time, (0.0, 0.8), rng))
+    speed = 1.0 + motion.speed_variation * np.tanh(band_noise(time, (0.0, 0.8), rng))
     # In a very short sweep a whole pause would leave no motion at all.
     pause_s = min(motion.pause_s, 0.2 * duration)
     for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:
@@ -195,7 +202,7 @@ def _smooth_step(u: FloatArray) -> FloatArray:
     return u * u * (3.0 - 2.0 * u)
 
 
-def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:
+def band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:
     """Random smooth function of unit rms made of a dozen sinusoids in the band."""
     frequency = rng.uniform(*band_hz, 12)
     phase = rng.uniform(0.0, 2.0 * np.pi, 12)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.sweep import ImageGrid, Sweep
@@ -20,6 +18,7 @@ from speckle3d.simulation.movement import (
     turned_about,
     world_from_medium,
 )
+from speckle3d.simulation.plane import simulate_plane
 from speckle3d.simulation.recipes import MEDIA
 from speckle3d.simulation.scan import Receiver, SimulatedFrames
 from speckle3d.simulation.sensors import (
@@ -28,56 +27,9 @@ from speckle3d.simulation.sensors import (
     simulate_orientation,
     simulate_tracker,
 )
+from speckle3d.simulation.settings import Preset, SimulatedSweep, SimulationSettings
 
-Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped"]
-
-
-class SimulationSettings(BaseModel):
-    """What to simulate. The same settings give the same sweep.
-
-    Parameters
-    ----------
-    preset : str
-        phantom: speckle with inclusions, one way. tissue: layers, one way. reversal: tissue, forward and
-        back. rotation: phantom with a deliberate turn. crossed: tissue, two sweeps at a right angle.
-        stepped: uniform speckle in exact elevational steps, for decorrelation curves.
-    frames : int, optional
-        Frames of a hand-held sweep; by default eight per mm, twice that when it reverses.
-    steps, step_mm, blocks : int, float, int
-        Of `stepped`: frames per block, their distance, and how many independent blocks.
-    turn_deg : float
-        Of `rotation`: the deliberate turn from first to last frame, about the axis `turn_axis`.
-    drift_mm : float
-        Of hand-held sweeps: slow lateral and axial wander, standard deviation.
-    snr_db : float
-        Speckle over electronic noise at the transmit focus.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    preset: Preset = "phantom"
-    seed: int = Field(0, ge=0)
-    vectors: int = Field(127, ge=1, le=1024)
-    samples: int = Field(3818, ge=256, le=3818)
-    length_mm: float = Field(20.0, gt=0, le=200)
-    frames: int | None = Field(None, ge=2)
-    frame_rate_hz: float = Field(25.0, gt=0, le=1000)
-    steps: int = Field(41, ge=2)
-    step_mm: float = Field(0.05, gt=0)
-    blocks: int = Field(4, ge=1)
-    turn_deg: float = Field(5.0, ge=-30, le=30)
-    turn_axis: Literal["tilt", "yaw"] = "tilt"
-    crossing_deg: float = Field(90.0, gt=0, lt=180)
-    drift_mm: float = Field(0.5, ge=0, le=20)
-    snr_db: float = Field(40.0, ge=-10, le=80)
-
-
-@dataclass(frozen=True)
-class SimulatedSweep:
-    """A sweep whose frames are computed as they are read, and the settings that determine it."""
-
-    sweep: Sweep
-    settings: SimulationSettings
+__all__ = ["Preset", "SimulatedSweep", "SimulationSettings", "simulate"]
 
 
 def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
@@ -87,6 +39,8 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     """
     seeds = np.random.SeedSequence(settings.seed)
     medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)
+    if settings.preset == "plane":
+        return (simulate_plane(settings, medium_seed, heading_seed, sweep_seeds[0]),)
     medium = MEDIA[_MEDIUM[settings.preset]](_entropy(medium_seed), settings.length_mm)
     probe = Probe()
     beam = tabulate_beam(probe, attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)

@@ -164,9 +164,9 @@ class SimulatedFrames:
         margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm
         lateral = np.array([-margin, self.image.width_mm + margin])
         depth = self.beam.depth_mm
-        corners = np.stack(np.meshgrid(lateral, depth[[0, -1]], [-thick.max(), thick.max()]), axis=-1)
-        seen = medium_from_image.apply(corners.reshape(-1, 3))
-        blocks = self.medium.within(seen.min(axis=0), seen.max(axis=0))
+        low = np.array([lateral[0], depth[0], -thick.max()])
+        high = np.array([lateral[1], depth[-1], thick.max()])
+        blocks = self.medium.seen(medium_from_image, low, high)
         position = np.empty((sum(s.size for _, s in blocks), 3))
         strength = np.empty(position.shape[0], np.float32)
         matrix, steps, n = medium_from_image.inv().as_matrix(), self._table_steps[:2], 0

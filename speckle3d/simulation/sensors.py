@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -35,6 +35,14 @@ class TrackerModel:
     def sensor_from_image(self) -> RigidTransform:
         """Where the image is on the sensor."""
         return RigidTransform.from_components(self.mounting_mm, Rotation.from_euler("ZYX", self.mounting_rad))
+
+    def with_noise(self, factor: float) -> TrackerModel:
+        """Return the same sensor with its jitter multiplied."""
+        return replace(
+            self,
+            position_mm=factor * self.position_mm,
+            orientation_rad=factor * self.orientation_rad,
+        )
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,22 @@ class OrientationModel:
     def sensor_from_image(self) -> Rotation:
         """How the image is turned on the sensor."""
         return Rotation.from_euler("ZYX", self.mounting_rad)
+
+    def with_noise(self, factor: float) -> OrientationModel:
+        """Return the same sensor with all of its errors multiplied, those of its clock excepted."""
+        return replace(self, **{name: factor * getattr(self, name) for name in _ERRORS})
+
+
+_ERRORS = (
+    "inclination_rad",
+    "heading_rad",
+    "white_rad",
+    "gyroscope_rad_s",
+    "gyroscope_bias_rad_s",
+    "accelerometer_m_s2",
+    "accelerometer_bias_m_s2",
+    "magnetometer_au",
+)
 
 
 def simulate_tracker(
