@@ -13,15 +13,20 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.ndimage import gaussian_filter1d
 
+from calibration.columns import (
+    BoolArray,
+    Columns,
+    IntArray,
+    lay_columns,
+    without_blank_sides,
+    without_standing,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import agreeing, best_pair, echo_fronts, edge_response, first_edges
 
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 Float32Array = npt.NDArray[np.float32]
 
 _TYPICAL = 0.5
@@ -34,10 +39,6 @@ _FINE = 0.25
 against noise, and short against the rise of an echo."""
 _REACH = 3.5
 """Length of the filters' sides, standard deviations."""
-_GLANCES = 48
-"""Frames looked at for what stands still in all of them."""
-_LIVELY = 0.25
-"""Change that counts, as a part of the strongest change in nearly all columns."""
 _FINEST_ROWS = 0.1
 """Scatter below which an edge is not placed: interpolation between rows is not better."""
 _ROUNDS = 20
@@ -130,20 +131,6 @@ class EchoLines:
         return int(self.frame.size)
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """Where to look: columns (n,), and which of their rows count (n, r), also as column, first, last row."""
-
-    column: IntArray
-    inside: BoolArray
-
-    @property
-    def spans(self) -> IntArray:
-        ends = np.diff(np.pad(self.inside, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-        column, first = np.nonzero(ends == 1)
-        return np.stack([column, first, np.nonzero(ends == -1)[1] - 1], axis=1).astype(np.int64)
-
-
 def detect_line(
     image: npt.NDArray[Any],
     pixel_mm: npt.ArrayLike,
@@ -172,12 +159,11 @@ def detect_line(
     s = settings or LineSettings()
     if image.ndim != 2:
         raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
-    scan = _lay_columns(image.shape, s, region_px)
+    columns = lay_columns(image.shape, s.columns, region_px)
+    samples = _sampled(image, columns)
     if region_px is None:
-        blank = np.ptp(image, axis=1) == 0
-        sides = np.logical_and.accumulate(blank) | np.logical_and.accumulate(blank[::-1])[::-1]
-        scan = _Scan(scan.column, scan.inside & ~sides[scan.column, None])
-    return _detect(image, _checked_pixel(pixel_mm), s, scan)
+        columns = without_blank_sides(columns, samples)
+    return _detect(samples, _checked_pixel(pixel_mm), s, columns)
 
 
 def detect_lines(
@@ -207,15 +193,15 @@ def detect_lines(
     """
     s = settings or LineSettings()
     pixel = _checked_pixel(pixel_mm)
-    scan = _lay_columns(frames.shape[1:], s, region_px)
-    if region_px is None:
-        scan = _Scan(scan.column, scan.inside & _in_motion(frames, scan.column, s.smoothing_mm / pixel[1]))
+    columns = lay_columns(frames.shape[1:], s.columns, region_px)
+    if region_px is None and frames.shape[0] > 0:
+        columns = without_standing(columns, frames, s.smoothing_mm / pixel[1])
     found: dict[int, EchoLine] = {}
     dropped: dict[int, str] = {}
     count = frames.shape[0]
     for index in range(count):
         try:
-            found[index] = _detect(frames[index], pixel, s, scan)
+            found[index] = _detect(_sampled(frames[index], columns), pixel, s, columns)
         except NoLineError as error:
             dropped[index] = str(error)
         if progress:
@@ -237,103 +223,47 @@ def _checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
     return pixel
 
 
-def _lay_columns(shape: tuple[int, ...], s: LineSettings, region_px: npt.ArrayLike | None) -> _Scan:
-    """Regular columns, symmetric about the region's middle, and their rows in the region."""
-    columns, rows = shape
-    region = None if region_px is None else _checked_region(region_px)
-    sides = (0, columns - 1)
-    if region is not None:
-        low, high = region[:, 0].min(), region[:, 0].max()
-        sides = max(0, int(np.ceil(low))), min(columns - 1, int(np.floor(high)))
-    left = np.rint(np.linspace(0, sides[1] - sides[0], s.columns)[: (s.columns + 1) // 2]).astype(np.int64)
-    column = np.unique(np.concatenate([sides[0] + left, sides[1] - left]))
-    inside = np.ones((column.size, rows), dtype=bool)
-    if region is not None:
-        inside = np.array([_rows_inside(region, c, rows) for c in column])
-    if sides[1] - sides[0] < 4 or not inside.any():
-        raise InvalidInputError(
-            f"region_px: expected a polygon that covers part of the {columns} x {rows} pixels, got none"
-        )
-    return _Scan(column, inside)
-
-
-def _checked_region(region_px: npt.ArrayLike) -> FloatArray:
-    region = np.asarray(region_px, dtype=float)
-    if region.ndim != 2 or region.shape[0] < 3 or region.shape[1] != 2:
-        raise InvalidInputError(f"region_px: expected shape (k, 2) with k of 3 or more, got {region.shape}")
-    require_finite(region, "region_px")
-    return region
-
-
-def _rows_inside(region: FloatArray, column: int, rows: int) -> BoolArray:
-    """Rows of a column within a polygon: between every other crossing of its sides."""
-    middle = (region[:, 0].min() + region[:, 0].max()) / 2
-    # A hair towards the middle, so that the first and the last column have rows however its corners lie.
-    u = column + 1e-9 * (middle - column)
-    (x0, y0), (x1, y1) = region.T, np.roll(region, -1, axis=0).T
-    crossed = (np.minimum(x0, x1) <= u) & (u < np.maximum(x0, x1))
-    x0, y0, x1, y1 = (values[crossed] for values in (x0, y0, x1, y1))
-    crossings = y0 + (u - x0) * (y1 - y0) / (x1 - x0)
-    row = np.arange(rows)[:, None]
-    # From either end, so that rows exactly on a side are inside.
-    above = (crossings <= row + 1e-6).sum(axis=1) % 2 == 1
-    below = (crossings >= row - 1e-6).sum(axis=1) % 2 == 1
-    return np.asarray(above | below)
-
-
-def _in_motion(frames: Frames, column: IntArray, sigma: float) -> BoolArray:
-    """Rows of the columns but for those that stand still, as far as they are bright and above all motion."""
-    glances = np.unique(np.linspace(0, frames.shape[0] - 1, _GLANCES).astype(int))
-    low = high = np.asarray(frames[int(glances[0])][column], np.float32)
-    for index in glances[1:]:
-        image = np.asarray(frames[int(index)][column], np.float32)
-        low, high = np.minimum(low, image), np.maximum(high, image)
-    change = gaussian_filter1d(high - low, sigma / 2, axis=1)
-    limit = _LIVELY * np.percentile(change.max(axis=1), 90)
-    lively = change > limit
-    still_above = ~np.logical_or.accumulate(lively, axis=1)
-    bright = still_above & (gaussian_filter1d(low, sigma / 2, axis=1) - low.min() > limit)
-    under = ~np.logical_or.accumulate(bright[:, ::-1], axis=1)[:, ::-1]
-    if not limit > 0:
-        return np.ones(change.shape, dtype=bool)
-    return np.asarray(under & lively.any(axis=1)[:, None])
-
-
-def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, scan: _Scan) -> EchoLine:
-    samples = _sampled(image, scan)
-    row = _echo_rows(samples, scan.spans, s, s.smoothing_mm / pixel_mm[1])
-    column = scan.column.astype(float)
-    tolerance = s.tolerance_mm / pixel_mm[1]
-    _, start, slope = best_pair(column, row, scan.inside, tolerance)
-    agree = np.zeros(row.size, dtype=bool)
-    agreed, possible, _ = agreeing(column, row, scan.inside, start, slope, tolerance, agree)
-    for _ in range(_ROUNDS):
-        if agreed < 3:
-            break
-        slope, start = np.polyfit(column[agree], row[agree], 1)
-        before = agree.copy()
-        agreed, possible, _ = agreeing(column, row, scan.inside, start, slope, tolerance, agree)
-        if np.array_equal(before, agree):
-            break
-    held = np.count_nonzero(scan.inside.any(axis=1))
-    needed = max(int(np.ceil(s.consensus * possible - 1e-9)), int(np.ceil(_LEAST_SHARE * held)), 3)
-    if agreed < needed:
-        raise NoLineError(f"no line: {agreed} of {possible} possible columns agree, {needed} needed")
-    return _measured(column, row, agree, (start, slope), possible, pixel_mm)
-
-
-def _sampled(image: npt.NDArray[Any], scan: _Scan) -> Float32Array:
-    """The columns looked at, which must show something."""
+def _sampled(image: npt.NDArray[Any], columns: Columns) -> Float32Array:
     if not np.isrealobj(image):
         raise InvalidInputError(f"image: expected real values, got {image.dtype}")
-    samples = np.asarray(image[scan.column], dtype=np.float32)
-    held = samples[scan.inside]
+    return np.asarray(image[columns.column], dtype=np.float32)
+
+
+def _detect(samples: Float32Array, pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
+    _require_content(samples[columns.inside])
+    column = columns.column.astype(float)
+    row = _echo_rows(samples, columns.spans, s, s.smoothing_mm / pixel_mm[1])
+    fit, agree, possible = _consensus(column, row, columns.inside, s.tolerance_mm / pixel_mm[1])
+    agreed = int(agree.sum())
+    needed = max(3, *(int(np.ceil(x - 1e-9)) for x in (s.consensus * possible, _LEAST_SHARE * columns.held)))
+    if agreed < needed:
+        raise NoLineError(f"no line: {agreed} of {possible} possible columns agree, {needed} needed")
+    return _measured(column, row, agree, fit, possible, pixel_mm)
+
+
+def _require_content(held: Float32Array) -> None:
     if not np.isfinite(held).all():
         raise NoLineError("no line: the image holds values that are not finite")
     if held.size == 0 or np.ptp(held) == 0:
         raise NoLineError("no line: the image is of one level all over")
-    samples[~scan.inside] = 0.0
-    return samples
+
+
+def _consensus(
+    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float
+) -> tuple[tuple[float, float], BoolArray, int]:
+    """Start and slope of the line most points agree with, fitted to them; which do, and how many could."""
+    agree = np.zeros(row.size, dtype=bool)
+    agreed, start, slope = best_pair(column, row, inside, tolerance)
+    agreed, possible, _ = agreeing(column, row, inside, start, slope, tolerance, agree)
+    for _ in range(_ROUNDS):
+        if agreed < 3:
+            break
+        before = agree.copy()
+        slope, start = np.polyfit(column[agree], row[agree], 1)
+        agreed, possible, _ = agreeing(column, row, inside, start, slope, tolerance, agree)
+        if np.array_equal(before, agree):
+            break
+    return (start, slope), agree, possible
 
 
 def _echo_rows(samples: Float32Array, spans: IntArray, s: LineSettings, sigma: float) -> FloatArray:
@@ -342,13 +272,10 @@ def _echo_rows(samples: Float32Array, spans: IntArray, s: LineSettings, sigma: f
     t = np.arange(1, int(np.ceil(_REACH * sigma)) + 1)
     taps = t * np.exp(-0.5 * (t / sigma) ** 2)
     edge_response(samples, spans, (taps / (2 * t * taps).sum()).astype(np.float32), response)
-    threshold = s.threshold
-    # The kernel's slope is per row.
-    limit = (
-        _TYPICAL * np.median(response.max(axis=1))
-        if threshold is None
-        else threshold * s.smoothing_mm / sigma
-    )
+    largest = response.max(axis=1)[np.unique(spans[:, 0])]
+    typical = _TYPICAL * np.median(largest)
+    # The response is per row.
+    limit = typical if s.threshold is None else s.threshold * s.smoothing_mm / sigma
     edges, fronts, peaks = np.empty((3, len(samples)))
     found = np.empty(len(samples), np.int64)
     first_edges(response, spans, float(limit), edges, found)
@@ -374,7 +301,7 @@ def _measured(
     # both count the same, so that their sum and their difference are uncorrelated, too.
     start, slope = line
     x, y = column[agree], row[agree]
-    spread = x.std()
+    spread = float(x.std())
     ends = x.mean() + spread * np.array([-1.0, 1.0])
     residual = np.full(row.size, np.nan)
     residual[agree] = y - start - slope * x
@@ -393,16 +320,16 @@ def _measured(
 def _level_sd(residual: FloatArray) -> float:
     """Standard error of the mean of residuals (NaN where missing) that may resemble their neighbours."""
     there = np.isfinite(residual)
-    count = int(there.sum())
+    count = float(there.sum())
     r = np.where(there, residual, 0.0)
-    variance = r @ r / count
+    energy = max(float(r @ r), count * _FINEST_ROWS**2)
     likeness = 1.0
-    for lag in range(1, count // 4):
-        pairs = max(1, int(there[lag:] @ there[:-lag].astype(int)))
-        rho = r[lag:] @ r[:-lag] / pairs / max(variance, 1e-12)
+    for lag in range(1, int(count) // 4):
+        pairs = max(1, np.count_nonzero(there[lag:] & there[:-lag]))
+        rho = float(r[lag:] @ r[:-lag]) / pairs / (energy / count)
         if rho <= 0:
             break
         likeness += 2.0 * rho * (1 - lag / count)
     likeness = min(likeness, count / 4)
-    freedom = max(count - 2.0 * likeness, 1.0)
-    return float(np.sqrt(max(r @ r / freedom, _FINEST_ROWS**2) * likeness / count))
+    # The line itself took two of as many free residuals as there are independent ones.
+    return float(np.sqrt(energy / (count - 2.0 * likeness) * likeness / count))
