@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,26 +22,24 @@ from calibration.columns import (
     without_blank_sides,
     without_standing,
 )
+from calibration.edges import Edges, Place, first_echoes, take_slopes
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Frames
-from speckle3d.kernels.lines import agreeing, best_pair, echo_fronts, edge_response, first_edges
+from speckle3d.kernels.lines import consensus_line
 
 Float32Array = npt.NDArray[np.float32]
 
-_TYPICAL = 0.5
-"""Threshold, when chosen from the image, as a part of the response of the middle column's strongest edge."""
+_THRESHOLDS = (0.9, 0.7, 0.5, 0.35)
+"""Thresholds tried when none is given, as parts of the steepest rise in the middle one of all columns."""
+_WEAKER = 0.75
+"""How strong a line must be to go before a stronger one beneath it: above the haze and the side lobes, below
+the floor's own fading between images. Its reverberations lie beneath and are weaker in any case."""
 _LEAST_SHARE = 0.25
 """Part of the sampled columns that must agree however few the line could meet: two or three edges, which are
 noise, always agree with a line that cuts a corner of the region."""
-_FINE = 0.25
-"""Smoothing with which the front of an echo is placed, as a part of that with which it is found: enough
-against noise, and short against the rise of an echo."""
-_REACH = 3.5
-"""Length of the filters' sides, standard deviations."""
 _FINEST_ROWS = 0.1
 """Scatter below which an edge is not placed: interpolation between rows is not better."""
-_ROUNDS = 20
 
 
 class LineSettings(BaseModel):
@@ -61,14 +59,14 @@ class LineSettings(BaseModel):
     threshold: float | None = Field(
         None,
         gt=0,
-        description="Slope that makes an edge, grey levels per mm; by default half the largest in the middle "
-        "of all columns.",
+        description="Slope that makes an edge, grey levels per mm; by default the one with which the first "
+        "strong line shows best.",
     )
     tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
     consensus: float = Field(
         0.7, gt=0, le=1, description="Part that must agree of the columns whose region the line meets."
     )
-    place: Literal["front", "slope", "peak"] = Field(
+    place: Place = Field(
         "front",
         description="Where on an echo the line is put: where it has risen half way, where the smoothed image "
         "is steepest (up to smoothing_mm above a thin echo), or where it is brightest.",
@@ -229,16 +227,56 @@ def _sampled(image: npt.NDArray[Any], columns: Columns) -> Float32Array:
     return np.asarray(image[columns.column], dtype=np.float32)
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """A line that some columns' edges agree with."""
+
+    edges: Edges
+    agree: BoolArray
+    possible: int
+    start: float
+    slope: float
+
+    @property
+    def agreed(self) -> int:
+        return int(self.agree.sum())
+
+    @property
+    def strength(self) -> float:
+        return float(self.edges.strength[self.agree].sum() / max(self.possible, 1))
+
+
 def _detect(samples: Float32Array, pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
     _require_content(samples[columns.inside])
-    column = columns.column.astype(float)
-    row = _echo_rows(samples, columns.spans, s, s.smoothing_mm / pixel_mm[1])
-    fit, agree, possible = _consensus(column, row, columns.inside, s.tolerance_mm / pixel_mm[1])
-    agreed = int(agree.sum())
-    needed = max(3, *(int(np.ceil(x - 1e-9)) for x in (s.consensus * possible, _LEAST_SHARE * columns.held)))
-    if agreed < needed:
-        raise NoLineError(f"no line: {agreed} of {possible} possible columns agree, {needed} needed")
-    return _measured(column, row, agree, fit, possible, pixel_mm)
+    tolerance = s.tolerance_mm / float(pixel_mm[1])
+    slopes = take_slopes(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
+    thresholds = [part * slopes.typical for part in _THRESHOLDS]
+    if s.threshold is not None:
+        thresholds = [s.threshold * float(pixel_mm[1])]
+    echoes = [first_echoes(slopes, threshold, s.place) for threshold in thresholds]
+    tried = [_consensus(edges, columns, tolerance) for edges in echoes]
+    accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
+    if not accepted:
+        best = max(tried, key=lambda line: line.agreed)
+        raise NoLineError(
+            f"no line: {best.agreed} of {best.possible} possible columns agree, "
+            f"{_needed(best, columns, s)} needed"
+        )
+    return _measured(_first_strong(accepted, columns, tolerance), columns, pixel_mm)
+
+
+def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
+    shares = s.consensus * line.possible, _LEAST_SHARE * columns.held
+    return max(3, *(int(np.ceil(share - 1e-9)) for share in shares))
+
+
+def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -> _Candidate:
+    """The uppermost of the lines nearly as strong as the strongest, as the most columns see it."""
+    least = _WEAKER * max(line.strength for line in lines)
+    middle = float(columns.column.mean())
+    depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
+    upper = [line for line in lines if depths.get(id(line), np.inf) <= min(depths.values()) + tolerance]
+    return max(upper, key=lambda line: line.agreed)
 
 
 def _require_content(held: Float32Array) -> None:
@@ -248,71 +286,28 @@ def _require_content(held: Float32Array) -> None:
         raise NoLineError("no line: the image is of one level all over")
 
 
-def _consensus(
-    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float
-) -> tuple[tuple[float, float], BoolArray, int]:
-    """Start and slope of the line most points agree with, fitted to them; which do, and how many could."""
-    agree = np.zeros(row.size, dtype=bool)
-    agreed, start, slope = best_pair(column, row, inside, tolerance)
-    agreed, possible, _ = agreeing(column, row, inside, start, slope, tolerance, agree)
-    for _ in range(_ROUNDS):
-        if agreed < 3:
-            break
-        before = agree.copy()
-        slope, start = np.polyfit(column[agree], row[agree], 1)
-        agreed, possible, _ = agreeing(column, row, inside, start, slope, tolerance, agree)
-        if np.array_equal(before, agree):
-            break
-    return (start, slope), agree, possible
+def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:
+    agree = np.zeros(edges.row.size, dtype=bool)
+    column = columns.column.astype(float)
+    possible, start, slope = consensus_line(column, edges.row, columns.inside, tolerance, agree)
+    return _Candidate(edges, agree, possible, start, slope)
 
 
-def _echo_rows(samples: Float32Array, spans: IntArray, s: LineSettings, sigma: float) -> FloatArray:
-    """Row of the first strong echo in each column, shape (n,); NaN where there is none."""
-    response = np.empty_like(samples)
-    t = np.arange(1, int(np.ceil(_REACH * sigma)) + 1)
-    taps = t * np.exp(-0.5 * (t / sigma) ** 2)
-    edge_response(samples, spans, (taps / (2 * t * taps).sum()).astype(np.float32), response)
-    largest = response.max(axis=1)[np.unique(spans[:, 0])]
-    typical = _TYPICAL * np.median(largest)
-    # The response is per row.
-    limit = typical if s.threshold is None else s.threshold * s.smoothing_mm / sigma
-    edges, fronts, peaks = np.empty((3, len(samples)))
-    found = np.empty(len(samples), np.int64)
-    first_edges(response, spans, float(limit), edges, found)
-    if s.place == "slope":
-        return np.asarray(edges)
-    t = np.arange(int(np.ceil(_REACH * _FINE * sigma)) + 1)
-    fine = np.exp(-0.5 * (t / (_FINE * sigma)) ** 2)
-    fine /= 2 * fine.sum() - 1
-    echo_fronts(samples, spans, found, edges, fine.astype(np.float32), sigma, fronts, peaks)
-    return np.asarray(fronts if s.place == "front" else peaks)
-
-
-def _measured(
-    column: FloatArray,
-    row: FloatArray,
-    agree: BoolArray,
-    line: tuple[float, float],
-    possible: int,
-    pixel_mm: FloatArray,
-) -> EchoLine:
-    """The line with its errors."""
+def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoLine:
     # Errors of a fit's level at the mean column and of its slope are uncorrelated. One spread to either side
     # both count the same, so that their sum and their difference are uncorrelated, too.
-    start, slope = line
-    x, y = column[agree], row[agree]
+    x, y = columns.column[line.agree].astype(float), line.edges.row[line.agree]
     spread = float(x.std())
     ends = x.mean() + spread * np.array([-1.0, 1.0])
-    residual = np.full(row.size, np.nan)
-    residual[agree] = y - start - slope * x
-    level_sd_mm = _level_sd(residual) * pixel_mm[1]
-    steepness = slope * pixel_mm[1] / pixel_mm[0]
+    residual = line.edges.row - line.start - line.slope * columns.column
+    level_sd_mm = _level_sd(np.where(line.agree, residual, np.nan)) * float(pixel_mm[1])
+    steepness = line.slope * pixel_mm[1] / pixel_mm[0]
     return EchoLine(
-        points_px=np.stack([ends, start + slope * ends], axis=1),
+        points_px=np.stack([ends, line.start + line.slope * ends], axis=1),
         point_sd_mm=float(np.sqrt(2.0) * level_sd_mm),
         direction_sd_rad=float(level_sd_mm / (spread * pixel_mm[0]) / (1 + steepness**2)),
-        consensus=int(agree.sum()),
-        possible=possible,
+        consensus=line.agreed,
+        possible=line.possible,
         inlier_px=np.stack([x, y], axis=1),
     )
 
@@ -322,14 +317,14 @@ def _level_sd(residual: FloatArray) -> float:
     there = np.isfinite(residual)
     count = float(there.sum())
     r = np.where(there, residual, 0.0)
-    energy = max(float(r @ r), count * _FINEST_ROWS**2)
+    energy = float(np.maximum(r @ r, count * _FINEST_ROWS**2))
     likeness = 1.0
     for lag in range(1, int(count) // 4):
         pairs = max(1, np.count_nonzero(there[lag:] & there[:-lag]))
-        rho = float(r[lag:] @ r[:-lag]) / pairs / (energy / count)
+        rho = float(r[lag:] @ r[:-lag]) * count / (energy * pairs)
         if rho <= 0:
             break
         likeness += 2.0 * rho * (1 - lag / count)
-    likeness = min(likeness, count / 4)
+    likeness = float(np.minimum(likeness, count / 4))
     # The line itself took two of as many free residuals as there are independent ones.
     return float(np.sqrt(energy / (count - 2.0 * likeness) * likeness / count))

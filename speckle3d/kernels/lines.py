@@ -11,6 +11,8 @@ Float32Array = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+_ROUNDS = 20
+
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
 def edge_response(samples: Float32Array, spans: IntArray, taps: Float32Array, out: Float32Array) -> None:
@@ -47,7 +49,12 @@ def edge_response(samples: Float32Array, spans: IntArray, taps: Float32Array, ou
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def first_edges(
-    response: Float32Array, spans: IntArray, threshold: float, rows: FloatArray, found: IntArray
+    response: Float32Array,
+    spans: IntArray,
+    threshold: float,
+    rows: FloatArray,
+    largest: FloatArray,
+    found: IntArray,
 ) -> None:
     """First maximum of each column's response above a threshold, or else its largest maximum.
 
@@ -58,12 +65,14 @@ def first_edges(
         By column, then by row.
     rows : float64, shape (n,)
         Of the maximum, between samples by a parabola; NaN without any.
+    largest : float64, shape (n,)
+        The maximum; 0 without any.
     found : int64, shape (n,)
         The span it lies in; -1 without any.
     """
     rows[:] = np.nan
     found[:] = -1
-    largest = np.zeros(rows.size)
+    largest[:] = 0.0
     for s in range(spans.shape[0]):
         c, first, last = spans[s]
         line = response[c]
@@ -181,18 +190,17 @@ def agreeing(
 
 @njit(cache=True, nogil=True)
 def best_pair(
-    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float
-) -> tuple[int, float, float]:
+    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float, agree: BoolArray
+) -> tuple[float, float]:
     """The line through two points that most points agree with, the closest of equals.
 
-    Parameters are those of `agreeing`.
+    Parameters are those of `agreeing`; `agree` is overwritten.
 
     Returns
     -------
-    tuple of int, float and float
-        How many agree (0 without two points), the line's row in column 0, and its slope.
+    tuple of float
+        The line's row in column 0, and its slope; zeros without two points.
     """
-    agree = np.empty(column.size, np.bool_)
     most, least, best_start, best_slope = 0, np.inf, 0.0, 0.0
     for j in range(column.size):
         if np.isnan(row[j]):
@@ -205,4 +213,34 @@ def best_pair(
             agreed, _, squares = agreeing(column, row, inside, start, slope, tolerance, agree)
             if agreed > most or (agreed == most and squares < least):
                 most, least, best_start, best_slope = agreed, squares, start, slope
-    return most, best_start, best_slope
+    return best_start, best_slope
+
+
+@njit(cache=True, nogil=True)
+def consensus_line(
+    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float, agree: BoolArray
+) -> tuple[int, float, float]:
+    """Fit the best pair's line to the points that agree with it, until these stay the same.
+
+    Parameters are those of `agreeing`.
+
+    Returns
+    -------
+    tuple of int, float and float
+        How many points could agree, the line's row in column 0, and its slope.
+    """
+    start, slope = best_pair(column, row, inside, tolerance, agree)
+    agreed, possible, _ = agreeing(column, row, inside, start, slope, tolerance, agree)
+    before = np.empty_like(agree)
+    for _ in range(_ROUNDS):
+        if agreed < 3:
+            break
+        before[:] = agree
+        x, y = column[before], row[before]
+        away = x - x.mean()
+        slope = (away * y).sum() / (away * away).sum()
+        start = y.mean() - slope * x.mean()
+        agreed, possible, _ = agreeing(column, row, inside, start, slope, tolerance, agree)
+        if (before == agree).all():
+            break
+    return possible, start, slope
