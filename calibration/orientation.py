@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.adequacy import require_adequate
-from calibration.chain import IntArray
-from calibration.plane import OUTLIER_SIGMA, solve_directions
+from calibration.chain import ImagePoints, IntArray
+from calibration.plane import ANGLES, OUTLIER_SIGMA, LineDirections, settled_angles, solve, some
 from calibration.solution import Solution
-from calibration.stages import angle_starts, hemisphere, in_plane_mirror
+from calibration.stages import hemisphere, in_plane_mirror
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 
@@ -30,7 +30,6 @@ MIRROR_LIMIT = 0.2
 """Mean vertical part of the beam direction below which gravity cannot tell the image from its mirror: with
 the beam within 12 degrees of level on average, hand and floor may be tilted as much."""
 
-_STARTS = 4
 _CERTAIN_RAD = np.deg2rad(5.0)
 
 STEEPEST_PLANE = np.deg2rad(45.0)
@@ -74,17 +73,12 @@ def calibrate_orientation(
         raise InsufficientDataError(f"expected lines in at least {FEWEST_LINES} frames, got {len(frame)}")
     if viewed_from not in ("above", "below"):
         raise InvalidInputError(f"viewed_from: expected 'above' or 'below', got {viewed_from!r}")
-    ratio = float(pixel_mm[0] / pixel_mm[1])
+    size = np.array([float(pixel_mm[0] / pixel_mm[1]), 1.0])
     normals = hemisphere()
     normals = normals[:1] if level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
-    starts = angle_starts(directions_px, world_from_sensor, ratio, normals, _STARTS)
-    solutions = [
-        solve_directions(
-            directions_px, frame, world_from_sensor, start, level=level, outlier_sigma=outlier_sigma
-        )
-        for start in starts
-    ]
-    best = require_adequate(min(solutions, key=lambda solution: solution.sigma))
+    lines = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
+    start = settled_angles(some(lines), size[0], normals, level=level)
+    best = require_adequate(solve(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
     _require_floor(best)
     return upright(best, viewed_from)
 

@@ -8,6 +8,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -35,21 +36,21 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.leastsquares import Fit, clustered_covariance, levenberg_marquardt
 
+ANGLES = PROBE[5:]
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
 
-_SOME_LINES = 100
-"""Lines that choose among starting points, all of them refining the answer afterwards."""
+_SOME_FRAMES = 100
+"""Frames that choose among starting points, all of them refining the answer afterwards."""
 
 OUTLIER_SIGMA = 4.0
 """Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals one
 in 16,000, so that nothing is lost where nothing is wrong."""
 
 MAD_TO_SIGMA = 1.4826
-_CAUCHY = 2.385
-"""Tuning of the Cauchy weights, in standard deviations: 95 % efficient for Gaussian residuals."""
-_REWEIGHTINGS = 5
-_ROUNDS = 20
+_REWEIGHTINGS = 6
+_FREE_ROUNDS = 5
+"""After these, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
 
@@ -126,16 +127,20 @@ def solve(
         If there are too few points, or fewer than half of them agree.
     """
     free = (*probe, *phantom.determined)
-    chain, used = _first_guess(points, phantom, start, free), np.ones(len(points), dtype=bool)
-    for _ in range(_ROUNDS):
+    chain = _first_guess(points, phantom, start, free)
+    residuals = _residuals(points, phantom, chain)
+    used = _frames_within(residuals, points.frame, outlier_sigma * robust_sigma(residuals))
+    for round_ in itertools.count():
+        _require_majority(used, points)
         chain, fit, jacobian = _refined(points[used], phantom, chain, free)
         residuals = _residuals(points, phantom, chain)
         sigma = robust_sigma(residuals[used])
         agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
+        if round_ >= _FREE_ROUNDS:
+            agreeing &= used
         if (agreeing == used).all():
             break
         used = agreeing
-        _require_majority(used, points)
     return Solution(
         chain,
         phantom,
@@ -166,11 +171,11 @@ def condition_number(points: ImagePoints, phantom: Phantom, chain: Chain, free: 
 
 
 def _first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
-    """Least squares with weights that fall with the residual, so that wrong frames pull little."""
+    """Nearly least absolute residuals, by reweighting: wrong frames pull little."""
     chain = start
     for _ in range(_REWEIGHTINGS):
-        residuals = _residuals(points, phantom, chain)
-        weights = 1.0 / np.sqrt(1.0 + (residuals / (_CAUCHY * robust_sigma(residuals))) ** 2)
+        size = np.abs(_residuals(points, phantom, chain))
+        weights = 1.0 / np.sqrt(np.maximum(size, 0.1 * np.median(size) + _SMALLEST_SIGMA))
         chain, _, _ = _refined(points, phantom, chain, free, weights, tolerance=1e-3)
     return chain
 
@@ -279,67 +284,57 @@ def calibrate_plane(
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
-    """Angles from some directions, refined; then distances; the third stage is the caller's."""
-    some = _some(lines)
-    first, second = some[0::2], some[1::2]
-    turns = first.world_from_sensor.rotation
-    ratio = None if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
-    directions = second.pixels - first.pixels
-    found = []
-    for start in angle_starts(directions, turns, ratio, hemisphere()):
-        angles = refined_angles(directions, first.frame, turns, start, fit_ratio=pixel_mm is None)
-        mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
-        found += [distance_start(lines, either, pixel_mm) for either in (angles, mirror)]
+    """Angles from some directions; then distances; the third stage, refining all, is the caller's."""
+    few = some(lines)
+    first, second = few[0::2], few[1::2]
+    directions = replace(first, pixels=second.pixels - first.pixels)
+    ratio = 1.0 if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
+    chain = settled_angles(directions, ratio, hemisphere(), fit_ratio=pixel_mm is None)
+    normal = chain.target_from_world.rotation.as_matrix()[2]
+    either = (chain.sensor_from_image.rotation, in_plane_mirror(chain.sensor_from_image.rotation))
+    seen = float(chain.pixel_mm[0] / chain.pixel_mm[1])
+    found = [distance_start(lines, Angles(rotation, normal, seen), pixel_mm) for rotation in either]
     return min(found, key=lambda pair: pair[1])[0]
 
 
-def _some(lines: ImagePoints) -> ImagePoints:
-    """Lines from all over the recording, enough to choose among starting points."""
-    picked = np.unique(np.linspace(0, len(lines) // 2 - 1, _SOME_LINES).astype(int))
-    return lines[np.ravel(2 * picked[:, None] + [0, 1])]
+def some(points: ImagePoints) -> ImagePoints:
+    """Points of frames from all over the recording, enough to choose among starting points."""
+    frames = np.unique(points.frame)
+    picked = frames[np.unique(np.linspace(0, len(frames) - 1, _SOME_FRAMES).astype(int))]
+    return points[np.isin(points.frame, picked)]
 
 
-def refined_angles(
-    directions_px: FloatArray, frame: IntArray, world_from_sensor: Rotation, start: Angles, fit_ratio: bool
-) -> Angles:
-    """First stage: the angles that make all line directions lie in the plane."""
-    solution = solve_directions(directions_px, frame, world_from_sensor, start, fit_ratio=fit_ratio)
-    chain = solution.chain
-    normal = chain.target_from_world.rotation.as_matrix()[2]
-    ratio = float(chain.pixel_mm[0] / chain.pixel_mm[1])
-    return Angles(chain.sensor_from_image.rotation, normal, ratio, solution.sigma)
+def settled_angles(
+    lines: ImagePoints, ratio: float, normals: FloatArray, fit_ratio: bool = False, level: bool = False
+) -> Chain:
+    """First stage: the angles that make line directions lie in the plane, outliers pulling little.
 
-
-def solve_directions(
-    directions_px: FloatArray,
-    frame: IntArray,
-    world_from_sensor: Rotation,
-    start: Angles,
-    fit_ratio: bool = False,
-    level: bool = False,
-    outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
-    """Refine angles from line directions: the first of three stages, and all that orientation allows.
-
-    Residuals are sines of the angle between line and plane.
+    Parameters
+    ----------
+    lines : ImagePoints
+        Their pixels are directions, their poses' translations without effect.
     """
-    upright = Rotation.align_vectors([[0.0, 0.0, 1.0]], [start.normal])[0]
-    rotations = (start.sensor_from_image, Rotation.identity() if level else upright)
-    size = np.array([start.ratio, 1.0])
-    chain = Chain(size, *(RigidTransform.from_rotation(rotation) for rotation in rotations))
-    points = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
-    probe = PROBE[5:]
-    return solve(
-        points, LineDirections(size, level), chain, ("s_x", *probe) if fit_ratio else probe, outlier_sigma
-    )
+    turns = lines.world_from_sensor.rotation
+    points = replace(lines, world_from_sensor=RigidTransform.from_rotation(turns))
+    size = np.array([ratio, 1.0])
+    phantom = LineDirections(size, level)
+    free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
+    settled = []
+    for start in angle_starts(points.pixels, turns, ratio, normals):
+        upright = (
+            Rotation.identity() if level else Rotation.align_vectors([[0.0, 0.0, 1.0]], [start.normal])[0]
+        )
+        chain = Chain(size, *(RigidTransform.from_rotation(r) for r in (start.sensor_from_image, upright)))
+        settled.append(_first_guess(points, phantom, chain, free))
+    return min(settled, key=lambda one: robust_sigma(_residuals(points, phantom, one)))
 
 
 def _mountings(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
     """One stage: the best of all-at-once solutions of some lines, from mountings all over the sphere."""
     size = np.ones(2) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
-    some = _some(lines)
-    starts = [_lying_flat(some, size, turn) for turn in Rotation.create_group("O")]
-    settled = [solve(some, Plane(), start, probe, outlier_sigma=np.inf) for start in starts]
+    few = some(lines)
+    starts = [_lying_flat(few, size, turn) for turn in Rotation.create_group("O")]
+    settled = [solve(few, Plane(), start, probe, outlier_sigma=np.inf) for start in starts]
     return min(settled, key=lambda solution: solution.sigma).chain
 
 

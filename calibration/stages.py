@@ -1,7 +1,7 @@
 """Where to start: the angles of a plane calibration from line directions alone, then the distances.
 
-Both stages are linear once the plane's normal is assumed, so that no guess of the mounting is needed and no
-local minimum is met; normals are tried all over the hemisphere.
+Mountings are tried all over, so that no guess is needed and no local minimum is met; the distances are then
+linear.
 
 References
 ----------
@@ -18,8 +18,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.chain import Chain, ImagePoints
 from speckle3d.core.geometry import FloatArray
 
-_NORMALS = 120
-"""Directions over the hemisphere, 13 degrees apart: refinement converges from twice as far."""
+_NORMALS = 30
+_MOUNTINGS = 400
+"""About 26 and 30 degrees apart: refinement converges from further away."""
 
 _REWEIGHTINGS = 4
 
@@ -32,14 +33,11 @@ class Angles:
     ----------
     ratio : float
         Column pitch over row spacing.
-    cost : float
-        Median absolute sine of the angle between line and plane.
     """
 
     sensor_from_image: Rotation
     normal: FloatArray
     ratio: float
-    cost: float
 
 
 def hemisphere(count: int = _NORMALS) -> FloatArray:
@@ -51,65 +49,54 @@ def hemisphere(count: int = _NORMALS) -> FloatArray:
     return np.column_stack([flat * np.cos(around), flat * np.sin(around), z])
 
 
+def mountings() -> Rotation:
+    """Rotations spread over all there are, but for half turns about z, which line directions cannot tell.
+
+    References
+    ----------
+    .. [1] M. Alexa, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)", CVPR, 2022.
+    """
+    s = np.arange(2 * _MOUNTINGS) + 0.5
+    t = s / (2 * _MOUNTINGS)
+    first, second = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168755204288118041
+    inner, outer = np.sqrt(t), np.sqrt(1.0 - t)
+    quaternions = [
+        inner * np.sin(first),
+        inner * np.cos(first),
+        outer * np.sin(second),
+        outer * np.cos(second),
+    ]
+    every = Rotation.from_quat(np.column_stack(quaternions))
+    return every[every.as_matrix()[:, 0, 0] >= 0]
+
+
 def angle_starts(
-    directions_px: FloatArray,
-    world_from_sensor: Rotation,
-    ratio: float | None,
-    normals: FloatArray,
-    keep: int = 2,
+    directions_px: FloatArray, world_from_sensor: Rotation, ratio: float, normals: FloatArray, keep: int = 4
 ) -> list[Angles]:
-    """Find angles from line directions, best first.
+    """Try mountings of the sensor and normals of the plane all over, and keep the best.
 
     Parameters
     ----------
     directions_px : ndarray, shape (m, 2)
         Columns and rows from one end of each line to the other.
     world_from_sensor : Rotation, length m
-    ratio : float, optional
-        Column pitch over row spacing; estimated without it.
+    ratio : float
+        Column pitch over row spacing.
     normals : ndarray, shape (k, 3)
-        Normals of the plane to try.
     """
-    length = directions_px * [1.0 if ratio is None else ratio, 1.0]
+    length = directions_px * [ratio, 1.0]
     flat = length / np.linalg.norm(length, axis=1, keepdims=True)
     up = np.einsum("ki,nij->knj", normals, world_from_sensor.as_matrix())
-    axes = _image_axes(flat, up)
-    found = [_angles(flat, up[k], normals[k], axes[k], ratio) for k in range(len(normals))]
-    return sorted(found, key=lambda start: start.cost)[:keep]
-
-
-def _image_axes(flat: FloatArray, up: FloatArray) -> FloatArray:
-    """Image axes x and y in the sensor's frame for each assumed normal, up to scale, shape (k, 6).
-
-    To them every line's condition, ``(d_x x + d_y y) . up = 0``, is linear.
-    """
-    rows = np.concatenate([flat[:, :1] * up, flat[:, 1:] * up], axis=2)
-    weights = np.ones(rows.shape[:2])
-    for _ in range(_REWEIGHTINGS):
-        axes = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows)[1][:, :, 0]
-        misfit = np.abs(np.einsum("kni,ki->kn", rows, axes))
-        weights = 1.0 / np.maximum(misfit, np.median(misfit, axis=1, keepdims=True) + 1e-12)
-    return axes
-
-
-def _angles(
-    flat: FloatArray, up: FloatArray, normal: FloatArray, axes: FloatArray, ratio: float | None
-) -> Angles:
-    lengths = np.linalg.norm(axes.reshape(2, 3), axis=1)
-    seen = 1.0 if ratio is not None else float(lengths[0] / max(lengths[1], 1e-12))
-    rotation = _from_axes(axes[:3], axes[3:])
-    straight = flat * [seen, 1.0]
-    straight /= np.linalg.norm(straight, axis=1, keepdims=True)
-    sines = np.einsum("ni,ni->n", up, straight @ rotation.as_matrix()[:, :2].T)
-    return Angles(rotation, normal, seen if ratio is None else ratio, float(np.median(np.abs(sines))))
-
-
-def _from_axes(x: FloatArray, y: FloatArray) -> Rotation:
-    """Nearest rotation to image axes x and y that need not be square."""
-    unit = np.column_stack([x / np.linalg.norm(x), y / np.linalg.norm(y)])
-    left, _, right = np.linalg.svd(unit, full_matrices=False)
-    u, v = (left @ right).T
-    return Rotation.from_matrix(np.column_stack([u, v, np.cross(u, v)]))
+    tried = mountings()
+    axes = tried.as_matrix()[:, :, :2]
+    # Mean absolute sine of the angle between line and plane: wrong lines pull little.
+    sines = np.einsum("kni,jia,na->jkn", up, axes, flat, optimize=True)
+    costs = np.abs(sines).mean(axis=2)
+    best = np.argsort(costs, axis=None)[:keep]
+    return [
+        Angles(tried[int(j)], normals[k], ratio)
+        for j, k in zip(*np.unravel_index(best, costs.shape), strict=True)
+    ]
 
 
 def in_plane_mirror(rotation: Rotation) -> Rotation:
