@@ -148,7 +148,7 @@ class WaterBath:
     haze: TiledMedium
     sheet: RoughSheet
     reflector: Reflector = "wall"
-    strength_per_mm2: float = 20.0
+    strength_per_mm2: float = 8.0
     bar_mm: float = 0.2
     reverberation: float = 0.2
     repeats: int = 2
