@@ -1,0 +1,181 @@
+"""Phantoms made of stretched wires: where each wire runs, and which wires make a shape that says more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, require_finite
+
+IntArray = npt.NDArray[np.int64]
+
+_UNIT_TOLERANCE = 1e-6
+_PARALLEL_SINE = 0.02
+"""About one degree: outer wires closer to parallel than this make an N. Holes are drilled to a tenth of a
+millimetre over tens of millimetres, a quarter of that."""
+_FLAT_MM = 0.5
+"""How far apart wires of one layer may pass and still be said to cross: half a wire's thickness or so."""
+
+
+@dataclass(frozen=True)
+class WirePhantom:
+    """Straight wires in the phantom's own frame C.
+
+    Parameters
+    ----------
+    names : tuple of str, length k
+        All different.
+    points_mm : ndarray, shape (k, 3)
+        A point on each wire.
+    directions : ndarray, shape (k, 3)
+        Along each wire, of unit length; either way.
+    patterns : tuple of tuple of int
+        Wires that lie in one plane, in the order in which an image shows them from one side to the other.
+        Three of which the outer two are parallel and the middle one is not are an N (`n_shapes`).
+    ends_mm : ndarray, shape (k, 2, 3), optional
+        Where each wire ends.
+    world_from_phantom : RigidTransform, optional
+        Where the phantom is in the position sensor's world, if somebody measured it.
+
+    Raises
+    ------
+    InvalidInputError
+        If the wires are none, or not finite, or directions are not of unit length, or names repeat, or a
+        pattern names a wire that there is not.
+    MismatchError
+        If the names, points, directions and ends are not as many.
+    """
+
+    names: tuple[str, ...]
+    points_mm: FloatArray
+    directions: FloatArray
+    patterns: tuple[tuple[int, ...], ...] = ()
+    ends_mm: FloatArray | None = None
+    world_from_phantom: RigidTransform | None = None
+
+    def __post_init__(self) -> None:
+        k = len(self.names)
+        if k == 0:
+            raise InvalidInputError("wires: expected at least one, got none")
+        _require_vectors(self.points_mm, (k, 3), "points_mm")
+        _require_vectors(self.directions, (k, 3), "directions")
+        if self.ends_mm is not None:
+            _require_vectors(self.ends_mm, (k, 2, 3), "ends_mm")
+        self._require_names()
+        self._require_unit()
+        self._require_patterns()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def _require_names(self) -> None:
+        repeated = [name for i, name in enumerate(self.names) if name in self.names[:i]]
+        if repeated:
+            raise InvalidInputError(f"names: expected different ones, got {repeated[0]!r} twice")
+
+    def _require_unit(self) -> None:
+        lengths = np.linalg.norm(self.directions, axis=1)
+        bad = np.flatnonzero(np.abs(lengths - 1.0) > _UNIT_TOLERANCE)
+        if bad.size:
+            length = lengths[bad[0]]
+            raise InvalidInputError(f"directions[{bad[0]}]: expected unit length, got {length:.6g}")
+
+    def _require_patterns(self) -> None:
+        for number, pattern in enumerate(self.patterns):
+            if not pattern or len(set(pattern)) < len(pattern) or not set(pattern) <= set(range(len(self))):
+                raise InvalidInputError(
+                    f"patterns[{number}]: expected different wires from 0 to {len(self) - 1}, got {pattern}"
+                )
+
+    @cached_property
+    def n_shapes(self) -> tuple[tuple[int, int, int], ...]:
+        """Those of the patterns that are an N: outer, middle and outer wire."""
+        threes = [(p[0], p[1], p[2]) for p in self.patterns if len(p) == 3]
+        return tuple(three for three in threes if self._is_n(three))
+
+    def _is_n(self, three: tuple[int, int, int]) -> bool:
+        left, middle, right = self.directions[list(three)]
+        parallel = np.linalg.norm(np.cross(left, right)) < _PARALLEL_SINE
+        oblique = np.linalg.norm(np.cross(left, middle)) > _PARALLEL_SINE
+        return bool(parallel and oblique and self._passing_mm(three) < _FLAT_MM)
+
+    def _passing_mm(self, three: tuple[int, int, int]) -> float:
+        """Farthest that the middle wire passes from an outer one."""
+        first, last = (self._nearest(three[1], outer) for outer in (three[0], three[2]))
+        return float(max(np.linalg.norm(p - q) for p, q in (first, last)))
+
+    def _nearest(self, one: int, other: int) -> tuple[FloatArray, FloatArray]:
+        """Points of two wires that are nearest to each other."""
+        axes = np.column_stack([self.directions[one], -self.directions[other]])
+        along = np.linalg.lstsq(axes, self.points_mm[other] - self.points_mm[one], rcond=None)[0]
+        return (
+            self.points_mm[one] + along[0] * self.directions[one],
+            self.points_mm[other] + along[1] * self.directions[other],
+        )
+
+    def crossings_mm(self) -> FloatArray:
+        """Where the middle wire of each N meets the first and the last wire, shape (n_shapes, 2, 3)."""
+        meets = [[self._nearest(n[1], outer)[0] for outer in (n[0], n[2])] for n in self.n_shapes]
+        return np.reshape(meets, (len(self.n_shapes), 2, 3))
+
+    @cached_property
+    def normals(self) -> FloatArray:
+        """Two unit vectors square to each wire and to each other, shape (k, 2, 3).
+
+        ``normals @ (position - points_mm)`` are the two components of a position's distance from the wire.
+        """
+        steep = np.argsort(np.abs(self.directions), axis=1)[:, :2]
+        # The axes least along the wire come first, so that a wire along an axis has the other two.
+        first = np.eye(3)[np.sort(steep, axis=1)[:, 0]]
+        first = first - np.sum(first * self.directions, axis=1, keepdims=True) * self.directions
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        return np.stack([first, np.cross(self.directions, first)], axis=1)
+
+    def distances_mm(self, positions_mm: FloatArray, wire: IntArray) -> FloatArray:
+        """Distance of positions in C, shape (n, 3), from the wire that each is said to lie on, shape (n,)."""
+        apart = np.asarray(positions_mm) - self.points_mm[wire]
+        return np.asarray(np.linalg.norm(np.cross(apart, self.directions[wire]), axis=-1))
+
+    @classmethod
+    def from_ends(
+        cls,
+        names: tuple[str, ...],
+        ends_mm: FloatArray,
+        patterns: tuple[tuple[int, ...], ...] = (),
+        world_from_phantom: RigidTransform | None = None,
+    ) -> WirePhantom:
+        """Wires stretched between two ends each, shape (k, 2, 3), mm.
+
+        Raises
+        ------
+        InvalidInputError
+            Also if a wire has no length.
+        """
+        _require_vectors(ends_mm, (len(names), 2, 3), "ends_mm")
+        along = ends_mm[:, 1] - ends_mm[:, 0]
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        if not (length > 0).all():
+            name = names[int(np.flatnonzero(length[:, 0] <= 0)[0])]
+            raise InvalidInputError(f"wire {name}: expected two different ends, got the same twice")
+        return cls(names, ends_mm[:, 0], along / length, patterns, ends_mm, world_from_phantom)
+
+
+def three_wires(world_from_phantom: RigidTransform | None = None) -> WirePhantom:
+    """Three wires that meet at right angles, along the axes of the phantom's frame: ``x``, ``y`` and ``z``.
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 3.2.
+    """
+    return WirePhantom(("x", "y", "z"), np.zeros((3, 3)), np.eye(3), world_from_phantom=world_from_phantom)
+
+
+def _require_vectors(values: FloatArray, shape: tuple[int, ...], name: str) -> None:
+    if np.shape(values) != shape:
+        raise MismatchError(f"{name}: expected shape {shape}, got {np.shape(values)}")
+    require_finite(values, name)

@@ -1,0 +1,188 @@
+"""Wire phantoms as PLUS describes them: the XML file of a device set.
+
+The points and rectangles in PLUS's files count pixels of the image after PLUS turned it to its standard
+orientation, columns to the marked side and rows away from the probe; so do the frames of `read_metaimage`,
+whatever the orientation in the image file, and no mapping is needed: column is vector and row is sample.
+
+References
+----------
+.. [1] A. Lasso et al., "PLUS: open-source toolkit for ultrasound-guided intervention systems", IEEE Trans.
+   Biomed. Eng. 61, 2014.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.wires import WirePhantom
+from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.io.headers import numbers
+
+_PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
+"""How many wires a pattern of each type has."""
+
+_SIZE_LIMIT_BYTES = 2**26
+"""A thousand times the size of a device set; beyond it the file is none."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The part of an image in which dots are looked for, in pixels."""
+
+    column: int
+    row: int
+    columns: int
+    rows: int
+
+    def __post_init__(self) -> None:
+        if min(self.column, self.row) < 0 or min(self.columns, self.rows) < 1:
+            raise InvalidInputError(f"clip: expected a rectangle inside an image, got {self}")
+
+
+@dataclass(frozen=True)
+class WireConfig:
+    """What a device set says about a wire phantom and the images of it.
+
+    Attributes
+    ----------
+    phantom : WirePhantom
+        With ``world_from_phantom`` where the file holds it; the world is PLUS's reference frame.
+    pixel_mm : float, optional
+        Roughly, as somebody read it off the machine.
+    clip : Clip, optional
+    """
+
+    phantom: WirePhantom
+    pixel_mm: float | None = None
+    clip: Clip | None = None
+
+
+def read_wire_phantom(path: PathLike) -> WireConfig:
+    """Read a wire phantom from a device set of PLUS.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the element that is missing or wrong. A document with a type declaration is refused, because
+        the entities it may declare can grow without bounds.
+    """
+    root = _read_xml(path)
+    with naming(str(path)):
+        names, ends, patterns = _wires(root)
+        pose = _phantom_pose(root)
+        phantom = WirePhantom.from_ends(names, np.reshape(ends, (-1, 2, 3)), patterns, pose)
+        segmentation = root.find(".//Segmentation")
+        if segmentation is None:
+            return WireConfig(phantom)
+        return WireConfig(phantom, _pixel_mm(segmentation), _clip(segmentation))
+
+
+def _wires(
+    root: Element,
+) -> tuple[tuple[str, ...], list[list[tuple[float, ...]]], tuple[tuple[int, ...], ...]]:
+    geometry = root.find(".//PhantomDefinition/Geometry")
+    if geometry is None:
+        raise InvalidInputError("expected an element PhantomDefinition/Geometry, got none")
+    names: list[str] = []
+    ends: list[list[tuple[float, ...]]] = []
+    patterns = []
+    for number, pattern in enumerate(geometry.findall("Pattern")):
+        wires = _pattern_wires(pattern, f"Pattern[{number}]")
+        patterns.append(tuple(range(len(names), len(names) + len(wires))))
+        for i, wire in enumerate(wires):
+            names.append(wire.get("Name") or f"{number + 1}.{i + 1}")
+            ends.append([_vector(wire, f"EndPoint{end}", 3) for end in ("Front", "Back")])
+    if not names:
+        raise InvalidInputError(
+            "PhantomDefinition/Geometry: expected an element Pattern with wires, got none"
+        )
+    return tuple(names), ends, tuple(patterns)
+
+
+def _pattern_wires(pattern: Element, where: str) -> list[Element]:
+    kind = pattern.get("Type", "")
+    if kind not in _PATTERN_WIRES:
+        raise InvalidInputError(f"{where}: expected Type {' or '.join(_PATTERN_WIRES)}, got {kind!r}")
+    wires, wanted = pattern.findall("Wire"), _PATTERN_WIRES[kind]
+    if not wires or (wanted is not None and len(wires) != wanted):
+        raise InvalidInputError(f"{where}: expected {wanted or 'some'} elements Wire, got {len(wires)}")
+    return wires
+
+
+def _vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
+    label = element.get("Name") or element.get("From") or ""
+    where = f"{element.tag}{f' {label}' if label else ''}: {attribute}"
+    return numbers(element.get(attribute, ""), count, where)
+
+
+def _phantom_pose(root: Element) -> RigidTransform | None:
+    """Find the phantom in PLUS's reference frame, whichever way round the file has it."""
+    algorithm = root.find(".//vtkPlusProbeCalibrationAlgo")
+    held = {} if algorithm is None else algorithm.attrib
+    phantom = held.get("PhantomCoordinateFrame", "Phantom")
+    reference = held.get("ReferenceCoordinateFrame", "Reference")
+    for transform in root.iterfind(".//CoordinateDefinitions/Transform"):
+        ends = (transform.get("From"), transform.get("To"))
+        if set(ends) == {phantom, reference}:
+            matrix = np.reshape(_vector(transform, "Matrix", 16), (1, 4, 4))
+            pose = transforms_from_matrices(matrix, f"Transform {ends[0]} to {ends[1]}: Matrix")[0]
+            return pose if ends[0] == phantom else pose.inv()
+    return None
+
+
+def _pixel_mm(segmentation: Element) -> float | None:
+    if "ApproximateSpacingMmPerPixel" not in segmentation.attrib:
+        return None
+    (spacing,) = _vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
+    if spacing <= 0:
+        raise InvalidInputError(
+            f"Segmentation: ApproximateSpacingMmPerPixel: expected above zero, got {spacing:g}"
+        )
+    return spacing
+
+
+def _clip(segmentation: Element) -> Clip | None:
+    if not {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
+        return None
+    column, row = _vector(segmentation, "ClipRectangleOrigin", 2)
+    columns, rows = _vector(segmentation, "ClipRectangleSize", 2)
+    with naming("Segmentation"):
+        return Clip(int(column), int(row), int(columns), int(rows))
+
+
+def _read_xml(path: PathLike) -> Element:
+    try:
+        with open(path, "rb") as stream:
+            text = stream.read(_SIZE_LIMIT_BYTES + 1)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    if len(text) > _SIZE_LIMIT_BYTES:
+        raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")
+    try:
+        return _parse(text)
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        raise InvalidInputError(f"{path}: expected well-formed XML, got: {one_line(error)}") from error
+
+
+def _parse(text: bytes) -> Element:
+    """Build the tree of a document without a type declaration, so that it has no entities of its own."""
+    builder = TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.StartDoctypeDeclHandler = _refuse_doctype
+    parser.Parse(text, True)
+    return builder.close()
+
+
+def _refuse_doctype(name: str, *_: object) -> None:
+    raise ValueError(f"a document type declaration ({name})")

@@ -1,0 +1,187 @@
+"""Points in images picked by hand, or found and to be corrected by hand, as comma-separated text.
+
+::
+
+    # anything after a hash is a comment
+    frame,column_px,row_px,wire
+    0,605.7,191.9,G1
+    0,436.2,181.1,L1
+
+Frames count from 0, as in the sweep; columns and rows are vectors and samples of its frames, fractional and
+from 0 at the centre of the first. The column ``wire`` may be missing. A wire goes by its name or by its
+number in the phantom, from 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
+from speckle3d.io.headers import numbers
+
+IntArray = npt.NDArray[np.int64]
+
+Row = tuple[int, tuple[float, float], int]
+"""Frame, column and row, wire."""
+
+_COLUMNS = ("frame", "column_px", "row_px")
+_WIRE = "wire"
+
+
+@dataclass(frozen=True)
+class PickedPoints:
+    """Points in the frames of a sweep.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (n,)
+        From 0.
+    pixels : ndarray, shape (n, 2)
+        Column and row, fractional.
+    wire : ndarray of int, shape (n,), optional
+        Number of the wire in the phantom, from 0.
+    """
+
+    frame: IntArray
+    pixels: FloatArray
+    wire: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.frame)
+        if self.pixels.shape != (n, 2) or (self.wire is not None and self.wire.shape != (n,)):
+            raise MismatchError(f"points: expected {n} of each, got pixels of shape {self.pixels.shape}")
+        require_finite(self.pixels, "pixels")
+        if n and (self.frame.min() < 0 or (self.wire is not None and self.wire.min() < 0)):
+            raise InvalidInputError("points: expected frames and wires from 0, got a negative number")
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
+    """Read points, in any order of columns.
+
+    Parameters
+    ----------
+    wire_names : sequence of str, optional
+        The phantom's, needed where the file has a column ``wire``.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the line.
+    """
+    lines = _lines(path)
+    number, heading = next(lines, (1, ""))
+    columns = _columns(heading, f"{path}: line {number}")
+    rows: list[Row] = []
+    wires_seen: dict[tuple[int, int], int] = {}
+    for number, text in lines:
+        where = f"{path}: line {number}"
+        rows.append(_row(text, columns, wire_names, where))
+        if _WIRE in columns:
+            _require_new(rows[-1], wires_seen, number, where)
+    if not rows:
+        raise InvalidInputError(f"{path}: expected points below the heading, got none")
+    frame, pixels, wire = zip(*rows, strict=True)
+    wires = np.array(wire) if _WIRE in columns else None
+    return PickedPoints(np.array(frame), np.array(pixels, dtype=float), wires)
+
+
+def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:
+    """Write points in a form that `read_points` reads; the file appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    InvalidInputError
+        If a name cannot be written, or a wire has none although names are given.
+    """
+    names = [_writable(name) for name in wire_names]
+    heading = _COLUMNS if points.wire is None else (*_COLUMNS, _WIRE)
+    lines = [",".join(heading)]
+    for i, (frame, (column, row)) in enumerate(zip(points.frame, points.pixels, strict=True)):
+        line = f"{frame},{column:.3f},{row:.3f}"
+        lines.append(line if points.wire is None else f"{line},{_label(int(points.wire[i]), names)}")
+    with atomic_path(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _lines(path: PathLike) -> Iterator[tuple[int, str]]:
+    """Numbers and texts of the lines that hold something, from 1."""
+    try:
+        with open(path, encoding="utf-8-sig") as stream:
+            for number, line in enumerate(stream, start=1):
+                text = line.partition("#")[0].strip()
+                if text:
+                    yield number, text
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"{path}: expected text in UTF-8, got other bytes") from error
+
+
+def _columns(heading: str, where: str) -> list[str]:
+    columns = [word.strip().lower() for word in heading.split(",")]
+    known = (*_COLUMNS, _WIRE)
+    if not set(_COLUMNS) <= set(columns) <= set(known) or len(set(columns)) < len(columns):
+        shown = heading if len(heading) <= 60 else f"{heading[:57]}..."
+        raise InvalidInputError(
+            f"{where}: expected the heading {','.join(_COLUMNS)}[,{_WIRE}], got {shown!r}"
+        )
+    return columns
+
+
+def _row(text: str, columns: list[str], wire_names: Sequence[str], where: str) -> Row:
+    words = [word.strip() for word in text.split(",")]
+    if len(words) != len(columns):
+        raise InvalidInputError(f"{where}: expected {len(columns)} values, got {len(words)}")
+    cell = dict(zip(columns, words, strict=True))
+    frame, column, row = (numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS)
+    if frame < 0 or frame != int(frame):
+        raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
+    wire = _wire(cell[_WIRE], wire_names, f"{where}: wire") if _WIRE in cell else 0
+    return int(frame), (column, row), wire
+
+
+def _wire(word: str, names: Sequence[str], where: str) -> int:
+    if word in names:
+        return list(names).index(word)
+    if word.isascii() and word.isdigit() and int(word) < len(names):
+        return int(word)
+    known = f"one of {', '.join(names)} or its number from 0" if names else "no wire, the phantom having none"
+    raise InvalidInputError(f"{where}: expected {known}, got {word!r}")
+
+
+def _require_new(row: Row, seen: dict[tuple[int, int], int], number: int, where: str) -> None:
+    """A wire shows once in a frame."""
+    frame, _, wire = row
+    if (frame, wire) in seen:
+        raise InvalidInputError(
+            f"{where}: expected a wire once in a frame, got wire {wire} of frame {frame} as on line "
+            f"{seen[frame, wire]}"
+        )
+    seen[frame, wire] = number
+
+
+def _writable(name: str) -> str:
+    if not name.strip() or name != name.strip() or any(c in name for c in ",#\r\n"):
+        raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
+    return name
+
+
+def _label(wire: int, names: list[str]) -> str:
+    if not names:
+        return str(wire)
+    if wire >= len(names):
+        raise InvalidInputError(f"wire: expected one of {len(names)} wires, got number {wire}")
+    return names[wire]
