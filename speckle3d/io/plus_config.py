@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.geometry import FloatArray, transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
 from speckle3d.io.hdf5 import PathLike, one_line
 from speckle3d.io.headers import numbers
@@ -44,6 +44,13 @@ class Clip:
     def __post_init__(self) -> None:
         if min(self.column, self.row) < 0 or min(self.columns, self.rows) < 1:
             raise InvalidInputError(f"clip: expected a rectangle inside an image, got {self}")
+
+    @property
+    def corners_px(self) -> FloatArray:
+        """Column and row of the centres of its corner pixels, clockwise from the top left, shape (4, 2)."""
+        left, right = float(self.column), float(self.column + self.columns - 1)
+        top, bottom = float(self.row), float(self.row + self.rows - 1)
+        return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
 
 
 @dataclass(frozen=True)
