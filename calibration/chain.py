@@ -75,7 +75,7 @@ class ImagePoints:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def __getitem__(self, chosen: BoolArray | IntArray) -> ImagePoints:
+    def __getitem__(self, chosen: BoolArray | IntArray | slice) -> ImagePoints:
         wire = None if self.wire is None else self.wire[chosen]
         return ImagePoints(self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire)
 

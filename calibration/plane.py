@@ -48,7 +48,9 @@ OUTLIER_SIGMA = 4.0
 in 16,000, so that nothing is lost where nothing is wrong."""
 
 MAD_TO_SIGMA = 1.4826
-_REWEIGHTINGS = 6
+_REWEIGHTINGS = 8
+_SETTLED = 0.99
+"""Reweighting ends when it lowers the mean absolute residual by less."""
 _FREE_ROUNDS = 5
 """After these, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -172,9 +174,12 @@ def condition_number(points: ImagePoints, phantom: Phantom, chain: Chain, free: 
 
 def _first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
     """Nearly least absolute residuals, by reweighting: wrong frames pull little."""
-    chain = start
+    chain, before = start, np.inf
     for _ in range(_REWEIGHTINGS):
         size = np.abs(_residuals(points, phantom, chain))
+        if size.mean() > _SETTLED * before:
+            break
+        before = size.mean()
         weights = 1.0 / np.sqrt(np.maximum(size, 0.1 * np.median(size) + _SMALLEST_SIGMA))
         chain, _, _ = _refined(points, phantom, chain, free, weights, tolerance=1e-3)
     return chain
@@ -255,13 +260,12 @@ def calibrate_plane(
     lines : ImagePoints
         Two points of the plane's line in each frame (`ImagePoints.of_lines`).
     pixel_mm : ndarray, shape (2,), optional
-        Column pitch and row spacing from the scanner's calipers; needed unless they are fitted, and then a
-        start for one stage only.
+        Column pitch and row spacing from the scanner's calipers; needed unless they are fitted.
     fit_pixels : bool
         Estimate the pixel size too: eleven parameters, else nine.
     stages : str
         ``"three"``: angles from line directions, then distances, then all. ``"one"``: all at once, from
-        mountings all over the sphere.
+        several mountings.
 
     Raises
     ------
@@ -279,21 +283,46 @@ def calibrate_plane(
         )
     held = None if fit_pixels else np.asarray(pixel_mm, dtype=float)
     probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
-    start = _three_stages(lines, held) if stages == "three" else _mountings(lines, pixel_mm, probe)
+    start = _three_stages(lines, held) if stages == "three" else _one_stage(lines, held, probe)
     return facing_up(require_adequate(solve(lines, Plane(), start, probe, outlier_sigma)))
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
     """Angles from some directions; then distances; the third stage, refining all, is the caller's."""
-    few = some(lines)
-    first, second = few[0::2], few[1::2]
-    directions = replace(first, pixels=second.pixels - first.pixels)
-    ratio = 1.0 if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
-    chain = settled_angles(directions, ratio, hemisphere(), fit_ratio=pixel_mm is None)
+    chain = settled_angles(_directions(lines), _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
     normal = chain.target_from_world.rotation.as_matrix()[2]
-    either = (chain.sensor_from_image.rotation, in_plane_mirror(chain.sensor_from_image.rotation))
     seen = float(chain.pixel_mm[0] / chain.pixel_mm[1])
-    found = [distance_start(lines, Angles(rotation, normal, seen), pixel_mm) for rotation in either]
+    return _with_distances(lines, Angles(chain.sensor_from_image.rotation, normal, seen), pixel_mm)
+
+
+def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
+    """The best of all-at-once solutions of some lines, from several mountings that are not refined first."""
+    directions, few = _directions(lines), some(lines)
+    starts = angle_starts(
+        directions.pixels, directions.world_from_sensor.rotation, _ratio(pixel_mm), hemisphere()
+    )
+    settled = [
+        solve(few, Plane(), _with_distances(few, start, pixel_mm), probe, outlier_sigma=np.inf)
+        for start in starts
+    ]
+    return min(settled, key=lambda solution: solution.sigma).chain
+
+
+def _directions(lines: ImagePoints) -> ImagePoints:
+    """From one end to the other of some of the lines."""
+    few = some(lines)
+    first, second = few[::2], few[1::2]
+    return replace(first, pixels=second.pixels - first.pixels)
+
+
+def _ratio(pixel_mm: FloatArray | None) -> float:
+    return 1.0 if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
+
+
+def _with_distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> Chain:
+    """Second stage, for the image and its in-plane mirror: distances tell them apart."""
+    mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
+    found = [distance_start(lines, either, pixel_mm) for either in (angles, mirror)]
     return min(found, key=lambda pair: pair[1])[0]
 
 
@@ -327,26 +356,6 @@ def settled_angles(
         chain = Chain(size, *(RigidTransform.from_rotation(r) for r in (start.sensor_from_image, upright)))
         settled.append(_first_guess(points, phantom, chain, free))
     return min(settled, key=lambda one: robust_sigma(_residuals(points, phantom, one)))
-
-
-def _mountings(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
-    """One stage: the best of all-at-once solutions of some lines, from mountings all over the sphere."""
-    size = np.ones(2) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
-    few = some(lines)
-    starts = [_lying_flat(few, size, turn) for turn in Rotation.create_group("O")]
-    settled = [solve(few, Plane(), start, probe, outlier_sigma=np.inf) for start in starts]
-    return min(settled, key=lambda solution: solution.sigma).chain
-
-
-def _lying_flat(lines: ImagePoints, pixel_mm: FloatArray, turn: Rotation) -> Chain:
-    """An image turned against the sensor by `turn`, and the plane nearest to where its lines then are."""
-    flat = np.column_stack([lines.pixels * pixel_mm, np.zeros(len(lines))])
-    world = (lines.world_from_sensor * RigidTransform.from_rotation(turn)).apply(flat)
-    middle = world.mean(axis=0)
-    normal = np.linalg.svd(world - middle, full_matrices=False)[2][2]
-    target = Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0]
-    height = RigidTransform.from_components([0.0, 0.0, -normal @ middle], target)
-    return Chain(pixel_mm, RigidTransform.from_rotation(turn), height)
 
 
 def facing_up(solution: Solution) -> Solution:

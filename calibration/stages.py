@@ -19,7 +19,7 @@ from calibration.chain import Chain, ImagePoints
 from speckle3d.core.geometry import FloatArray
 
 _NORMALS = 30
-_MOUNTINGS = 400
+_ROTATIONS = 800
 """About 26 and 30 degrees apart: refinement converges from further away."""
 
 _REWEIGHTINGS = 4
@@ -49,25 +49,19 @@ def hemisphere(count: int = _NORMALS) -> FloatArray:
     return np.column_stack([flat * np.cos(around), flat * np.sin(around), z])
 
 
-def mountings() -> Rotation:
-    """Rotations spread over all there are, but for half turns about z, which line directions cannot tell.
+def rotations_all_over() -> Rotation:
+    """Rotations spread evenly over all there are.
 
     References
     ----------
     .. [1] M. Alexa, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)", CVPR, 2022.
     """
-    s = np.arange(2 * _MOUNTINGS) + 0.5
-    t = s / (2 * _MOUNTINGS)
+    s = np.arange(_ROTATIONS) + 0.5
+    t = s / _ROTATIONS
     first, second = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168755204288118041
     inner, outer = np.sqrt(t), np.sqrt(1.0 - t)
-    quaternions = [
-        inner * np.sin(first),
-        inner * np.cos(first),
-        outer * np.sin(second),
-        outer * np.cos(second),
-    ]
-    every = Rotation.from_quat(np.column_stack(quaternions))
-    return every[every.as_matrix()[:, 0, 0] >= 0]
+    parts = (inner * np.sin(first), inner * np.cos(first), outer * np.sin(second), outer * np.cos(second))
+    return Rotation.from_quat(np.column_stack(parts))
 
 
 def angle_starts(
@@ -87,7 +81,9 @@ def angle_starts(
     length = directions_px * [ratio, 1.0]
     flat = length / np.linalg.norm(length, axis=1, keepdims=True)
     up = np.einsum("ki,nij->knj", normals, world_from_sensor.as_matrix())
-    tried = mountings()
+    tried = rotations_all_over()
+    # Half a turn about z leaves the directions of lines as they are.
+    tried = tried[tried.as_matrix()[:, 0, 0] >= 0]
     axes = tried.as_matrix()[:, :, :2]
     # Mean absolute sine of the angle between line and plane: wrong lines pull little.
     sines = np.einsum("kni,jia,na->jkn", up, axes, flat, optimize=True)
@@ -126,7 +122,7 @@ def distance_start(points: ImagePoints, angles: Angles, pixel_mm: FloatArray | N
     one = np.ones((len(points), 1))
     unknown = np.concatenate([up, one] if pixel_mm is not None else [up, one, height[:, None]], axis=1)
     wanted = -shift @ angles.normal - (height if pixel_mm is not None else 0.0)
-    found, misfit = _least_absolute(unknown, wanted)
+    found, misfit = least_absolute(unknown, wanted)
     size = square * (1.0 if pixel_mm is not None else found[4])
     turned = angles.sensor_from_image
     if size[1] < 0:
@@ -140,11 +136,11 @@ def distance_start(points: ImagePoints, angles: Angles, pixel_mm: FloatArray | N
     return chain, float(np.median(np.abs(misfit)))
 
 
-def _least_absolute(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+def least_absolute(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Linear solution whose outliers pull little (reweighted least squares towards least absolute values)."""
     weights = np.ones(len(wanted))
     for _ in range(_REWEIGHTINGS):
         found = np.linalg.lstsq(weights[:, None] * matrix, weights * wanted, rcond=None)[0]
         misfit = matrix @ found - wanted
         weights = 1.0 / np.sqrt(np.maximum(np.abs(misfit), np.median(np.abs(misfit)) + 1e-9))
-    return found, misfit
+    return np.asarray(found), misfit

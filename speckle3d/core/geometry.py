@@ -70,6 +70,14 @@ def skew(vectors: FloatArray) -> FloatArray:
     return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
 
 
+def rotation_from_axes(x: FloatArray, y: FloatArray) -> Rotation:
+    """Nearest rotation to image axes x and y, shape (3,) each, of any length and not quite square."""
+    unit = np.column_stack([x / np.linalg.norm(x), y / np.linalg.norm(y)])
+    left, _, right = np.linalg.svd(unit, full_matrices=False)
+    u, v = (left @ right).T
+    return Rotation.from_matrix(np.column_stack([u, v, np.cross(u, v)]))
+
+
 def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
     """Validate scalar-first unit quaternions, shape (m, 4), read from `where`.
 

@@ -12,10 +12,15 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import FloatArray, require_increasing, transforms_from_matrices
+from speckle3d.core.geometry import (
+    FloatArray,
+    require_increasing,
+    rotation_from_axes,
+    transforms_from_matrices,
+)
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
@@ -248,10 +253,7 @@ def _probe_from_image(header: SequenceHeader, settings: ImportSettings) -> Rigid
     x, y = (matrix[:3, k] / np.linalg.norm(matrix[:3, k]) for k in (0, 1))
     if abs(x @ y) > SKEW_TOLERANCE:
         raise InvalidInputError(f"image_to_probe: expected square axes, got cosine {x @ y:.3f}")
-    left, _, right = np.linalg.svd(np.column_stack([x, y]), full_matrices=False)
-    u, v = (left @ right).T
-    axes = np.column_stack([u, v, np.cross(u, v)])
-    return RigidTransform.from_components(matrix[:3, 3], Rotation.from_matrix(axes))
+    return RigidTransform.from_components(matrix[:3, 3], rotation_from_axes(x, y))
 
 
 def _calibration(header: SequenceHeader, settings: ImportSettings) -> FloatArray:

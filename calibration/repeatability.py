@@ -1,0 +1,110 @@
+"""Precision over repeated calibrations, and the error of a calibration on recordings it was not made from.
+
+References
+----------
+.. [1] R. J. Housden et al., BioMedical Engineering OnLine, 2008, Table 1 (roll, yaw and tilt).
+.. [2] Prager et al., CUED/F-INFENG/TR 303, 1997, equation 12 and Table 3 (the image's centre).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibration.chain import Chain, ImagePoints, Phantom
+from calibration.plane import solve
+from calibration.solution import Solution
+from speckle3d.core.calibration import Calibration
+from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.geometry import FloatArray
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Scatter of repeated calibrations about their mean.
+
+    Attributes
+    ----------
+    trials : int
+    roll_yaw_tilt_sd_rad : ndarray, shape (3,)
+        About the image's z, y and x axes.
+    centre_sd_mm, corner_sd_mm : float, optional
+        Root mean square distance of the image's centre, and of its four corners, from their mean place in the
+        sensor's frame; None for an orientation sensor.
+    centre_shift_mm : ndarray, shape (trials - 1,), optional
+        Distance of the centre from its place in the first trial (TR 303, equation 12).
+    """
+
+    trials: int
+    roll_yaw_tilt_sd_rad: FloatArray
+    centre_sd_mm: float | None
+    corner_sd_mm: float | None
+    centre_shift_mm: FloatArray | None
+
+
+def repeatability(
+    calibrations: Sequence[Calibration], size_px: tuple[int, int] | None = None
+) -> Repeatability:
+    """Compare repeated calibrations of one mounting.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration, at least two
+    size_px : (columns, rows), optional
+        Of the image; needed for its centre and corners.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are fewer than two.
+    MismatchError
+        If they are not of one kind of sensor.
+    """
+    if len(calibrations) < 2:
+        raise InsufficientDataError(f"expected at least two calibrations to compare, got {len(calibrations)}")
+    sensors = sorted({one.sensor for one in calibrations})
+    if len(sensors) > 1:
+        raise MismatchError(f"expected calibrations of one sensor, got {' and '.join(sensors)}")
+    angles = rotation_errors([one.rotation for one in calibrations])
+    sd = np.sqrt(np.sum(angles**2, axis=0) / (len(calibrations) - 1))
+    if size_px is None or any(one.translation_mm is None for one in calibrations):
+        return Repeatability(len(calibrations), sd, None, None, None)
+    places = np.stack([_centre_and_corners(one, size_px) for one in calibrations])
+    apart = np.linalg.norm(places - places.mean(axis=0), axis=2)
+    scatter = np.sqrt(np.sum(apart**2, axis=0) / (len(calibrations) - 1))
+    shift = np.linalg.norm(places[1:, 0] - places[0, 0], axis=1)
+    corners = float(np.sqrt(np.mean(scatter[1:] ** 2)))
+    return Repeatability(len(calibrations), sd, float(scatter[0]), corners, shift)
+
+
+def rotation_errors(rotations: Sequence[Rotation]) -> FloatArray:
+    """Deviations from the mean rotation as roll, yaw and tilt, rad, shape (n, 3)."""
+    every = Rotation.concatenate(rotations)
+    return np.asarray((every.mean().inv() * every).as_rotvec()[:, ::-1])
+
+
+def _centre_and_corners(calibration: Calibration, size_px: tuple[int, int]) -> FloatArray:
+    columns, rows = size_px
+    shares = np.array([[0.5, 0.5], [0, 0], [1, 0], [1, 1], [0, 1]])
+    pixels = shares * [columns - 1, rows - 1]
+    flat = np.column_stack([pixels, np.zeros(5), np.ones(5)])
+    return np.asarray((flat @ calibration.pixel_matrix().T)[:, :3])
+
+
+def validate(chain: Chain, phantom: Phantom, points: ImagePoints) -> Solution:
+    """Hold a calibration and see how well it explains another recording; only the phantom's place is fitted.
+
+    Returns
+    -------
+    Solution
+        Its `rms` is the error on the validation set, no frame left out.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the recording is too short to find the phantom in.
+    """
+    return solve(points, phantom, chain, probe=(), outlier_sigma=np.inf)

@@ -1,0 +1,192 @@
+"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes; solved by the plane module.
+
+References
+----------
+.. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, sections 3.1 and 3.2.
+.. [2] P. R. Detmer et al., "3D ultrasonic image feature localization based on magnetic scanhead tracking",
+   Ultrasound in Medicine and Biology, 1994 (the crossing).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.adequacy import require_adequate
+from calibration.chain import PROBE, SCALES, TARGET, Chain, ImagePoints, Phantom, Seen
+from calibration.plane import OUTLIER_SIGMA, solve, some
+from calibration.solution import Solution
+from calibration.stages import least_absolute, rotations_all_over
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray, rotation_from_axes
+from speckle3d.core.wires import WirePhantom
+
+_FEWEST_FRAMES = 6
+_STARTS = 6
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
+
+    determined: tuple[str, ...] = TARGET[:3]
+    seen_as: Seen = "dot"
+
+    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
+        """Displacement from the crossing."""
+        n = len(points)
+        return np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
+
+
+@dataclass(frozen=True)
+class Wires:
+    """Straight wires of known geometry: two equations for each dot (TR 303, equation 7).
+
+    Parameters
+    ----------
+    geometry : WirePhantom
+    registered : bool
+        The phantom's place in the tracker's world is known and held; else it is estimated.
+    """
+
+    geometry: WirePhantom
+    registered: bool
+    seen_as: Seen = field(default="dot")
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """All of `TARGET`, unless the phantom is registered."""
+        return () if self.registered else TARGET
+
+    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
+        """Displacement from the wire, along two directions across it."""
+        if points.wire is None:
+            raise InvalidInputError("expected points with the wire each lies on, got points without")
+        rows = self.geometry.normals[points.wire]
+        return rows, np.einsum("nri,ni->nr", rows, self.geometry.points_mm[points.wire])
+
+
+def calibrate_crossing(
+    points: ImagePoints,
+    pixel_mm: FloatArray | None = None,
+    fit_pixels: bool = True,
+    outlier_sigma: float = OUTLIER_SIGMA,
+) -> Solution:
+    """Calibrate a 6-DOF sensor from images of two crossing wires, or of a bead.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        The crossing in each frame.
+    pixel_mm : ndarray, shape (2,), optional
+        Column pitch and row spacing; needed unless they are fitted.
+    fit_pixels : bool
+        Eleven parameters, else nine.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are too few points, they contradict each other, or the motion does not determine the answer.
+    """
+    start = _linear_start(points, Crossing(), Rotation.identity(), fitted=True)[0]
+    return _finished(points, Crossing(), start, pixel_mm, fit_pixels, outlier_sigma)
+
+
+def calibrate_wires(
+    points: ImagePoints,
+    geometry: WirePhantom,
+    pixel_mm: FloatArray | None = None,
+    fit_pixels: bool = True,
+    fit_registration: bool = False,
+    outlier_sigma: float = OUTLIER_SIGMA,
+) -> Solution:
+    """Calibrate a 6-DOF sensor from dots on straight wires.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        With the wire each lies on.
+    geometry : WirePhantom
+        If it says where it is in the tracker's world that is held, unless `fit_registration`; the three-wire
+        phantom's place is always estimated (fourteen parameters).
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are too few points, they contradict each other, or the motion does not determine the answer.
+    """
+    place = geometry.world_from_phantom
+    phantom = Wires(geometry, registered=place is not None and not fit_registration)
+    if place is not None:
+        start = _linear_start(points, phantom, place.inv(), fitted=False)[0]
+    else:
+        few = some(points)
+        tried = [_linear_start(few, phantom, turn, fitted=True) for turn in rotations_all_over()]
+        best = sorted(tried, key=lambda one: one[1])[:_STARTS]
+        probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
+        settled = [
+            solve(few, phantom, _sized(chain, pixel_mm, fit_pixels), probe, np.inf) for chain, _ in best
+        ]
+        start = min(settled, key=lambda solution: solution.sigma).chain
+    return _finished(points, phantom, start, pixel_mm, fit_pixels, outlier_sigma)
+
+
+def _finished(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    pixel_mm: FloatArray | None,
+    fit_pixels: bool,
+    outlier_sigma: float,
+) -> Solution:
+    frames = len(np.unique(points.frame))
+    if frames < _FEWEST_FRAMES:
+        raise InsufficientDataError(f"expected the wires in at least {_FEWEST_FRAMES} frames, got {frames}")
+    probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
+    return require_adequate(solve(points, phantom, _sized(start, pixel_mm, fit_pixels), probe, outlier_sigma))
+
+
+def _sized(start: Chain, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
+    if fit_pixels:
+        return start
+    if pixel_mm is None:
+        raise InvalidInputError(
+            "expected pixel_mm, the scanner's pixel size, where it is not fitted, got none"
+        )
+    return Chain(np.asarray(pixel_mm, dtype=float), start.sensor_from_image, start.target_from_world)
+
+
+def _linear_start(
+    points: ImagePoints, phantom: Phantom, place: Rotation | RigidTransform, fitted: bool
+) -> tuple[Chain, float]:
+    """Chain whose image axes need not be square, by linear least absolute values, then squared.
+
+    Parameters
+    ----------
+    place : Rotation or RigidTransform
+        ``target_from_world``; of a rotation the translation is found too.
+
+    Returns
+    -------
+    chain : Chain
+    cost : float
+        Median absolute residual before squaring, mm.
+    """
+    known = place if isinstance(place, RigidTransform) else RigidTransform.from_rotation(place)
+    rows, offsets = phantom.vanishing(points)
+    in_world = rows @ known.rotation.as_matrix()
+    in_sensor = in_world @ points.turns
+    pixels = np.column_stack([points.pixels, np.ones(len(points))])
+    matrix = np.einsum("nri,na->nrai", in_sensor, pixels).reshape(-1, 9)
+    if fitted:
+        matrix = np.concatenate([matrix, rows.reshape(-1, 3)], axis=1)
+    at_sensor = known.apply(points.shifts_mm)
+    wanted = (offsets - np.einsum("nri,ni->nr", rows, at_sensor)).ravel()
+    found, misfit = least_absolute(matrix, wanted)
+    columns, rows_axis, origin = found[:9].reshape(3, 3)
+    size = np.array([np.linalg.norm(columns), np.linalg.norm(rows_axis)])
+    probe = RigidTransform.from_components(origin, rotation_from_axes(columns, rows_axis))
+    shift = RigidTransform.from_translation(found[9:12]) if fitted else RigidTransform.identity()
+    return Chain(size, probe, shift * known), float(np.median(np.abs(misfit)))
