@@ -1,0 +1,343 @@
+"""N-wire phantoms: what three dots in a line say about where the image is, and a start for the calibration.
+
+The outer wires of an N are parallel, so that the middle dot divides the distance between the outer two as the
+place where the image cuts the middle wire divides the distance between its crossings with the outer wires:
+one image gives a point in the phantom for each N, whatever the scale of its pixels.
+
+References
+----------
+.. [1] R. M. Comeau, A. Fenster and T. M. Peters, "Integrated MR and ultrasound imaging for improved image
+   guidance in neurosurgery", Proc. SPIE 3338, 1998.
+.. [2] G. Carbajal, A. Lasso, A. Gomez and G. Fichtinger, "Improving N-wire phantom-based freehand ultrasound
+   calibration", Int. J. Comput. Assist. Radiol. Surg. 8, 2013 (distances of all dots to their wires).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.chain import Chain, ImagePoints, IntArray
+from calibration.dots import Dots
+from calibration.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
+from calibration.wirefit import rigid_fits
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.wires import WirePhantom
+
+_PLUS_SHARE = 0.95
+_REWEIGHTINGS = 10
+_FEWEST_POINTS = 9
+"""Two or three equations each, for nine unknowns, and as many again to tell a wrong one."""
+_LEAST_SINGULAR = 1e-4
+"""Least ratio of singular values at which the linear problem has one answer: noise of a hundredth of a
+millimetre would move others by the image's own size."""
+_FAR = 4.0
+"""Distance, in medians, at which a point pulls with half its weight."""
+
+By = Literal["middle", "all"]
+_LEAST_TURN = 0.02
+"""Least ratio of singular values at which a phantom's pose counts as determined by the turns of the sensor:
+noise of a degree over turns of a radian."""
+
+
+@dataclass(frozen=True)
+class MiddleWires:
+    """Where images cut the middle wires of N.
+
+    Attributes
+    ----------
+    points : ImagePoints, length n
+        The middle dots.
+    phantom_mm : ndarray, shape (n, 3)
+        In the phantom's frame, from the distances of the outer dots.
+    """
+
+    points: ImagePoints
+    phantom_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class NWireErrors:
+    """Distances of middle dots from where the outer dots say they are.
+
+    Attributes
+    ----------
+    frame, wire : ndarray of int, shape (n,)
+        The frame, and the number of the middle wire.
+    error_mm : ndarray, shape (n,)
+    """
+
+    frame: IntArray
+    wire: IntArray
+    error_mm: FloatArray
+
+    def trimmed(self, share: float = _PLUS_SHARE) -> tuple[float, float]:
+        """Mean and standard deviation of the least errors, mm.
+
+        PLUS reports those of the least 95 per cent; with a share of one they are those of all.
+
+        Raises
+        ------
+        InsufficientDataError
+            If there are none.
+        """
+        kept = np.sort(self.error_mm)[: round(share * len(self.error_mm))]
+        if kept.size == 0:
+            raise InsufficientDataError("expected an N with all three dots, got none")
+        return float(kept.mean()), float(kept.std())
+
+
+def middle_wires(points: ImagePoints, phantom: WirePhantom) -> MiddleWires:
+    """Find where images cut the middle wires, from all N whose three dots are there.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        With the wire of each.
+
+    Raises
+    ------
+    InvalidInputError
+        If the points have no wires.
+    """
+    wire = _wires(points, phantom)
+    middles, places = [], []
+    for shape, crossings in zip(phantom.n_shapes, phantom.crossings_mm(), strict=True):
+        first, middle, last = _together(points.frame, wire, shape)
+        to_middle, between = (points.pixels[k] - points.pixels[first] for k in (middle, last))
+        share = np.linalg.norm(to_middle, axis=1) / np.linalg.norm(between, axis=1)
+        middles.append(middle)
+        places.append(crossings[0] + share[:, None] * (crossings[1] - crossings[0]))
+    index = np.concatenate([np.zeros(0, dtype=np.int64), *middles])
+    order = np.argsort(points.frame[index], kind="stable")
+    return MiddleWires(points[index[order]], np.concatenate([np.zeros((0, 3)), *places])[order])
+
+
+def nwire_errors_mm(
+    points: ImagePoints,
+    phantom: WirePhantom,
+    sensor_from_pixels: FloatArray,
+    world_from_phantom: RigidTransform | None = None,
+) -> NWireErrors:
+    """How far middle dots are from where the outer dots say they are: PLUS's 3-D reprojection error.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        With the wire of each; all N whose three dots are there count.
+    sensor_from_pixels : ndarray, shape (4, 4)
+        Affine: PLUS's ``ImageToProbe``, `Calibration.pixel_matrix`, or `pixel_matrix` of a chain.
+    world_from_phantom : RigidTransform, optional
+        By default the phantom's own.
+
+    Raises
+    ------
+    InvalidInputError
+        If neither says where the phantom is, or the points have no wires.
+    """
+    pose = _registered(phantom, world_from_phantom)
+    middle = middle_wires(points, phantom)
+    seen = middle.points.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
+    expected = (middle.points.world_from_sensor.inv() * pose).apply(middle.phantom_mm)
+    wire = _wires(middle.points, phantom)
+    return NWireErrors(middle.points.frame, wire, np.linalg.norm(seen - expected, axis=1))
+
+
+def pixel_matrix(chain: Chain) -> FloatArray:
+    """Affine matrix from pixels (column, row, 0, 1) to the sensor's frame in mm, shape (4, 4)."""
+    scale = np.diag([*chain.pixel_mm, float(chain.pixel_mm.mean()), 1.0])
+    return np.asarray(chain.sensor_from_image.as_matrix() @ scale)
+
+
+def start_from_nwires(
+    points: ImagePoints, phantom: WirePhantom, pixel_mm: npt.ArrayLike | None = None, by: By = "middle"
+) -> Chain:
+    """Calibrate in closed form, by robust linear least squares for the image's origin and axes.
+
+    The axes come out free of the constraint that they be square; the solution is the nearest that are.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        With the wire of each.
+    pixel_mm : array_like, shape (2,), optional
+        Rough distance between columns and between rows, mm; needed only where the phantom's own pose is not
+        known. That is then found first, from the images' places among the wires.
+    by : {"middle", "all"}
+        What is least: the errors of `nwire_errors_mm`, [1]_, or the distances of all dots from their wires,
+        [2]_, for which frames need not show all wires of an N.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the points are too few, or do not determine the answer.
+    InvalidInputError
+        If the points have no wires, or the pixel size is needed.
+
+    References
+    ----------
+    .. [1] R. M. Comeau et al., 1998, see this module.
+    .. [2] G. Carbajal et al., 2013, see this module.
+    """
+    _wires(points, phantom)
+    pose = phantom.world_from_phantom
+    if pose is None:
+        pose = _phantom_pose(points, phantom, pixel_mm)
+    equations = _middle_equations if by == "middle" else _wire_equations
+    return _chain(_robust(*equations(points, phantom, pose)), pose.inv())
+
+
+def label_and_start(
+    dots: Dots,
+    phantom: WirePhantom,
+    world_from_sensor: RigidTransform,
+    pixel_mm: npt.ArrayLike,
+    settings: LabelSettings | None = None,
+) -> tuple[LabelledDots, Chain]:
+    """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
+
+    Parameters
+    ----------
+    world_from_sensor : RigidTransform
+        One for each frame of the sequence.
+    pixel_mm : array_like, shape (2,)
+        Rough distance between columns and between rows, mm.
+
+    Raises
+    ------
+    InsufficientDataError, InvalidInputError
+        See `label_dots` and `start_from_nwires`.
+    """
+    alone = label_dots(dots, phantom, pixel_mm, settings)
+    if len(alone) == 0:
+        reasons = sorted(set(alone.dropped.values())) or ["no frames"]
+        raise InsufficientDataError(f"expected frames that show all wires, got none: {reasons[0]}")
+    start = start_from_nwires(alone.points(world_from_sensor), phantom, pixel_mm)
+    found = label_by_calibration(dots, phantom, start, world_from_sensor, settings)
+    registered = replace(phantom, world_from_phantom=start.target_from_world.inv())
+    return found, start_from_nwires(found.points(world_from_sensor), registered)
+
+
+def _wires(points: ImagePoints, phantom: WirePhantom) -> IntArray:
+    if points.wire is None:
+        raise InvalidInputError("points: expected the wire of each, got none")
+    if len(points) and not (int(points.wire.min()) >= 0 and int(points.wire.max()) < len(phantom)):
+        raise InvalidInputError(f"points: expected wires from 0 to {len(phantom) - 1}, got others")
+    return points.wire
+
+
+def _registered(phantom: WirePhantom, world_from_phantom: RigidTransform | None) -> RigidTransform:
+    pose = phantom.world_from_phantom if world_from_phantom is None else world_from_phantom
+    if pose is None:
+        raise InvalidInputError("expected where the phantom is in the world, got none")
+    return pose
+
+
+def _together(frame: IntArray, wire: IntArray, shape: tuple[int, ...]) -> list[IntArray]:
+    """Of the frames that show all wires of a shape, the numbers of the points, one array for each wire."""
+    numbers = [np.flatnonzero(wire == k) for k in shape]
+    first = [dict(zip(frame[n].tolist(), n.tolist(), strict=True)) for n in numbers]
+    common = sorted(set.intersection(*(set(found) for found in first)))
+    return [np.array([found[f] for f in common], dtype=np.int64) for found in first]
+
+
+def _middle_equations(
+    points: ImagePoints, phantom: WirePhantom, pose: RigidTransform
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where middle dots are, in the sensor's frame: rows, shape (n, 3, 3), positions, and pixels."""
+    middle = middle_wires(points, phantom)
+    expected = (middle.points.world_from_sensor.inv() * pose).apply(middle.phantom_mm)
+    return np.tile(np.eye(3), (len(expected), 1, 1)), expected, middle.points.pixels
+
+
+def _wire_equations(
+    points: ImagePoints, phantom: WirePhantom, pose: RigidTransform
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Two directions square to each dot's wire, in the sensor's frame: rows, (n, 2, 3), places, and pixels."""
+    wire = _wires(points, phantom)
+    phantom_from_sensor = pose.inv() * points.world_from_sensor
+    rows = phantom.normals[wire]
+    offsets = np.einsum("nri,ni->nr", rows, phantom.points_mm[wire] - phantom_from_sensor.translation)
+    return rows @ phantom_from_sensor.rotation.as_matrix(), offsets, points.pixels
+
+
+def _robust(rows: FloatArray, wanted: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Origin of the image and its axes per pixel, as rows, shape (3, 3).
+
+    Points far off pull little (reweighted least squares with Cauchy's weights).
+    """
+    if len(pixels) < _FEWEST_POINTS:
+        raise InsufficientDataError(
+            f"expected at least {_FEWEST_POINTS} dots to start from, got {len(pixels)}"
+        )
+    centre, spread = pixels.mean(axis=0), float(pixels.std()) or 1.0
+    lifted = np.column_stack([np.ones(len(pixels)), (pixels - centre) / spread])
+    matrix = np.einsum("nk,nri->nrki", lifted, rows).reshape(*wanted.shape, 9)
+    weights = np.ones((len(pixels), 1))
+    for _ in range(_REWEIGHTINGS):
+        weighted = (weights[..., None] * matrix).reshape(-1, 9)
+        found, _, rank, _ = np.linalg.lstsq(weighted, (weights * wanted).ravel(), rcond=_LEAST_SINGULAR)
+        if rank < matrix.shape[2]:
+            raise InsufficientDataError(
+                "the dots do not determine where the image is: too few wires or poses"
+            )
+        misfit = np.linalg.norm(matrix @ found - wanted, axis=1, keepdims=True)
+        weights = 1.0 / np.sqrt(1.0 + (misfit / (_FAR * np.median(misfit) + 1e-9)) ** 2)
+    axes = found.reshape(3, 3)[1:] / spread
+    return np.vstack([found[:3] - centre @ axes, axes])
+
+
+def _chain(affine: FloatArray, target_from_world: RigidTransform) -> Chain:
+    lengths = np.linalg.norm(affine[1:], axis=1)
+    left, _, right = np.linalg.svd((affine[1:] / lengths[:, None]).T, full_matrices=False)
+    x, y = (left @ right).T
+    turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)]))
+    return Chain(lengths, RigidTransform.from_components(affine[0], turn), target_from_world)
+
+
+def _phantom_pose(
+    points: ImagePoints, phantom: WirePhantom, pixel_mm: npt.ArrayLike | None
+) -> RigidTransform:
+    """Find ``world_from_phantom`` from frames that show all wires of all N.
+
+    In every frame ``world_from_phantom * phantom_from_image = world_from_sensor * sensor_from_image``; the
+    rotations are found first, linearly, then the translations.
+
+    References
+    ----------
+    .. [1] M. Shah, "Solving the robot-world/hand-eye calibration problem using the Kronecker product", J.
+       Mech. Robot. 5, 2013.
+    """
+    if pixel_mm is None:
+        raise InvalidInputError("pixel_mm: expected a rough pixel size where the phantom's pose is not known")
+    wires = tuple(k for shape in phantom.n_shapes for k in shape)
+    index = np.stack(_together(points.frame, _wires(points, phantom), wires), axis=1)
+    if len(index) < 3:
+        raise InsufficientDataError(f"expected all wires in at least 3 frames, got {len(index)}")
+    seen = points.pixels[index] * np.asarray(pixel_mm, dtype=float)
+    fits = rigid_fits(seen, np.tile(np.array(wires), (len(index), 1)), phantom, scale_tolerance=0.05)
+    return _shared_pose(fits.phantom_from_image, points.world_from_sensor[index[:, 0]])
+
+
+def _shared_pose(phantom_from_image: RigidTransform, world_from_sensor: RigidTransform) -> RigidTransform:
+    seen, held = (t.rotation.as_matrix() for t in (phantom_from_image, world_from_sensor))
+    kron = np.einsum("nij,nkl->ikjl", held, seen).reshape(9, 9)
+    left, singular, _ = np.linalg.svd(kron)
+    if 1.0 - singular[1] / singular[0] < _LEAST_TURN**2:
+        raise InsufficientDataError("the sensor turned too little to find where the phantom is")
+    turn = _nearest_rotation(left[:, 0].reshape(3, 3))
+    matrix = np.concatenate([np.tile(np.eye(3), (len(seen), 1, 1)), -held], axis=2).reshape(-1, 6)
+    wanted = world_from_sensor.translation - phantom_from_image.translation @ turn.T
+    found = np.linalg.lstsq(matrix, wanted.ravel(), rcond=None)[0]
+    return RigidTransform.from_components(found[:3], Rotation.from_matrix(turn))
+
+
+def _nearest_rotation(matrix: FloatArray) -> FloatArray:
+    left, _, right = np.linalg.svd(matrix)
+    turned = left @ right
+    return np.asarray(turned * np.sign(np.linalg.det(turned)))
