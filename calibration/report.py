@@ -1,0 +1,212 @@
+"""A calibration's report: a table for people, the same for programs, and one page of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from calibration.beam import BeamBias
+from calibration.solution import Solution
+from speckle3d.core.calibration import Calibration, Parameter
+from speckle3d.core.geometry import FloatArray, roll_yaw_tilt
+
+USED, DROPPED = "#0072B2", "#D55E00"
+"""Of Okabe and Ito's palette, told apart with any colour vision."""
+
+_LONGEST_REASONS = 6
+
+
+@dataclass(frozen=True)
+class Shot:
+    """An image to show, with what was found in it.
+
+    Attributes
+    ----------
+    image : ndarray, shape (columns, rows)
+    marks_px : ndarray, shape (k, 2)
+        Column and row of points on a line, or of dots; none if nothing was found.
+    note : str
+        Why the frame was dropped; empty if it was used.
+    """
+
+    frame: int
+    image: npt.NDArray[Any]
+    marks_px: FloatArray
+    as_line: bool
+    note: str = ""
+
+
+def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """What was found as description, value and unit, angles in degrees."""
+    rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
+    rows += [_row(parameter) for parameter in calibration.parameters]
+    names = ("roll", "yaw", "tilt")
+    angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
+    errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
+    rows += [
+        (f"sensor_from_image, {name}", f"{angle:.3f} +- {error:.3f}", "deg")
+        for name, angle, error in zip(names, angles, errors, strict=True)
+    ]
+    rms = np.rad2deg(calibration.rms) if calibration.rms_unit == "rad" else calibration.rms
+    used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
+    rows += [
+        ("RMS residual", f"{rms:.3f}", "deg" if calibration.rms_unit == "rad" else calibration.rms_unit),
+        ("condition number", f"{calibration.condition_number:.1f}", ""),
+        ("frames used", used, ""),
+    ]
+    rows += [(f"dropped: {reason}", str(count), "frames") for reason, count in _reasons(calibration)]
+    if calibration.time_offset_s is not None:
+        rows.append(("sensor clock offset", f"{calibration.time_offset_s:+.4f}", "s"))
+    return [*rows, ("verdict", calibration.verdict, "")]
+
+
+def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
+    """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
+    rows = rows_of(calibration)
+    width = max(len(description) for description, _, _ in rows)
+    lines = [f"{description.ljust(width)}  {value} {unit}".rstrip() for description, value, unit in rows]
+    if calibration.translation_mm is not None and calibration.pixel_mm is not None:
+        lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
+        lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
+    if beam:
+        lines += ["", "On a bare wall the thickness of the beam puts the image too near to the probe, by"]
+        lines += [
+            f"  {abs(one.simulated_mm[1]):.2f} mm if the beam is {one.width_mm:g} mm thick "
+            f"(closed form {abs(one.closed_form_mm):.2f} mm; it leaves an RMS of {one.rms_mm:.3f} mm)"
+            for one in beam
+        ]
+        lines.append("A thin bar that stays in the middle of the beam does not have this bias.")
+    return "\n".join([*lines, *(["", *notes] if notes else [])]) + "\n"
+
+
+def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
+    """Numbers of the report, angles in radians."""
+    translation = calibration.translation_mm
+    return {
+        "method": calibration.method,
+        "sensor": calibration.sensor,
+        "parameters": [vars(parameter) for parameter in calibration.parameters],
+        "sensor_from_image_wxyz": calibration.rotation.as_quat(scalar_first=True).tolist(),
+        "translation_mm": None if translation is None else translation.tolist(),
+        "pixel_mm": None if calibration.pixel_mm is None else calibration.pixel_mm.tolist(),
+        "standard_errors": np.sqrt(np.diag(calibration.covariance)).tolist(),
+        "rms": calibration.rms,
+        "rms_unit": calibration.rms_unit,
+        "condition_number": calibration.condition_number,
+        "frames_given": calibration.frames.given,
+        "frames_used": list(calibration.frames.used),
+        "frames_dropped": {str(frame): why for frame, why in calibration.frames.dropped.items()},
+        "time_offset_s": calibration.time_offset_s,
+        "verdict": calibration.verdict,
+        "beam": [
+            {"width_mm": one.width_mm, "shift_mm": one.simulated_mm.tolist(), "rms_mm": one.rms_mm}
+            for one in beam
+        ],
+    }
+
+
+def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
+    """One page: images with what was found in them, residuals, and the motion."""
+    figure = Figure(figsize=(12.0, 7.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, 3)
+    size = calibration.pixel_mm
+    for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
+        _draw_shot(axes, shot, 1.0 if size is None else float(size[1] / size[0]))
+    _draw_residuals(panels[1, 0], solution)
+    _draw_against_tilt(panels[1, 1], solution)
+    _draw_motion(panels[1, 2], solution)
+    figure.suptitle(calibration.verdict, fontsize=10)
+    return figure
+
+
+def _row(parameter: Parameter) -> tuple[str, str, str]:
+    angular = parameter.unit == "rad"
+    value, error = (
+        np.rad2deg(number) if angular else number for number in (parameter.value, parameter.standard_error)
+    )
+    digits = 5 if parameter.unit == "mm/pixel" else 3
+    return parameter.name, f"{value:.{digits}f} +- {error:.{digits}f}", "deg" if angular else parameter.unit
+
+
+def _reasons(calibration: Calibration) -> list[tuple[str, int]]:
+    """Reasons without the numbers that differ from frame to frame."""
+    counted: dict[str, int] = {}
+    for reason in calibration.frames.dropped.values():
+        plain = reason.split(" by ")[0].split(":")[0]
+        counted[plain] = counted.get(plain, 0) + 1
+    return sorted(counted.items(), key=lambda item: -item[1])[:_LONGEST_REASONS]
+
+
+def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    if shot is None:
+        axes.set_axis_off()
+        return
+    axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
+    colour = DROPPED if shot.note else USED
+    if len(shot.marks_px):
+        columns, rows = shot.marks_px.T
+        if shot.as_line:
+            slope = (rows[-1] - rows[0]) / (columns[-1] - columns[0])
+            across = np.array([0.0, shot.image.shape[0] - 1.0])
+            axes.plot(across, rows[0] + slope * (across - columns[0]), color=colour, lw=1.0)
+        else:
+            axes.plot(columns, rows, "o", mfc="none", color=colour, ms=8)
+        axes.set_xlim(0, shot.image.shape[0] - 1)
+        axes.set_ylim(shot.image.shape[1] - 1, 0)
+    axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
+
+
+def _draw_residuals(axes: Axes, solution: Solution) -> None:
+    values, unit = _shown(solution)
+    used = solution.used
+    axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
+    axes.plot(solution.points.frame[~used], values[~used], "x", color=DROPPED, ms=4)
+    if used.any():
+        reach = 8.0 * float(np.abs(values[used]).std() + 1e-12)
+        axes.set_ylim(-reach, reach)
+    _label(axes, "frame", f"residual / {unit}")
+
+
+def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
+    """A thick beam shows as a V."""
+    values, unit = _shown(solution)
+    turns = _turns_deg(solution)
+    used = solution.used
+    axes.plot(turns[used, 0], values[used], ".", color=USED, ms=3)
+    _label(axes, "tilt / deg", f"residual / {unit}")
+
+
+def _draw_motion(axes: Axes, solution: Solution) -> None:
+    turns = _turns_deg(solution)[solution.used]
+    drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
+    axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
+    _label(axes, "tilt / deg", "roll / deg")
+
+
+def _shown(solution: Solution) -> tuple[FloatArray, str]:
+    """The worst residual of each point, with its sign."""
+    worst = np.abs(solution.residuals).argmax(axis=1)
+    values = solution.residuals[np.arange(len(worst)), worst]
+    return (np.rad2deg(values), "deg") if solution.phantom.seen_as == "direction" else (values, "mm")
+
+
+def _turns_deg(solution: Solution) -> FloatArray:
+    """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
+    turns = solution.chain.target_from_image(solution.points).rotation
+    return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(alpha=0.3)
