@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 _GLANCES = 48
 """Frames looked at for what stands still in all of them."""
+DENSELY = 4
+"""How many times the columns asked for are looked at to learn which of them show anything."""
 _LIVELY = 0.25
 """Change that counts, as a part of the strongest change in nearly all columns."""
 
@@ -44,6 +47,12 @@ class Columns:
         place, first = np.nonzero(ends == 1)
         spans = np.stack([place, first, np.nonzero(ends == -1)[1] - 1], axis=1)
         object.__setattr__(self, "spans", spans.astype(np.int64))
+
+    def thinned(self, count: int) -> Columns:
+        """So many of the columns with rows in the region, evenly spread."""
+        place = np.flatnonzero(self.inside.any(axis=1))
+        place = place[_spread(place.size, count)] if place.size else place
+        return Columns(self.column[place], self.inside[place])
 
     @property
     def held(self) -> int:
@@ -78,8 +87,7 @@ def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | N
     if region is not None:
         first = max(first, int(np.ceil(region[:, 0].min())))
         last = min(last, int(np.floor(region[:, 0].max())))
-    left = np.rint(np.linspace(0, max(last - first, 0), count)[: (count + 1) // 2]).astype(np.int64)
-    column = np.unique(np.concatenate([first + left, last - left]))
+    column = first + _spread(max(last - first + 1, 1), count)
     inside = np.ones((column.size, rows), dtype=bool)
     if region is not None:
         inside = np.array([_rows_inside(region, c, rows) for c in column])
@@ -90,15 +98,10 @@ def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | N
     return Columns(column, inside)
 
 
-def without_blank_sides(columns: Columns, image: npt.NDArray[np.float32]) -> Columns:
-    """Leave out columns of one level at the image's sides: the fan does not reach them.
-
-    Parameters
-    ----------
-    image : ndarray, shape (n, r)
-        The sampled columns of one image.
-    """
-    blank = np.ptp(image, axis=1) == 0
+def without_blank_sides(columns: Columns, image: npt.NDArray[Any]) -> Columns:
+    """Leave out columns of one level at the sides of an image (column, row): the fan does not reach them."""
+    sampled = np.asarray(image[columns.column], np.float32)
+    blank = np.ptp(sampled, axis=1) == 0
     sides = np.logical_and.accumulate(blank) | np.logical_and.accumulate(blank[::-1])[::-1]
     return columns.narrowed(~sides[:, None])
 
@@ -124,6 +127,12 @@ def without_standing(columns: Columns, frames: Frames, smoothing_rows: float) ->
     standing = (level > limit) & ~np.logical_or.accumulate(lively, axis=1)
     under = ~np.logical_or.accumulate(standing[:, ::-1], axis=1)[:, ::-1]
     return columns.narrowed(under & lively.any(axis=1)[:, None])
+
+
+def _spread(size: int, count: int) -> IntArray:
+    """About `count` of the numbers below `size`, at regular intervals and symmetric about their middle."""
+    left = np.rint(np.linspace(0, size - 1, count)[: (count + 1) // 2]).astype(np.int64)
+    return np.unique(np.concatenate([left, size - 1 - left]))
 
 
 def _checked_region(region_px: npt.ArrayLike) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from calibration.columns import Columns
 from speckle3d.core.geometry import FloatArray
-from speckle3d.kernels.lines import echo_fronts, edge_response, first_edges
+from speckle3d.kernels.lines import echo_fronts, echo_levels, filter_columns, first_edges
 
 Float32Array = npt.NDArray[np.float32]
 Place = Literal["front", "slope", "peak"]
@@ -20,31 +20,40 @@ _FINE = 0.25
 short against the rise of an echo."""
 _REACH = 3.5
 """Length of the filters' sides, standard deviations."""
+_AHEAD = 2.0
+"""How far below its edge an echo is brightest at the most, standard deviations: one and a half its length."""
+_LEAST = 0.3
+"""Slope that is looked at, as a part of the steepest in the middle one of all columns."""
 
 
 @dataclass(frozen=True)
-class Slopes:
-    """Columns of an image and how steeply their smoothed levels rise.
+class Profiles:
+    """What columns of an image show along their depth.
 
     Attributes
     ----------
-    samples, response : ndarray, shape (n, r)
-        Levels, and levels per row.
     columns : Columns
+    levels : ndarray, shape (n, r)
+        The image, slightly smoothed.
+    slope : ndarray, shape (n, r)
+        How steeply the image, strongly smoothed, rises, levels per row.
     sigma : float
-        Of the smoothing, rows.
+        Of the strong smoothing, rows.
     """
 
-    samples: Float32Array
-    response: Float32Array
     columns: Columns
+    levels: Float32Array
+    slope: Float32Array
     sigma: float
 
-    @property
-    def typical(self) -> float:
-        """Largest response of the middle one of all columns, by response."""
-        held = self.columns.inside.any(axis=1)
-        return float(np.median(self.response[held].max(axis=1)))
+    def brightness(self) -> Float32Array:
+        """Level of the echo that begins at each steep place, above the image's middle level; 0 elsewhere."""
+        bright = np.empty_like(self.levels)
+        least = _LEAST * typical(self.slope, self.columns)
+        dark = float(np.median(self.levels[self.columns.inside]))
+        ahead = int(np.ceil(_AHEAD * self.sigma))
+        echo_levels(self.slope, self.levels, self.columns.spans, least, dark, ahead, bright)
+        return bright
 
 
 @dataclass(frozen=True)
@@ -56,51 +65,55 @@ class Edges:
     row : ndarray, shape (n,)
         Where the echo is; NaN without one.
     strength : ndarray, shape (n,)
-        Levels per row; 0 without one.
+        Its score; 0 without one.
     """
 
     row: FloatArray
     strength: FloatArray
 
 
-def take_slopes(samples: Float32Array, columns: Columns, sigma: float) -> Slopes:
-    """Differentiate columns smoothed by a Gaussian, in one convolution; nothing outside the region counts.
+def typical(score: Float32Array, columns: Columns) -> float:
+    """Largest score of the middle one of all columns."""
+    return float(np.median(score[columns.inside.any(axis=1)].max(axis=1)))
+
+
+def take_profiles(samples: Float32Array, columns: Columns, sigma: float) -> Profiles:
+    """Smooth columns by Gaussians, and differentiate in the same convolution; only the region counts.
 
     Parameters
     ----------
     samples : ndarray, shape (n, r)
     sigma : float
-        Of the Gaussian, rows.
+        Of the smoothing with which edges are found, rows.
 
     References
     ----------
     .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, appendix B.
     """
+    levels, slope = np.empty_like(samples), np.empty_like(samples)
     t = np.arange(1, int(np.ceil(_REACH * sigma)) + 1)
     taps = t * np.exp(-0.5 * (t / sigma) ** 2)
-    response = np.empty_like(samples)
-    edge_response(samples, columns.spans, (taps / (2 * t * taps).sum()).astype(np.float32), response)
-    return Slopes(samples, response, columns, sigma)
+    filter_columns(samples, columns.spans, 0.0, (taps / (2 * t * taps).sum()).astype(np.float32), -1.0, slope)
+    t = np.arange(1, int(np.ceil(_REACH * _FINE * sigma)) + 1)
+    taps = np.exp(-0.5 * (t / (_FINE * sigma)) ** 2)
+    whole = float(1 + 2 * taps.sum())
+    filter_columns(samples, columns.spans, 1 / whole, (taps / whole).astype(np.float32), 1.0, levels)
+    return Profiles(columns, levels, slope, sigma)
 
 
-def first_echoes(slopes: Slopes, threshold: float, place: Place) -> Edges:
-    """Find in each column the first rise steeper than a threshold, or else the steepest, and place its echo.
+def first_echoes(profiles: Profiles, score: Float32Array, threshold: float, place: Place) -> Edges:
+    """Find in each column the first steep place of more than some score, or else of the largest.
 
     Parameters
     ----------
-    threshold : float
-        Levels per row.
+    score : ndarray, shape (n, r)
+        What edges are judged by: their slope or their brightness.
     place : str
         See `LineSettings`.
     """
-    spans = slopes.columns.spans
-    steepest, front, peak, strength = np.empty((4, len(slopes.samples)))
-    found = np.empty(len(slopes.samples), np.int64)
-    first_edges(slopes.response, spans, threshold, steepest, strength, found)
-    if place == "slope":
-        return Edges(steepest, strength)
-    t = np.arange(int(np.ceil(_REACH * _FINE * slopes.sigma)) + 1)
-    taps = np.exp(-0.5 * (t / (_FINE * slopes.sigma)) ** 2)
-    taps = (taps / (2 * taps.sum() - 1)).astype(np.float32)
-    echo_fronts(slopes.samples, spans, found, steepest, taps, slopes.sigma, front, peak)
-    return Edges(front if place == "front" else peak, strength)
+    spans = profiles.columns.spans
+    steepest, front, peak, strength = np.empty((4, len(score)))
+    found = np.empty(len(score), np.int64)
+    first_edges(profiles.slope, score, spans, threshold, steepest, strength, found)
+    echo_fronts(profiles.levels, spans, found, steepest, profiles.sigma, front, peak)
+    return Edges({"front": front, "slope": steepest, "peak": peak}[place], strength)

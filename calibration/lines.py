@@ -15,6 +15,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from calibration.columns import (
+    DENSELY,
     BoolArray,
     Columns,
     IntArray,
@@ -22,7 +23,7 @@ from calibration.columns import (
     without_blank_sides,
     without_standing,
 )
-from calibration.edges import Edges, Place, first_echoes, take_slopes
+from calibration.edges import Edges, Place, first_echoes, take_profiles, typical
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Frames
@@ -30,11 +31,12 @@ from speckle3d.kernels.lines import consensus_line
 
 Float32Array = npt.NDArray[np.float32]
 
-_THRESHOLDS = (0.9, 0.7, 0.5, 0.35)
-"""Thresholds tried when none is given, as parts of the steepest rise in the middle one of all columns."""
+_PARTS = (0.95, 0.85, 0.75, 0.65, 0.5)
+"""Brightness of an echo that counts when no threshold is given, as parts of the brightest one in the middle
+one of all columns: each is tried."""
 _WEAKER = 0.75
-"""How strong a line must be to go before a stronger one beneath it: above the haze and the side lobes, below
-the floor's own fading between images. Its reverberations lie beneath and are weaker in any case."""
+"""How bright a line must be to go before a brighter one beneath it: brighter than haze and side lobes. The
+floor's reverberations lie beneath it and are no brighter."""
 _LEAST_SHARE = 0.25
 """Part of the sampled columns that must agree however few the line could meet: two or three edges, which are
 noise, always agree with a line that cuts a corner of the region."""
@@ -59,8 +61,8 @@ class LineSettings(BaseModel):
     threshold: float | None = Field(
         None,
         gt=0,
-        description="Slope that makes an edge, grey levels per mm; by default the one with which the first "
-        "strong line shows best.",
+        description="Slope that makes an edge, grey levels per mm; by default echoes are "
+        "judged by their brightness instead, by several measures, and the first bright line is taken.",
     )
     tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
     consensus: float = Field(
@@ -157,11 +159,15 @@ def detect_line(
     s = settings or LineSettings()
     if image.ndim != 2:
         raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
-    columns = lay_columns(image.shape, s.columns, region_px)
-    samples = _sampled(image, columns)
+    if not np.isrealobj(image):
+        raise InvalidInputError(f"image: expected real values, got {image.dtype}")
+    pixel = _checked_pixel(pixel_mm)
     if region_px is None:
-        columns = without_blank_sides(columns, samples)
-    return _detect(samples, _checked_pixel(pixel_mm), s, columns)
+        dense = lay_columns(image.shape, DENSELY * s.columns, None)
+        columns = without_blank_sides(dense, image).thinned(s.columns)
+    else:
+        columns = lay_columns(image.shape, s.columns, region_px)
+    return _detect(image, pixel, s, columns)
 
 
 def detect_lines(
@@ -190,16 +196,19 @@ def detect_lines(
         If an argument is not what it must be.
     """
     s = settings or LineSettings()
+    if np.issubdtype(frames.dtype, np.complexfloating):
+        raise InvalidInputError(f"frames: expected real values, got {frames.dtype}")
     pixel = _checked_pixel(pixel_mm)
     columns = lay_columns(frames.shape[1:], s.columns, region_px)
     if region_px is None and frames.shape[0] > 0:
-        columns = without_standing(columns, frames, s.smoothing_mm / pixel[1])
+        dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
+        columns = without_standing(dense, frames, s.smoothing_mm / pixel[1]).thinned(s.columns)
     found: dict[int, EchoLine] = {}
     dropped: dict[int, str] = {}
     count = frames.shape[0]
     for index in range(count):
         try:
-            found[index] = _detect(_sampled(frames[index], columns), pixel, s, columns)
+            found[index] = _detect(frames[index], pixel, s, columns)
         except NoLineError as error:
             dropped[index] = str(error)
         if progress:
@@ -221,12 +230,6 @@ def _checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
     return pixel
 
 
-def _sampled(image: npt.NDArray[Any], columns: Columns) -> Float32Array:
-    if not np.isrealobj(image):
-        raise InvalidInputError(f"image: expected real values, got {image.dtype}")
-    return np.asarray(image[columns.column], dtype=np.float32)
-
-
 @dataclass(frozen=True)
 class _Candidate:
     """A line that some columns' edges agree with."""
@@ -243,17 +246,20 @@ class _Candidate:
 
     @property
     def strength(self) -> float:
-        return float(self.edges.strength[self.agree].sum() / max(self.possible, 1))
+        return float(self.edges.strength[self.agree].mean())
 
 
-def _detect(samples: Float32Array, pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
+def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
+    samples = np.asarray(image[columns.column], np.float32)
     _require_content(samples[columns.inside])
     tolerance = s.tolerance_mm / float(pixel_mm[1])
-    slopes = take_slopes(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
-    thresholds = [part * slopes.typical for part in _THRESHOLDS]
-    if s.threshold is not None:
-        thresholds = [s.threshold * float(pixel_mm[1])]
-    echoes = [first_echoes(slopes, threshold, s.place) for threshold in thresholds]
+    profiles = take_profiles(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
+    if s.threshold is None:
+        score = profiles.brightness()
+        thresholds = [part * typical(score, columns) for part in _PARTS]
+    else:
+        score, thresholds = profiles.slope, [s.threshold * float(pixel_mm[1])]
+    echoes = [first_echoes(profiles, score, threshold, s.place) for threshold in thresholds]
     tried = [_consensus(edges, columns, tolerance) for edges in echoes]
     accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
     if not accepted:
@@ -320,7 +326,7 @@ def _level_sd(residual: FloatArray) -> float:
     energy = float(np.maximum(r @ r, count * _FINEST_ROWS**2))
     likeness = 1.0
     for lag in range(1, int(count) // 4):
-        pairs = max(1, np.count_nonzero(there[lag:] & there[:-lag]))
+        pairs = max(1, int(np.count_nonzero(there[lag:] & there[:-lag])))
         rho = float(r[lag:] @ r[:-lag]) * count / (energy * pairs)
         if rho <= 0:
             break

@@ -15,8 +15,10 @@ _ROUNDS = 20
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def edge_response(samples: Float32Array, spans: IntArray, taps: Float32Array, out: Float32Array) -> None:
-    """Correlate each span of a column with an odd filter; beyond its ends a span goes on at their level.
+def filter_columns(
+    samples: Float32Array, spans: IntArray, middle: float, taps: Float32Array, sign: float, out: Float32Array
+) -> None:
+    """Correlate each span of a column with an even or odd filter; beyond its ends it goes on at their level.
 
     Parameters
     ----------
@@ -24,13 +26,16 @@ def edge_response(samples: Float32Array, spans: IntArray, taps: Float32Array, ou
         Columns of an image.
     spans : int64, shape (s, 3)
         Column, first and last row.
+    middle : float
+        Weight of the row itself.
     taps : float32, shape (h,)
-        Weights of the differences between rows 1, 2, ... h below and above.
+        Weights of the rows 1, 2, ... h below; those above have them times `sign`.
     out : float32, shape (n, r)
         Zero outside the spans.
     """
     out[:] = 0.0
     reach = taps.size
+    turned = np.float32(sign)
     padded = np.empty(samples.shape[1] + 2 * reach, np.float32)
     for s in range(spans.shape[0]):
         c, first, last = spans[s]
@@ -39,34 +44,70 @@ def edge_response(samples: Float32Array, spans: IntArray, taps: Float32Array, ou
         padded[reach : reach + size] = samples[c, first : last + 1]
         padded[reach + size : size + 2 * reach] = samples[c, last]
         line = out[c, first : last + 1]
+        line[:] = np.float32(middle) * padded[reach : reach + size]
         for t in range(1, reach + 1):
             weight = taps[t - 1]
             below = padded[reach + t : reach + t + size]
             above = padded[reach - t : reach - t + size]
             for j in range(size):
-                line[j] += weight * (below[j] - above[j])
+                line[j] += weight * (below[j] + turned * above[j])
+
+
+@njit(cache=True, nogil=True)
+def echo_levels(
+    response: Float32Array,
+    levels: Float32Array,
+    spans: IntArray,
+    least: float,
+    dark: float,
+    ahead: int,
+    out: Float32Array,
+) -> None:
+    """How bright the echo is that begins at each maximum of the response.
+
+    Parameters
+    ----------
+    response, levels : float32, shape (n, r)
+    spans : int64, shape (s, 3)
+    least : float
+        Response that a maximum must exceed.
+    dark : float
+        Level to count from.
+    ahead : int
+        Rows from the maximum in which the echo is brightest.
+    out : float32, shape (n, r)
+        Zero where there is no maximum.
+    """
+    out[:] = 0.0
+    for s in range(spans.shape[0]):
+        c, first, last = spans[s]
+        line = response[c]
+        for j in range(first + 1, last):
+            if line[j] > least and line[j] > line[j - 1] and line[j] >= line[j + 1]:
+                out[c, j] = max(levels[c, j : min(j + ahead, last) + 1].max() - dark, 0.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def first_edges(
     response: Float32Array,
+    score: Float32Array,
     spans: IntArray,
     threshold: float,
     rows: FloatArray,
     largest: FloatArray,
     found: IntArray,
 ) -> None:
-    """First maximum of each column's response above a threshold, or else its largest maximum.
+    """First maximum of each column's response whose score exceeds a threshold, or else that of largest score.
 
     Parameters
     ----------
-    response : float32, shape (n, r)
+    response, score : float32, shape (n, r)
     spans : int64, shape (s, 3)
         By column, then by row.
     rows : float64, shape (n,)
         Of the maximum, between samples by a parabola; NaN without any.
     largest : float64, shape (n,)
-        The maximum; 0 without any.
+        Its score; 0 without any.
     found : int64, shape (n,)
         The span it lies in; -1 without any.
     """
@@ -78,11 +119,11 @@ def first_edges(
         line = response[c]
         for j in range(first + 1, last):
             here = line[j]
-            if here <= largest[c] or here <= line[j - 1] or here < line[j + 1]:
+            if score[c, j] <= largest[c] or here <= line[j - 1] or here < line[j + 1]:
                 continue
             if largest[c] > threshold:
                 break
-            largest[c] = here
+            largest[c] = score[c, j]
             found[c] = s
             bend = line[j - 1] - 2.0 * here + line[j + 1]
             rows[c] = j + 0.5 * (line[j - 1] - line[j + 1]) / bend
@@ -90,11 +131,10 @@ def first_edges(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def echo_fronts(
-    samples: Float32Array,
+    levels: Float32Array,
     spans: IntArray,
     found: IntArray,
     edges: FloatArray,
-    taps: Float32Array,
     sigma: float,
     fronts: FloatArray,
     peaks: FloatArray,
@@ -103,40 +143,30 @@ def echo_fronts(
 
     Parameters
     ----------
-    samples : float32, shape (n, r)
+    levels : float32, shape (n, r)
     spans : int64, shape (s, 3)
     found : int64, shape (n,)
         The span each edge lies in; -1 where there is none.
     edges : float64, shape (n,)
         Rows of the edges, seen through a Gaussian of `sigma` rows: up to so far above the echo.
-    taps : float32, shape (h + 1,)
-        Half of the even filter that profiles are smoothed with, its middle first.
     fronts, peaks : float64, shape (n,)
         Rows; NaN without an echo.
     """
-    reach = taps.size - 1
-    profile = np.empty(int(5.0 * sigma) + 8)
     for c in range(edges.size):
         fronts[c] = peaks[c] = np.nan
         if found[c] < 0:
             continue
         _, first, last = spans[found[c]]
         top = max(first, int(np.floor(edges[c] - 2.5 * sigma)))
-        size = min(last, int(np.ceil(edges[c] + 2.0 * sigma))) - top + 1
-        for k in range(size):
-            level = taps[0] * samples[c, top + k]
-            for t in range(1, reach + 1):
-                below, above = min(last, top + k + t), max(first, top + k - t)
-                level += taps[t] * (samples[c, below] + samples[c, above])
-            profile[k] = level
-        before = min(max(1, int(edges[c] - sigma) - top + 1), size)
-        k = min(max(0, int(edges[c] - 0.5 * sigma) - top), size - 1)
-        k += np.argmax(profile[k:size])
+        profile = levels[c, top : min(last, int(np.ceil(edges[c] + 2.0 * sigma))) + 1]
+        before = min(max(1, int(edges[c] - sigma) - top + 1), profile.size)
+        k = min(max(0, int(edges[c] - 0.5 * sigma) - top), profile.size - 1)
+        k += np.argmax(profile[k:])
         half = 0.5 * (profile[:before].mean() + profile[k])
         if not profile[k] > half:
             continue
         peaks[c] = top + k
-        if 0 < k < size - 1:
+        if 0 < k < profile.size - 1:
             bend = profile[k - 1] - 2.0 * profile[k] + profile[k + 1]
             if bend < 0.0:
                 peaks[c] += 0.5 * (profile[k - 1] - profile[k + 1]) / bend
