@@ -1,0 +1,149 @@
+"""Reconstructing a sweep, and looking at what was reconstructed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from speckle3d.cli.common import ConfigFile, Json, app, emit, note, progress_bar
+from speckle3d.core.errors import InvalidInputError
+
+
+@app.command()
+def reconstruct(
+    sweep_file: Annotated[Path, typer.Argument(metavar="SWEEP", help="Sweep to reconstruct.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
+    curves_file: Annotated[
+        Path | None, typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside SWEEP.")
+    ] = None,
+    drift: Annotated[
+        list[str] | None, typer.Option(help="Correction mode: orientation or pose; may be repeated.")
+    ] = None,
+    reference: Annotated[str | None, typer.Option(help="tracker or truth: what to compare with.")] = None,
+    consistent_subset: Annotated[
+        bool | None,
+        typer.Option(help="In mode orientation, drop distances that the sensed orientation contradicts."),
+    ] = None,
+    drift_curves: Annotated[
+        str | None, typer.Option(help="Correction cubic in time (published) or in distance (for reversals).")
+    ] = None,
+    config_file: ConfigFile = None,
+    as_json: Json = False,
+) -> None:
+    """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
+    from speckle3d.config import Config, load_config
+    from speckle3d.io.curves import read_curves
+    from speckle3d.io.load import load_sweep
+    from speckle3d.study.job import run_job
+
+    settings = load_config(config_file) if config_file else Config()
+    settings = settings.with_choices(consistent_subset=consistent_subset, drift_curves=drift_curves)
+    modes = list(dict.fromkeys(drift or ()))
+    sweep = load_sweep(sweep_file)
+    curves = read_curves(_find_curves(curves_file, sweep_file))
+    with progress_bar(f"reconstructing {sweep_file.name}") as progress:
+        result = run_job(sweep, sweep_file, curves, out, modes, reference, settings, progress)
+    if as_json:
+        emit((result.directory / "summary.json").read_text(encoding="utf-8"))
+        return
+    emit(result.table)
+    details = result.summary.details
+    for line in details["flagged_frames"]:
+        note(f"{line}: poses there are guesses")
+    if 0 < result.summary.coverage < 1:
+        note(f"compared over the {100 * result.summary.coverage:.0f} % of frames that have a reference")
+    rejected = details["rejected_patch_share"]
+    if rejected == rejected:
+        note(f"{100 * rejected:.0f} % of patches contradict the sensed orientation and were left out")
+    if details["direction_from"] == "truth":
+        note("the sign of the elevational motion was taken from the simulation's truth")
+    if details["direction_from"] == "assumed":
+        note(
+            "nothing tells the sign of the elevational motion: taken as positive (setting sensors.direction)"
+        )
+    note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+
+
+def _find_curves(given: Path | None, sweep_file: Path) -> Path:
+    if given is not None:
+        return given
+    beside = sweep_file.parent / "curves.h5"
+    if not beside.is_file():
+        raise InvalidInputError(
+            f"expected decorrelation curves: --curves CURVES.h5 or {beside}, got neither "
+            "(speckle3d calibrate curves makes them from a phantom sweep)"
+        )
+    note(f"curves: {beside}")
+    return beside
+
+
+@app.command()
+def volume(
+    reconstruction_file: Annotated[Path, typer.Argument(metavar="RECONSTRUCTION")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha or .nii.gz to write.")],
+    mode: Annotated[str, typer.Option(help="image, orientation, pose: which poses to use.")] = "image",
+    voxel_mm: Annotated[float, typer.Option(help="Side of a voxel.")] = 0.2,
+    sweep_file: Annotated[
+        Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
+    ] = None,
+    dynamic_range_db: Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")] = 60.0,
+) -> None:
+    """Compound the frames into voxels, at the poses of one mode."""
+    from speckle3d.imaging.volume import compound
+    from speckle3d.io.volumes import write_volume
+    from speckle3d.study.images import grey_images, open_reconstruction
+
+    reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
+    with progress_bar(f"compounding {out.name}") as progress:
+        images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
+        voxels = compound(images, images.grid, _poses(reconstruction, mode), voxel_mm, voxel_type="uint8")
+    write_volume(out, voxels)
+
+
+@app.command()
+def reslice(
+    reconstruction_file: Annotated[Path, typer.Argument(metavar="RECONSTRUCTION")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="PNG to write.")],
+    mode: Annotated[str, typer.Option(help="image, orientation, pose: which poses to use.")] = "image",
+    lateral_mm: Annotated[
+        float | None, typer.Option(help="Cut along the sweep at this lateral position (middle).")
+    ] = None,
+    depth_mm: Annotated[float | None, typer.Option(help="Cut parallel to the skin at this depth.")] = None,
+    reach_mm: Annotated[float, typer.Option(help="Frames farther from a pixel do not count.")] = 0.5,
+    sweep_file: Annotated[
+        Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
+    ] = None,
+    dynamic_range_db: Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")] = 60.0,
+) -> None:
+    """Cut a plane straight from the frames, at the poses of one mode."""
+    from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames, surface_plane
+    from speckle3d.study.figures import figure_reslice, save_figure
+    from speckle3d.study.images import grey_images, open_reconstruction
+
+    if lateral_mm is not None and depth_mm is not None:
+        raise InvalidInputError("expected --lateral-mm or --depth-mm, got both")
+    reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
+    poses = _poses(reconstruction, mode)
+    with progress_bar(f"reslicing {out.name}") as progress:
+        images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
+        if depth_mm is not None:
+            plane = surface_plane(poses, images.grid, depth_mm)
+            labels = ("elevational / mm", "lateral / mm")
+        else:
+            middle = images.grid.width_mm / 2
+            plane = along_sweep_plane(poses, images.grid, middle if lateral_mm is None else lateral_mm)
+            labels = ("elevational / mm", "depth / mm")
+        cut = reslice_frames(images, images.grid, poses, plane, reach_mm)
+    extent = (0.0, plane.width_mm, plane.height_mm, 0.0)
+    decibel = cut / 255 * dynamic_range_db
+    figure = figure_reslice({mode: decibel}, {mode: extent}, dynamic_range_db, sweep.name, labels)
+    save_figure(figure, out)
+
+
+def _poses(reconstruction: Any, mode: str) -> Any:
+    if mode not in reconstruction.poses:
+        held = ", ".join(reconstruction.poses)
+        raise InvalidInputError(f"--mode: expected one of {held}, got {mode!r}")
+    return reconstruction.poses[mode]
