@@ -215,3 +215,94 @@ def bin_by_distance(rho, offset_mm, slope, lateral_mm, edges_mm):
             r = rho[one, p].astype(float)
             out[p, b] = [one.sum(), d[one, p].sum(), r.sum(), (r**2).sum()]
     return out
+
+
+def edges_of_columns(samples, inside, sigma, threshold):
+    """Twin of `calibration.edges` judged by slope: each run of rows convolved on its own, maxima by search.
+
+    Returns the first maximum's row above the threshold, or else the largest's, (n,); NaN without one.
+    """
+    reach = int(np.ceil(3.5 * sigma))
+    t = np.arange(-reach, reach + 1)
+    kernel = t * np.exp(-0.5 * (t / sigma) ** 2)
+    kernel /= (t * kernel).sum()
+    rows = np.full(len(samples), np.nan)
+    for c, (line, held) in enumerate(zip(samples.astype(float), inside, strict=True)):
+        maxima = []
+        for run in np.split(np.arange(line.size), np.flatnonzero(np.diff(held)) + 1):
+            if not held[run[0]]:
+                continue
+            slope = np.correlate(np.pad(line[run], reach, mode="edge"), kernel, mode="valid")
+            for j in range(1, run.size - 1):
+                if slope[j] > 0 and slope[j - 1] < slope[j] >= slope[j + 1]:
+                    top = np.polyfit([-1, 0, 1], slope[j - 1 : j + 2], 2)
+                    maxima.append((slope[j], run[j] - top[1] / (2 * top[0])))
+        strong = [row for height, row in maxima if height > threshold]
+        if maxima:
+            rows[c] = strong[0] if strong else max(maxima)[1]
+    return rows
+
+
+def consensus_line(column, row, inside, tolerance):
+    """Twin of `speckle3d.kernels.lines.consensus_line`: all pairs at once, then `np.polyfit` until it stays.
+
+    Returns which points agree (n,), how many could, and the line's start and slope.
+    """
+
+    def compare(start, slope):
+        at = start + slope * column
+        nearest = np.floor(at + 0.5).astype(int)
+        could = (nearest >= 0) & (nearest < inside.shape[1])
+        could[could] = inside[np.flatnonzero(could), nearest[could]]
+        return (
+            could & (np.abs(row - at) <= tolerance),
+            could,
+            np.nansum(((row - at) ** 2)[could & (np.abs(row - at) <= tolerance)]),
+        )
+
+    best = (0, -np.inf, 0.0, 0.0)
+    there = np.flatnonzero(np.isfinite(row))
+    for a, j in enumerate(there):
+        for k in there[a + 1 :]:
+            slope = (row[k] - row[j]) / (column[k] - column[j])
+            start = row[j] - slope * column[j]
+            agree, _, squares = compare(start, slope)
+            best = max(best, (agree.sum(), -squares, start, slope), key=lambda each: each[:2])
+    start, slope = best[2:]
+    agree, could, _ = compare(start, slope)
+    for _ in range(20):
+        if agree.sum() < 3:
+            break
+        before = agree
+        slope, start = np.polyfit(column[agree], row[agree], 1)
+        agree, could, _ = compare(start, slope)
+        if np.array_equal(before, agree):
+            break
+    return agree, could.sum(), start, slope
+
+
+def echo_fronts(levels, inside, edges, sigma):
+    """Twin of `speckle3d.kernels.lines.echo_fronts`, its crossing by `np.interp` on the rise alone."""
+    fronts, peaks = np.full((2, len(levels)), np.nan)
+    for c, edge in enumerate(edges):
+        if np.isnan(edge):
+            continue
+        held = np.flatnonzero(inside[c])
+        run = next(r for r in np.split(held, np.flatnonzero(np.diff(held) > 1) + 1) if r[0] <= edge <= r[-1])
+        rows = run[(run >= np.floor(edge - 2.5 * sigma)) & (run <= np.ceil(edge + 2 * sigma))]
+        above = levels[c, rows[rows <= max(int(edge - sigma), rows[0])]].astype(float)
+        echo = rows[rows >= max(int(edge - 0.5 * sigma), rows[0])]
+        peak = echo[np.argmax(levels[c, echo])]
+        half = (above.mean() + levels[c, peak]) / 2
+        if not levels[c, peak] > half:
+            continue
+        peaks[c] = peak
+        if rows[0] < peak < rows[-1]:
+            bend = np.polyfit([-1, 0, 1], levels[c, peak - 1 : peak + 2].astype(float), 2)
+            peaks[c] += -bend[1] / (2 * bend[0]) if bend[0] < 0 else 0.0
+        lower = [r for r in rows if r < peak and levels[c, r] < half]
+        if lower:
+            fronts[c] = np.interp(
+                half, levels[c, lower[-1] : lower[-1] + 2].astype(float), [lower[-1], lower[-1] + 1]
+            )
+    return fronts, peaks
