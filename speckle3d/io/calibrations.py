@@ -1,0 +1,154 @@
+"""Calibrations on disk (format ``speckle3d.calibration``, version 1).
+
+Attributes of the file: ``method``, ``sensor``, ``rms``, ``rms_unit``, ``condition_number``, ``verdict`` and,
+where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), or ``/sensor_from_image_wxyz``
+(4,) of a sensor that knows its orientation only; ``/pixel_mm`` (2,), where known; ``/covariance`` (6, 6) or
+(3, 3), as `speckle3d.core.calibration.Calibration` has it; ``/parameters/name``, ``value``,
+``standard_error`` and ``unit`` (p,); ``/frames/used`` (u,), ``dropped`` and ``reason`` (d,), with attribute
+``given``; ``/source`` with attributes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import h5py
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source
+from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.geometry import (
+    FloatArray,
+    require_finite,
+    rotations_from_quaternions,
+    transforms_from_matrices,
+)
+from speckle3d.io.hdf5 import (
+    PathLike,
+    atomic_hdf5,
+    find_group,
+    locate,
+    opened,
+    read_attribute,
+    read_checked,
+    read_text,
+    require_dataset,
+)
+
+FORMAT = "speckle3d.calibration"
+
+
+def write_calibration(path: PathLike, calibration: Calibration) -> None:
+    """Write a calibration, whole or not at all."""
+    with atomic_hdf5(path, FORMAT) as file:
+        for name in ("method", "sensor", "rms", "rms_unit", "condition_number", "verdict"):
+            file.attrs[name] = getattr(calibration, name)
+        if calibration.time_offset_s is not None:
+            file.attrs["time_offset_s"] = calibration.time_offset_s
+        if calibration.translation_mm is None:
+            file["sensor_from_image_wxyz"] = calibration.rotation.as_quat(scalar_first=True)
+        else:
+            file["sensor_from_image"] = calibration.sensor_from_image.as_matrix()
+        if calibration.pixel_mm is not None:
+            file["pixel_mm"] = calibration.pixel_mm
+        file["covariance"] = calibration.covariance
+        _write_parameters(file.create_group("parameters"), calibration.parameters)
+        _write_frames(file.create_group("frames"), calibration.frames)
+        source = file.create_group("source")
+        for name, value in vars(calibration.source).items():
+            source.attrs[name] = value
+
+
+def read_calibration(path: PathLike) -> Calibration:
+    """Read a calibration, checked.
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        Naming the file and what in it is wrong.
+    """
+    with opened(path, FORMAT) as file, naming(str(path)):
+        rotation, translation = _read_pose(file)
+        size = 3 if translation is None else 6
+        covariance = read_checked(file, "covariance", (size, size))
+        if np.isnan(covariance).any():
+            raise InvalidInputError("/covariance: expected numbers, got NaN")
+        pixel_mm = read_checked(file, "pixel_mm", (2,)) if "pixel_mm" in file else None
+        return Calibration(
+            method=read_text(file, "method"),
+            sensor=read_text(file, "sensor"),
+            rotation=rotation,
+            translation_mm=translation,
+            pixel_mm=pixel_mm,
+            covariance=covariance,
+            parameters=_read_parameters(_group(file, "parameters")),
+            rms=read_attribute(file, "rms"),
+            rms_unit=read_text(file, "rms_unit"),
+            condition_number=float(file.attrs.get("condition_number", np.nan)),
+            frames=_read_frames(_group(file, "frames")),
+            time_offset_s=read_attribute(file, "time_offset_s") if "time_offset_s" in file.attrs else None,
+            verdict=read_text(file, "verdict"),
+            source=_read_source(_group(file, "source")),
+        )
+
+
+def _write_parameters(group: h5py.Group, parameters: tuple[Parameter, ...]) -> None:
+    text = h5py.string_dtype()
+    for name in ("name", "unit"):
+        group.create_dataset(name, data=[getattr(p, name) for p in parameters], dtype=text)
+    for name in ("value", "standard_error"):
+        group[name] = np.array([getattr(p, name) for p in parameters], dtype=float)
+
+
+def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
+    values = read_checked(group, "value", ("p",))
+    require_finite(values, locate(group, "value"))
+    errors = read_checked(group, "standard_error", (values.size,))
+    names, units = (_read_texts(group, name, values.size) for name in ("name", "unit"))
+    rows = zip(names, values.tolist(), errors.tolist(), units, strict=True)
+    return tuple(Parameter(*row) for row in rows)
+
+
+def _write_frames(group: h5py.Group, frames: FramesUsed) -> None:
+    group.attrs["given"] = frames.given
+    group["used"] = np.array(frames.used, dtype=np.int64)
+    group["dropped"] = np.array(list(frames.dropped), dtype=np.int64)
+    group.create_dataset("reason", data=list(frames.dropped.values()), dtype=h5py.string_dtype())
+
+
+def _read_frames(group: h5py.Group) -> FramesUsed:
+    used = read_checked(group, "used", ("u",), np.int64)
+    dropped = read_checked(group, "dropped", ("d",), np.int64)
+    reasons = _read_texts(group, "reason", dropped.size)
+    given = int(read_attribute(group, "given"))
+    return FramesUsed(given, tuple(used.tolist()), dict(zip(dropped.tolist(), reasons, strict=True)))
+
+
+def _read_pose(file: h5py.File) -> tuple[Rotation, FloatArray | None]:
+    if "sensor_from_image" in file:
+        matrix = read_checked(file, "sensor_from_image", (4, 4))
+        pose: RigidTransform = transforms_from_matrices(matrix[None], "/sensor_from_image")[0]
+        return pose.rotation, np.asarray(pose.translation)
+    quaternion = read_checked(file, "sensor_from_image_wxyz", (4,))
+    return rotations_from_quaternions(quaternion[None], "/sensor_from_image_wxyz")[0], None
+
+
+def _read_source(group: h5py.Group) -> Source:
+    return Source(**{one.name: read_text(group, one.name) for one in fields(Source)})
+
+
+def _read_texts(group: h5py.Group, name: str, count: int) -> list[str]:
+    node = require_dataset(group, name)
+    if h5py.check_string_dtype(node.dtype) is None or node.shape != (count,):
+        raise InvalidInputError(
+            f"{locate(group, name)}: expected {count} texts, got {node.shape} {node.dtype}"
+        )
+    return [str(text) for text in node.asstr(errors="replace")[()]]
+
+
+def _group(file: h5py.File, name: str) -> h5py.Group:
+    found = find_group(file, name)
+    if found is None:
+        raise InvalidInputError(f"/{name}: expected a group, got none")
+    return found
