@@ -258,7 +258,7 @@ def _middle_equations(
 def _wire_equations(
     points: ImagePoints, phantom: WirePhantom, pose: RigidTransform
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Two directions square to each dot's wire, in the sensor's frame: rows, (n, 2, 3), places, and pixels."""
+    """Two directions square to each dot's wire, in its sensor frame: rows (n, 2, 3), places, pixels."""
     wire = _wires(points, phantom)
     phantom_from_sensor = pose.inv() * points.world_from_sensor
     rows = phantom.normals[wire]

@@ -30,6 +30,9 @@ IntArray = npt.NDArray[np.int64]
 Row = tuple[int, tuple[float, float], int]
 """Frame, column and row, wire."""
 
+_MOST_FRAMES = 2**31
+"""Two years at 30 frames/s."""
+
 _COLUMNS = ("frame", "column_px", "row_px")
 _WIRE = "wire"
 
@@ -93,7 +96,7 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
     frame, pixels, wire = zip(*rows, strict=True)
     wires = np.array(wire) if _WIRE in columns else None
-    return PickedPoints(np.array(frame), np.array(pixels, dtype=float), wires)
+    return PickedPoints(np.array(frame, dtype=np.int64), np.array(pixels, dtype=float), wires)
 
 
 def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:
@@ -147,7 +150,7 @@ def _row(text: str, columns: list[str], wire_names: Sequence[str], where: str) -
         raise InvalidInputError(f"{where}: expected {len(columns)} values, got {len(words)}")
     cell = dict(zip(columns, words, strict=True))
     frame, column, row = (numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS)
-    if frame < 0 or frame != int(frame):
+    if not 0 <= frame < _MOST_FRAMES or frame != int(frame):
         raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
     wire = _wire(cell[_WIRE], wire_names, f"{where}: wire") if _WIRE in cell else 0
     return int(frame), (column, row), wire

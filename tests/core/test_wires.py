@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.wires import WirePhantom, three_wires
+
+N_ENDS = np.array(
+    [
+        [[30.0, 0.0, 20.0], [30.0, 40.0, 20.0]],
+        [[55.0, 0.0, 20.0], [35.0, 40.0, 20.0]],
+        [[60.0, 0.0, 20.0], [60.0, 40.0, 20.0]],
+    ]
+)
+NAMES = ("a", "b", "c")
+
+
+def test_the_three_wire_phantom_has_two_components_that_vanish_on_each_axis():
+    phantom = three_wires()
+    assert phantom.names == ("x", "y", "z")
+    # Prager et al. 1997, equation 7: on the x wire y and z vanish, and so on.
+    for axis in range(3):
+        on_wire = 7.0 * np.eye(3)[axis]
+        np.testing.assert_allclose(phantom.normals[axis] @ on_wire, 0.0, atol=1e-15)
+        off = phantom.normals[axis] @ np.array([1.0, 2.0, 3.0])
+        np.testing.assert_allclose(np.sort(np.abs(off)), np.delete([1.0, 2.0, 3.0], axis))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=30)
+def test_components_along_normals_make_up_the_distance_from_any_wire(seed):
+    rng = np.random.default_rng(seed)
+    ends = rng.normal(size=(5, 2, 3)) * 30.0
+    phantom = WirePhantom.from_ends(tuple("abcde"), ends)
+    along = rng.uniform(-2, 2, 5)[:, None]
+    foot = ends[:, 0] + along * (ends[:, 1] - ends[:, 0])
+    away = np.cross(ends[:, 1] - ends[:, 0], rng.normal(size=(5, 3)))
+    away *= (rng.uniform(0, 5, 5) / np.linalg.norm(away, axis=1))[:, None]
+    distance = np.linalg.norm(away, axis=1)
+    np.testing.assert_allclose(phantom.distances_mm(foot + away, np.arange(5)), distance, atol=1e-9)
+    components = np.einsum("kri,ki->kr", phantom.normals, foot + away - phantom.points_mm)
+    np.testing.assert_allclose(np.linalg.norm(components, axis=1), distance, atol=1e-9)
+
+
+def test_an_n_has_parallel_outer_wires_and_crosses_them_where_drawn():
+    phantom = WirePhantom.from_ends(NAMES, N_ENDS, ((0, 1, 2),))
+    assert phantom.n_shapes == ((0, 1, 2),)
+    # The middle wire falls 20 mm of x over 40 mm of y: it meets x = 30 at y = 50 and x = 60 at y = -10.
+    np.testing.assert_allclose(phantom.crossings_mm(), [[[30.0, 50.0, 20.0], [60.0, -10.0, 20.0]]])
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda ends: ends[1].__setitem__(1, [55.0, 40.0, 20.0]),  # all three parallel
+        lambda ends: ends[2].__setitem__(1, [50.0, 40.0, 20.0]),  # outer wires askew
+        lambda ends: ends[1].__setitem__((slice(None), 2), 22.0),  # middle wire 2 mm above
+    ],
+)
+def test_three_wires_that_are_no_n_are_none(spoil):
+    ends = N_ENDS.copy()
+    spoil(ends)
+    assert WirePhantom.from_ends(NAMES, ends, ((0, 1, 2),)).n_shapes == ()
+
+
+def test_patterns_of_other_numbers_are_no_n():
+    assert WirePhantom.from_ends(NAMES, N_ENDS, ((0, 1), (2,))).crossings_mm().shape == (0, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": ("a", "b", "a")}, "names: expected different ones, got 'a' twice"),
+        ({"patterns": ((0, 1, 3),)}, r"patterns\[0\]: expected different wires from 0 to 2, got \(0, 1, 3\)"),
+        ({"patterns": ((0, 1, 1),)}, r"patterns\[0\]"),
+        ({"directions": 2.0 * np.eye(3)}, r"directions\[0\]: expected unit length, got 2"),
+        ({"points_mm": np.full((3, 3), np.nan)}, r"points_mm\[\(0, 0\)\]: expected a finite value"),
+    ],
+)
+def test_a_phantom_that_is_none_is_refused(change, message):
+    given = {"names": NAMES, "points_mm": np.zeros((3, 3)), "directions": np.eye(3)}
+    with pytest.raises(InvalidInputError, match=message):
+        WirePhantom(**{**given, **change})
+
+
+def test_numbers_that_do_not_match_are_refused():
+    with pytest.raises(MismatchError, match=r"points_mm: expected shape \(3, 3\), got \(2, 3\)"):
+        WirePhantom(NAMES, np.zeros((2, 3)), np.eye(3))
+    with pytest.raises(InvalidInputError, match="expected at least one, got none"):
+        WirePhantom((), np.zeros((0, 3)), np.zeros((0, 3)))
+    with pytest.raises(InvalidInputError, match="wire b: expected two different ends"):
+        WirePhantom.from_ends(NAMES, np.stack([N_ENDS[0], N_ENDS[1][[0, 0]], N_ENDS[2]]))
