@@ -260,7 +260,7 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
     else:
         score, thresholds = profiles.slope, [s.threshold * float(pixel_mm[1])]
     echoes = [first_echoes(profiles, score, threshold, s.place) for threshold in thresholds]
-    tried = [_consensus(edges, columns, tolerance) for edges in echoes]
+    tried = [_consensus(edges, columns, tolerance) for edges in _distinct(echoes)]
     accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
     if not accepted:
         best = max(tried, key=lambda line: line.agreed)
@@ -269,6 +269,15 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
             f"{_needed(best, columns, s)} needed"
         )
     return _measured(_first_strong(accepted, columns, tolerance), columns, pixel_mm)
+
+
+def _distinct(echoes: list[Edges]) -> list[Edges]:
+    """Without those like the ones before them, as neighbouring thresholds mostly give."""
+    kept = echoes[:1]
+    for edges in echoes[1:]:
+        if not np.array_equal(edges.row, kept[-1].row, equal_nan=True):
+            kept.append(edges)
+    return kept
 
 
 def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
