@@ -61,8 +61,8 @@ class LineSettings(BaseModel):
     threshold: float | None = Field(
         None,
         gt=0,
-        description="Slope that makes an edge, grey levels per mm; by default echoes are "
-        "judged by their brightness instead, by several measures, and the first bright line is taken.",
+        description="Slope that makes an edge, grey levels per mm; by default echoes are judged by their "
+        "brightness instead, by several measures, and the first bright line is taken.",
     )
     tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
     consensus: float = Field(
@@ -196,8 +196,10 @@ def detect_lines(
         If an argument is not what it must be.
     """
     s = settings or LineSettings()
-    if np.issubdtype(frames.dtype, np.complexfloating):
-        raise InvalidInputError(f"frames: expected real values, got {frames.dtype}")
+    if len(frames.shape) != 3 or np.issubdtype(frames.dtype, np.complexfloating):
+        raise InvalidInputError(
+            f"frames: expected real values of shape (n, column, row), got {frames.dtype} of {frames.shape}"
+        )
     pixel = _checked_pixel(pixel_mm)
     columns = lay_columns(frames.shape[1:], s.columns, region_px)
     if region_px is None and frames.shape[0] > 0:

@@ -388,6 +388,9 @@ def test_images_of_another_kind_are_refused():
         detect_line(np.zeros((2, *SHAPE)), PIXEL_MM)
     with pytest.raises(InvalidInputError, match="expected real values, got complex128"):
         detect_line(np.zeros(SHAPE, complex), PIXEL_MM)
+    for frames in (np.zeros(SHAPE), np.zeros((2, *SHAPE), complex)):
+        with pytest.raises(InvalidInputError, match=r"expected real values of shape \(n, column, row\), got"):
+            detect_lines(frames, PIXEL_MM)
 
 
 @pytest.mark.parametrize(
