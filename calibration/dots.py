@@ -1,8 +1,8 @@
 """Wires seen end on: bright dots in images, found without help.
 
-A dot stands out from its surroundings at one size and on all sides; the difference of two Gaussians answers
-to that. Side lobes make it wide and ringing gives it a tail, both weaker than the dot itself, so its place is
-the centroid of what is above half of its peak.
+A dot stands out from its surroundings at one size, to which the difference of two Gaussians answers, and is
+not part of a line. Side lobes make it wide and ringing gives it a tail, both weaker than the dot itself, so
+its place is the centroid of what is above half of its peak.
 """
 
 from __future__ import annotations
@@ -29,6 +29,12 @@ _FAINTEST = 0.03
 0.75, and wires off the image's plane were seen at 0.1."""
 _PLACING = 0.35
 """Smoothing before a dot is placed, as part of the dot's own size: enough to join the grains of one dot."""
+_ANGLES = 24
+_LINE_REACH = 2.5
+"""How far along a line is looked whether a peak is part of one, in surroundings; 24 directions are then less
+than half a millimetre apart."""
+_MOST_MAXIMA = 500
+"""A bound on time alone: what is weaker than so many others is no candidate."""
 _REACH = 2.0
 """Half the window in which a dot is placed, in surroundings."""
 
@@ -61,7 +67,7 @@ class Dots:
     pixels : ndarray, shape (n, 2)
         Column and row, fractional.
     score : ndarray, shape (n,)
-        Contrast with the surroundings, grey levels.
+        Contrast with the surroundings, less that of a line the dot may be part of, grey levels.
     dropped : dict of int to str
         Why other frames have none.
     """
@@ -182,29 +188,52 @@ def _dots(
     require_finite(grey, "image")
     contrast = ndimage.gaussian_filter(grey, s.dot_mm / pixel_mm)
     contrast -= ndimage.gaussian_filter(grey, s.surround_mm / pixel_mm, truncate=3.0)
-    peaks = _peaks(contrast, pixel_mm, s, inside)
+    limit = _limit(contrast if inside is None else contrast[inside], s)
+    peaks = _maxima(contrast, limit, pixel_mm, s, inside)
+    score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm, s)
+    best = np.argsort(-score, kind="stable")
+    best = best[score[best] > limit][: s.candidates]
     fine = ndimage.gaussian_filter(grey, _PLACING * s.dot_mm / pixel_mm)
-    places = [_placed(fine, peak, pixel_mm, s) for peak in peaks]
-    return np.reshape(places, (-1, 2)), contrast[tuple(peaks.T)].astype(float)
+    places = [_placed(fine, peak, pixel_mm, s) for peak in peaks[best]]
+    return np.reshape(places, (-1, 2)), score[best].astype(float)
 
 
-def _peaks(
-    contrast: Float32Array, pixel_mm: FloatArray, s: DotSettings, inside: BoolArray | None
-) -> IntArray:
-    """Columns and rows of the strongest maxima, shape (n, 2), strongest first."""
-    size = 2 * np.maximum(np.rint(s.apart_mm / 2 / pixel_mm), 1).astype(int) + 1
-    top = contrast == ndimage.maximum_filter(contrast, size=tuple(size))
-    held = contrast if inside is None else contrast[inside]
+def _limit(contrast: Float32Array, s: DotSettings) -> float:
     # A sample of the pixels says as much about the noise.
-    noise = _MAD_TO_SIGMA * float(np.median(np.abs(held.ravel()[::7])))
-    rounding = float(np.finfo(np.float32).eps * np.abs(held).max())
-    limit = np.max([s.noise_sds * noise, _FAINTEST * float(held.max()), rounding])
-    top &= contrast > limit
+    noise = _MAD_TO_SIGMA * float(np.median(np.abs(contrast.ravel()[::7])))
+    rounding = float(np.finfo(np.float32).eps * np.abs(contrast).max())
+    return float(np.max([s.noise_sds * noise, _FAINTEST * float(contrast.max()), rounding]))
+
+
+def _maxima(
+    contrast: Float32Array, limit: float, pixel_mm: FloatArray, s: DotSettings, inside: BoolArray | None
+) -> IntArray:
+    """Columns and rows of maxima that are some way apart, shape (n, 2), strongest first."""
+    size = 2 * np.maximum(np.rint(s.apart_mm / 2 / pixel_mm), 1).astype(int) + 1
+    top = (contrast == ndimage.maximum_filter(contrast, size=tuple(size))) & (contrast > limit)
     if inside is not None:
         top &= inside
     peaks = np.argwhere(top)
-    peaks = peaks[np.argsort(-contrast[tuple(peaks.T)], kind="stable")]
-    return _far_apart(peaks, s.apart_mm / pixel_mm)[: s.candidates]
+    peaks = peaks[np.argsort(-contrast[tuple(peaks.T)], kind="stable")][:_MOST_MAXIMA]
+    return _far_apart(peaks, s.apart_mm / pixel_mm)
+
+
+def _along_lines(
+    contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray, s: DotSettings
+) -> Float32Array:
+    """Contrast of lines that peaks may be part of: what there is on both sides of them, shape (n,).
+
+    Specular echoes, of a floor as much as of the phantom's frame, would otherwise be rows of dots.
+    """
+    angle = np.linspace(0.0, np.pi, _ANGLES, endpoint=False)
+    away = _LINE_REACH * s.surround_mm * np.column_stack([np.cos(angle), np.sin(angle)]) / pixel_mm
+    sides = []
+    for step in (away, -away):
+        places = np.rint(peaks[:, None] + step).astype(int)
+        held = np.all((places >= 0) & (places < contrast.shape), axis=2)
+        column, row = np.moveaxis(np.where(held[..., None], places, 0), 2, 0)
+        sides.append(np.where(held, contrast[column, row], np.float32(0.0)))
+    return np.asarray(np.minimum(*sides).max(axis=1, initial=0.0), dtype=np.float32)
 
 
 def _far_apart(peaks: IntArray, apart_px: FloatArray) -> IntArray:
