@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from speckle3d.cli.common import Json, app, emit, progress_bar
+from speckle3d.cli.mounting import CalibrationFiles, fitted_pixels, mount, resize
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -40,7 +41,7 @@ def config() -> None:
 def simulate(
     out: Annotated[Path, typer.Argument(help="Sweep file to write.")],
     preset: Annotated[
-        str, typer.Option(help="phantom, tissue, reversal, rotation, crossed or stepped.")
+        str, typer.Option(help="phantom, tissue, reversal, rotation, crossed, stepped or plane.")
     ] = "phantom",
     seed: Annotated[int, typer.Option(help="Same seed and settings, same sweep.")] = 0,
     vectors: Annotated[int | None, typer.Option(help="Vectors in a frame (127).")] = None,
@@ -54,6 +55,20 @@ def simulate(
     turn_axis: Annotated[str | None, typer.Option(help="rotation: tilt or yaw.")] = None,
     drift_mm: Annotated[float | None, typer.Option(help="Slow lateral and axial wander (0.5).")] = None,
     snr_db: Annotated[float | None, typer.Option(help="Speckle over electronic noise (40).")] = None,
+    reflector: Annotated[
+        str | None, typer.Option(help="plane: wall, or bar (the Cambridge phantom).")
+    ] = None,
+    duration_s: Annotated[float | None, typer.Option(help="plane: how long the scan lasts (30).")] = None,
+    tilt_range_deg: Annotated[float | None, typer.Option(help="plane: tilt, either way (25).")] = None,
+    roll_range_deg: Annotated[float | None, typer.Option(help="plane: roll, either way (11).")] = None,
+    yaw_range_deg: Annotated[float | None, typer.Option(help="plane: yaw, either way (90).")] = None,
+    depth_range_mm: Annotated[
+        tuple[float, float] | None, typer.Option(help="plane: depths of the floor (12 34).")
+    ] = None,
+    floor_slope_deg: Annotated[float | None, typer.Option(help="plane: slope of the floor (0).")] = None,
+    sensor_noise: Annotated[
+        float | None, typer.Option(help="plane: factor on the noise of both sensors (1).")
+    ] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
     from pydantic import ValidationError
@@ -74,7 +89,7 @@ def simulate(
     for number, simulated in enumerate(prepare(settings)):
         path = out if number == 0 else out.with_name(f"{out.stem}-crossing{out.suffix}")
         with progress_bar(f"simulating {path.name}") as progress:
-            write_sweep(path, simulated.sweep, progress, simulation=settings.model_dump(mode="json"))
+            write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
 
 
 @app.command()
@@ -89,14 +104,21 @@ def convert(
     row_spacing_mm: Annotated[float | None, typer.Option(help="B-mode: distance between rows.")] = None,
     dynamic_range_db: Annotated[float | None, typer.Option(help="B-mode: dynamic range.")] = None,
     frame_rate_hz: Annotated[float | None, typer.Option(help="For sequences without time stamps.")] = None,
+    calibration: CalibrationFiles = None,
 ) -> None:
-    """Turn an image sequence into a sweep file; options give what its header lacks."""
+    """Turn an image sequence into a sweep file; options give what its header lacks.
+
+    A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
+    unless options give it.
+    """
     from speckle3d.io.load import load_sweep
     from speckle3d.io.metaimage import ImportSettings
     from speckle3d.io.sweep_writer import write_sweep
 
     names = ImportSettings.__dataclass_fields__
     given = {k: v for k, v in locals().items() if k in names and v is not None}
-    sweep = load_sweep(source, ImportSettings(**given))
+    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given}
+    sweep = resize(load_sweep(source, ImportSettings(**(fitted | given))), fitted)
+    sweep = mount(sweep, calibration or ())
     with progress_bar(f"writing {out.name}") as progress:
         write_sweep(out, sweep, progress)

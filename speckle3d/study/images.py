@@ -16,9 +16,17 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor, IntensitySettings
 
+_GLANCES = 24
+"""Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""
+
 
 class GreyImages:
     """Log-compressed images of a sweep, 0 to 255, by frame number.
+
+    Parameters
+    ----------
+    clipped : bool
+        Let the brightest echoes saturate, as on a screen.
 
     Attributes
     ----------
@@ -32,20 +40,30 @@ class GreyImages:
         dynamic_range_db: float,
         progress: Callable[[int, int], None] | None = None,
         settings: IntensitySettings | None = None,
+        clipped: bool = True,
     ) -> None:
         if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
         self._extractor = IntensityExtractor.for_sweep(sweep, settings)
         self._sweep, self._range_db, self._progress = sweep, dynamic_range_db, progress
         self.grid: ImageGrid = self._extractor.grid
-        middle = self._decibel(len(sweep) // 2)
-        # One level for the whole sweep; the 99.9th percentile, so that one specular echo does not darken it.
-        self._brightest = float(np.percentile(middle, 99.9))
+        # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo does
+        # not darken it; for measuring an echo's place, the brightest, so that none is cut off.
+        if clipped:
+            self._brightest = float(np.percentile(self._decibel(len(sweep) // 2), 99.9))
+        else:
+            some = np.unique(np.linspace(0, len(sweep) - 1, _GLANCES).astype(int))
+            self._brightest = max(float(self._decibel(int(i)).max()) for i in some)
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
         return len(self._sweep), self.grid.vectors, self.grid.samples
+
+    @property
+    def dtype(self) -> np.dtype[np.float32]:
+        """Type of the grey levels."""
+        return np.dtype(np.float32)
 
     def __getitem__(self, index: int) -> Float32Array:
         if self._progress:

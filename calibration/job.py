@@ -1,0 +1,290 @@
+"""A recording of a phantom in, a calibration with its report out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.beam import BeamBias, predict_bias
+from calibration.chain import ImagePoints, IntArray
+from calibration.lines import EchoLines, LineSettings, detect_lines
+from calibration.orientation import Viewed, calibrate_orientation
+from calibration.pairing import Offset, covered, estimate_offset
+from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
+from calibration.report import Shot
+from calibration.results import as_calibration
+from calibration.solution import Solution
+from calibration.wires import calibrate_crossing, calibrate_wires
+from speckle3d.core.calibration import Calibration, FramesUsed
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import Frames
+from speckle3d.core.wires import WirePhantom
+
+Progress = Callable[[int, int], None]
+
+SEARCH_S = 0.4
+"""Clock offsets tried to either side of the recording's own: usual latencies of trackers and frame grabbers
+are below 0.2 s."""
+
+_FEWEST_COVERED = 0.3
+"""Share of the frames with something in them that must have a reading; below it, the recordings do not belong
+together."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Images of a phantom and a sensor's readings.
+
+    Parameters
+    ----------
+    images : Frames, shape (n, column, row)
+        Grey levels.
+    pixel_mm : ndarray, shape (2,)
+        Distance between columns and between rows; rough where it is to be estimated.
+    first_row : float
+        Depth of row 0 below the image's origin, in rows.
+    frame_time_s : ndarray, shape (n,)
+    readings : TimedPoses or TimedRotations
+    time_offset_s : float
+        A reading at t belongs to image time t + `time_offset_s`.
+    """
+
+    images: Frames
+    pixel_mm: FloatArray
+    first_row: float
+    frame_time_s: FloatArray
+    readings: TimedPoses | TimedRotations
+    time_offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do with the sensor's clock and with frames that contradict the others.
+
+    Parameters
+    ----------
+    estimate_offset : bool
+        Find the clock offset that explains the images best, near the recording's own.
+    """
+
+    estimate_offset: bool = False
+    outlier_sigma: float = OUTLIER_SIGMA
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A calibration and what its report shows."""
+
+    solution: Solution
+    calibration: Calibration
+    shots: tuple[Shot, ...]
+    beam: tuple[BeamBias, ...] = ()
+    offset: Offset | None = None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was found in the images.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (m,)
+        Of each line, or of each dot.
+    marks_px : ndarray, shape (m, 2, 2) for lines, (m, 2) for dots
+    wire : ndarray of int, shape (m,), optional
+    dropped : dict of int to str
+        Why other frames show nothing.
+    """
+
+    frame: IntArray
+    marks_px: FloatArray
+    wire: IntArray | None = None
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def are_lines(self) -> bool:
+        """Whether marks are lines."""
+        return self.marks_px.ndim == 3
+
+    @classmethod
+    def lines(
+        cls,
+        recording: Recording,
+        settings: LineSettings | None = None,
+        region_px: npt.ArrayLike | None = None,
+        progress: Progress | None = None,
+    ) -> Seen:
+        """Find the plane's line in every image."""
+        found: EchoLines = detect_lines(recording.images, recording.pixel_mm, settings, region_px, progress)
+        return cls(found.frame, found.points_px, None, found.dropped)
+
+
+def plane_job(
+    recording: Recording,
+    seen: Seen,
+    job: Job,
+    fit_pixels: bool = True,
+    stages: Stages = "three",
+    beam_mm: Sequence[float] = (),
+) -> Outcome:
+    """Calibrate a 6-DOF sensor with a plane; `beam_mm` are thicknesses whose bias the report shows."""
+
+    def calibrate(points: ImagePoints) -> Solution:
+        return calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma)
+
+    outcome = _finished(recording, seen, job, calibrate, "plane")
+    beam = tuple(predict_bias(outcome.solution, width) for width in beam_mm)
+    return Outcome(outcome.solution, outcome.calibration, outcome.shots, beam, outcome.offset)
+
+
+def orientation_job(
+    recording: Recording, seen: Seen, job: Job, level: bool = False, viewed_from: Viewed = "above"
+) -> Outcome:
+    """Calibrate an orientation sensor with a plane."""
+
+    def calibrate(points: ImagePoints) -> Solution:
+        return calibrate_orientation(
+            points.pixels[1::2] - points.pixels[::2],
+            points.frame[::2],
+            points.world_from_sensor.rotation[::2],
+            recording.pixel_mm,
+            level,
+            viewed_from,
+            job.outlier_sigma,
+        )
+
+    return _finished(recording, seen, job, calibrate, "orientation")
+
+
+def crossing_job(recording: Recording, seen: Seen, job: Job, fit_pixels: bool = True) -> Outcome:
+    """Calibrate a 6-DOF sensor with two crossing wires or a bead."""
+
+    def calibrate(points: ImagePoints) -> Solution:
+        return calibrate_crossing(points, recording.pixel_mm, fit_pixels, job.outlier_sigma)
+
+    return _finished(recording, seen, job, calibrate, "cross-wire")
+
+
+def wires_job(
+    recording: Recording,
+    seen: Seen,
+    job: Job,
+    phantom: WirePhantom,
+    fit_pixels: bool = True,
+    fit_registration: bool = False,
+) -> Outcome:
+    """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes."""
+
+    def calibrate(points: ImagePoints) -> Solution:
+        return calibrate_wires(
+            points, phantom, recording.pixel_mm, fit_pixels, fit_registration, job.outlier_sigma
+        )
+
+    return _finished(recording, seen, job, calibrate, "n-wire" if phantom.n_shapes else "three-wire")
+
+
+def paired(
+    recording: Recording, seen: Seen, offset_s: float, slack_s: float = 0.0
+) -> tuple[ImagePoints, Seen]:
+    """Join what was seen with the readings of a clock that is off by `offset_s`.
+
+    Returns
+    -------
+    points : ImagePoints
+        Of the frames with a reading at any offset within `slack_s`.
+    seen : Seen
+        With the reason for those without.
+
+    Raises
+    ------
+    InsufficientDataError
+        If few frames have one.
+    """
+    times = recording.frame_time_s[seen.frame]
+    there = covered(recording.readings, times, offset_s, slack_s)
+    if there.sum() < max(1.0, _FEWEST_COVERED * len(times)):
+        first, last = recording.readings.time_s[[0, -1]] + offset_s
+        raise InsufficientDataError(
+            f"expected sensor readings at the times of the frames, got them for {there.sum()} of "
+            f"{len(times)} in which something was found: readings span {first:.3f} to {last:.3f} s, frames "
+            f"{recording.frame_time_s[0]:.3f} to {recording.frame_time_s[-1]:.3f} s"
+        )
+    missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~there])), "no sensor reading at its time")
+    poses = _poses(recording, times[there] - offset_s)
+    marks = seen.marks_px[there] + np.array([0.0, recording.first_row])
+    if seen.are_lines:
+        points = ImagePoints.of_lines(seen.frame[there], marks, poses)
+    else:
+        wire = None if seen.wire is None else seen.wire[there]
+        points = ImagePoints(marks, seen.frame[there], poses, wire)
+    return points, Seen(seen.frame, seen.marks_px, seen.wire, {**seen.dropped, **missing})
+
+
+def _poses(recording: Recording, times_s: FloatArray) -> RigidTransform:
+    read: RigidTransform | Rotation = recording.readings.at(times_s)
+    return RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+
+
+def _finished(
+    recording: Recording, seen: Seen, job: Job, calibrate: Callable[[ImagePoints], Solution], method: str
+) -> Outcome:
+    if len(seen.frame) == 0:
+        reasons = sorted(set(seen.dropped.values())) or ["no frames"]
+        raise InsufficientDataError(f"expected the phantom in the images, got it in none: {reasons[0]}")
+    offset = None
+    if job.estimate_offset:
+
+        def at(offset_s: float) -> Solution:
+            return calibrate(_everywhere_paired(recording, seen, offset_s))
+
+        offset = estimate_offset(at, recording.time_offset_s, SEARCH_S)
+    used_offset = recording.time_offset_s if offset is None else offset.seconds
+    points, told = paired(recording, seen, used_offset)
+    solution = calibrate(points)
+    frames = FramesUsed(recording.images.shape[0], (), told.dropped)
+    stored = used_offset if offset is not None or recording.time_offset_s != 0.0 else None
+    calibration = as_calibration(solution, method, frames, stored)
+    return Outcome(solution, calibration, _shots(recording, seen, calibration), (), offset)
+
+
+def _everywhere_paired(recording: Recording, seen: Seen, offset_s: float) -> ImagePoints:
+    """The same frames whatever the offset that is tried."""
+    there = covered(recording.readings, recording.frame_time_s[seen.frame], recording.time_offset_s, SEARCH_S)
+    if not there.any():
+        raise InsufficientDataError(
+            f"expected readings from {SEARCH_S:g} s before to {SEARCH_S:g} s after some frames, to tell the "
+            "clock, got none"
+        )
+    wire = None if seen.wire is None else seen.wire[there]
+    return paired(recording, Seen(seen.frame[there], seen.marks_px[there], wire), offset_s)[0]
+
+
+def _shots(recording: Recording, seen: Seen, calibration: Calibration) -> tuple[Shot, ...]:
+    """A used frame from the middle, one from the end, and the first that was dropped."""
+    used, dropped = calibration.frames.used, calibration.frames.dropped
+    chosen = [used[len(used) // 2], used[-1], *sorted(dropped)[:1]]
+    return tuple(_shot(recording, seen, number, dropped.get(number, "")) for number in dict.fromkeys(chosen))
+
+
+def _shot(recording: Recording, seen: Seen, number: int, note: str) -> Shot:
+    return Shot(
+        number,
+        recording.images[number],
+        seen.marks_px[seen.frame == number].reshape(-1, 2),
+        seen.are_lines,
+        note,
+    )
+
+
+def require_poses(recording: Recording) -> None:
+    """Raise `InvalidInputError` unless the sensor tells positions."""
+    if not isinstance(recording.readings, TimedPoses):
+        raise InvalidInputError(
+            "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
+        )

@@ -1,0 +1,347 @@
+"""Calibration of a sensor to the image with a phantom: a plane, or wires."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
+from speckle3d.core.errors import InvalidInputError, naming
+
+if TYPE_CHECKING:
+    from calibration.job import Job, Outcome, Recording, Seen
+    from calibration.lines import LineSettings
+    from speckle3d.core.geometry import FloatArray
+
+Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
+Out = Annotated[
+    Path, typer.Option("-o", "--output", help="Calibration file to write; .txt and .png beside it.")
+]
+Poses = Annotated[
+    Path | None, typer.Option("--poses", help="File with the sensor's readings, if not in IMAGES.")
+]
+PixelMm = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Distance between columns and rows, mm, if IMAGES does not say."),
+]
+Region = Annotated[
+    str | None, typer.Option(help='Polygon "column,row column,row ..." outside which nothing counts.')
+]
+TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
+FixedPixels = Annotated[
+    bool, typer.Option("--fixed-pixels", help="Keep the pixel size instead of estimating it.")
+]
+OutlierSigma = Annotated[
+    float, typer.Option(min=1.0, help="Drop frames whose residual exceeds so many standard deviations.")
+]
+Columns = Annotated[int | None, typer.Option(help="Lines: columns sampled (n).")]
+SmoothingMm = Annotated[
+    float | None, typer.Option(help="Lines: standard deviation of the smoothing (sigma).")
+]
+Threshold = Annotated[float | None, typer.Option(help="Lines: slope that makes an edge, levels/mm (T).")]
+ToleranceMm = Annotated[float | None, typer.Option(help="Lines: how near an edge must be to agree (d).")]
+Consensus = Annotated[float | None, typer.Option(help="Lines: part of the possible columns that agree (p).")]
+Place = Annotated[str | None, typer.Option(help="Lines: where on an echo: front, slope or peak.")]
+Validation = Annotated[
+    Path | None, typer.Option(help="Another recording of the phantom, on which the calibration is checked.")
+]
+
+
+class Stages(StrEnum):
+    """How a plane calibration is solved."""
+
+    three = "three"
+    one = "one"
+
+
+class Reflector(StrEnum):
+    """What shows the plane."""
+
+    wall = "wall"
+    bar = "bar"
+
+
+class Viewed(StrEnum):
+    """From which side a plane is seen."""
+
+    above = "above"
+    below = "below"
+
+
+@calibrate.command("plane")
+def calibrate_plane(
+    images: Images,
+    out: Out,
+    poses: Poses = None,
+    pixel_mm: PixelMm = None,
+    fixed_pixels: FixedPixels = False,
+    stages: Annotated[Stages, typer.Option(help="Angles, distances, all; or all at once.")] = Stages.three,
+    reflector: Annotated[
+        Reflector, typer.Option(help="A bare wall, whose bias is predicted, or a thin bar (Cambridge).")
+    ] = Reflector.wall,
+    beam_mm: Annotated[
+        list[float] | None, typer.Option(help="Thickness of the beam for that prediction; may be repeated.")
+    ] = None,
+    region: Region = None,
+    time_offset: TimeOffset = None,
+    outlier_sigma: OutlierSigma = 4.0,
+    validation: Validation = None,
+    columns: Columns = None,
+    smoothing_mm: SmoothingMm = None,
+    threshold: Threshold = None,
+    tolerance_mm: ToleranceMm = None,
+    consensus: Consensus = None,
+    place: Place = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
+    from calibration.job import plane_job, require_poses
+
+    lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
+    recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
+    require_poses(recording)
+    seen = _seen_lines(recording, lines, region, images)
+    widths = () if reflector is Reflector.bar else tuple(beam_mm or (1.0, 2.0, 3.0))
+    with naming(str(images)):
+        outcome = plane_job(recording, seen, job, not fixed_pixels, stages.value, widths)
+    notes = []
+    if validation is not None:
+        other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
+        notes = _validated(outcome, other, _seen_lines(other, lines, region, validation), validation)
+    _finish(images, out, outcome, seen, as_json, notes)
+
+
+@calibrate.command("orientation")
+def calibrate_orientation(
+    images: Images,
+    out: Out,
+    poses: Poses = None,
+    pixel_mm: PixelMm = None,
+    level: Annotated[
+        bool, typer.Option("--level", help="The plane is level: three unknowns, not five.")
+    ] = False,
+    viewed_from: Annotated[
+        Viewed, typer.Option(help="Whether the beam points down on average, or up.")
+    ] = Viewed.above,
+    sensor: Annotated[
+        str, typer.Option(help="orientation, or tracker: use only what a tracker says of orientation.")
+    ] = "orientation",
+    region: Region = None,
+    time_offset: TimeOffset = None,
+    outlier_sigma: OutlierSigma = 4.0,
+    columns: Columns = None,
+    smoothing_mm: SmoothingMm = None,
+    threshold: Threshold = None,
+    tolerance_mm: ToleranceMm = None,
+    consensus: Consensus = None,
+    place: Place = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
+    from calibration.job import orientation_job
+
+    lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
+    recording, job = _prepared(images, poses, pixel_mm, sensor, time_offset, outlier_sigma)
+    seen = _seen_lines(recording, lines, region, images)
+    with naming(str(images)):
+        outcome = orientation_job(recording, seen, job, level, viewed_from.value)
+    _finish(images, out, outcome, seen, as_json)
+
+
+@calibrate.command("wires")
+def calibrate_wires(
+    images: Images,
+    out: Out,
+    phantom: Annotated[str, typer.Option(help="cross, three, or a PLUS configuration of N-wires.")],
+    points: Annotated[
+        Path | None, typer.Option(help="CSV of points picked by hand: frame,column_px,row_px[,wire].")
+    ] = None,
+    poses: Poses = None,
+    pixel_mm: PixelMm = None,
+    fixed_pixels: FixedPixels = False,
+    fit_registration: Annotated[
+        bool, typer.Option("--fit-registration", help="Estimate where the phantom is, too.")
+    ] = False,
+    region: Region = None,
+    time_offset: TimeOffset = None,
+    outlier_sigma: OutlierSigma = 4.0,
+    validation: Validation = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
+    from calibration.job import crossing_job, require_poses, wires_job
+    from speckle3d.io.plus_config import WireConfig, read_wire_phantom
+
+    config: WireConfig | None = None
+    if phantom not in ("cross", "three"):
+        config = read_wire_phantom(phantom)
+        if pixel_mm is None and config.pixel_mm is not None:
+            pixel_mm = (config.pixel_mm, config.pixel_mm)
+    recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
+    require_poses(recording)
+    seen = _seen_wires(recording, phantom, config, points, region, images)
+    with naming(str(images)):
+        if phantom == "cross":
+            outcome = crossing_job(recording, seen, job, not fixed_pixels)
+        else:
+            geometry = _three_wires() if config is None else config.phantom
+            outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, fit_registration)
+    notes = []
+    if validation is not None:
+        other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
+        other_seen = _seen_wires(other, phantom, config, None, region, validation)
+        notes = _validated(outcome, other, other_seen, validation)
+    _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
+
+
+def _three_wires() -> Any:
+    from speckle3d.core.wires import three_wires
+
+    return three_wires()
+
+
+def _line_settings(
+    columns: int | None,
+    smoothing_mm: float | None,
+    threshold: float | None,
+    tolerance_mm: float | None,
+    consensus: float | None,
+    place: str | None,
+) -> LineSettings:
+    from pydantic import ValidationError
+
+    from calibration.lines import LineSettings
+
+    given = {
+        name: value
+        for name, value in locals().items()
+        if name in LineSettings.model_fields and value is not None
+    }
+    try:
+        return LineSettings(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0]).replace("_", "-")
+        raise InvalidInputError(f"--{name}: {first['msg']}, got {first['input']!r}") from None
+
+
+def _prepared(
+    images: Path,
+    poses: Path | None,
+    pixel_mm: tuple[float, float] | None,
+    sensor: str,
+    time_offset: str | None,
+    outlier_sigma: float,
+) -> tuple[Recording, Job]:
+    from calibration.job import Job
+    from speckle3d.cli.recordings import open_recording
+
+    recording = open_recording(images, poses, pixel_mm, sensor)
+    if time_offset is None:
+        return recording, Job(False, outlier_sigma)
+    if time_offset == "estimate":
+        return recording, Job(True, outlier_sigma)
+    try:
+        return replace(recording, time_offset_s=float(time_offset)), Job(False, outlier_sigma)
+    except ValueError:
+        raise InvalidInputError(
+            f"--time-offset: expected seconds or `estimate`, got {time_offset!r}"
+        ) from None
+
+
+def _region(text: str | None) -> FloatArray | None:
+    """Polygon from "column,row column,row ..."."""
+    import numpy as np
+
+    if text is None:
+        return None
+    try:
+        corners = np.array([[float(x) for x in corner.split(",")] for corner in text.split()])
+    except ValueError:
+        corners = np.empty(0)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise InvalidInputError(f'--region: expected at least three "column,row", got {text!r}')
+    return corners
+
+
+def _seen_lines(recording: Recording, settings: LineSettings, region: str | None, images: Path) -> Seen:
+    from calibration.job import Seen
+
+    corners = _region(region)
+    with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
+        return Seen.lines(recording, settings, corners, progress)
+
+
+def _seen_wires(
+    recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
+) -> Seen:
+    from calibration.job import Seen
+    from calibration.wire_images import seen_crossings, seen_nwires
+    from speckle3d.io.points import read_points
+
+    names = ("x", "y", "z") if phantom == "three" else () if config is None else config.phantom.names
+    if points is not None:
+        picked = read_points(points, names)
+        return Seen(picked.frame, picked.pixels, picked.wire)
+    if phantom == "three":
+        raise InvalidInputError(
+            "--phantom three: expected --points, a CSV that says on which wire each dot lies, got none"
+        )
+    corners = _region(region)
+    with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
+        if config is None:
+            return seen_crossings(recording, corners, progress)
+        clip = config.clip.corners_px if corners is None and config.clip is not None else corners
+        return seen_nwires(recording, config.phantom, clip, progress)
+
+
+def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
+    from calibration.job import paired
+    from calibration.repeatability import validate
+
+    with naming(str(path)):
+        points, _ = paired(other, seen, outcome.calibration.time_offset_s or other.time_offset_s)
+        checked = validate(outcome.solution.chain, outcome.solution.phantom, points)
+    frames = len(set(points.frame.tolist()))
+    return [f"on {path.name}, not used: RMS residual {checked.rms:.3f} mm, {frames} frames, none left out"]
+
+
+def _finish(
+    images: Path,
+    out: Path,
+    outcome: Outcome,
+    seen: Seen,
+    as_json: bool,
+    notes: list[str] | None = None,
+    wire_names: tuple[str, ...] = (),
+) -> None:
+    """Write the calibration, its table and its pictures, and print the table."""
+    from importlib.metadata import version
+
+    from calibration.report import figure_report, json_report, text_report
+    from speckle3d.core.calibration import Source
+    from speckle3d.io.calibrations import write_calibration
+    from speckle3d.io.hdf5 import atomic_path, sha256_of
+    from speckle3d.io.points import PickedPoints, write_points
+    from speckle3d.study.figures import save_figure
+
+    source = Source(str(images), sha256_of(images), version("speckle3d"))
+    result = replace(outcome.calibration, source=source)
+    told = list(notes or [])
+    if outcome.offset is not None:
+        found = outcome.offset
+        told.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
+    table = text_report(result, outcome.beam, told)
+    write_calibration(out, result)
+    with atomic_path(out.with_suffix(".txt")) as part:
+        part.write_text(table, encoding="utf-8")
+    save_figure(figure_report(outcome.solution, result, outcome.shots), out.with_suffix(".png"))
+    if not seen.are_lines:
+        write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.marks_px, seen.wire), wire_names)
+    emit(json.dumps(json_report(result, outcome.beam) | {"notes": told}, indent=2) if as_json else table)
+    note(f"calibration in {out}, report in {out.with_suffix('.txt')} and {out.with_suffix('.png')}")

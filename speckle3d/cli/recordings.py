@@ -1,0 +1,89 @@
+"""Recordings of a calibration phantom from files: images and readings, each from wherever they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calibration.job import Recording
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
+from speckle3d.io.load import load_sweep, sniff
+from speckle3d.io.metaimage import ImportSettings, read_poses
+from speckle3d.study.images import GreyImages
+
+DYNAMIC_RANGE_DB = 60.0
+"""Of the images made from RF, and said of imported ones: only their grey levels matter here."""
+
+
+def open_recording(
+    images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, sensor: str
+) -> Recording:
+    """Open images and the readings of one sensor.
+
+    Parameters
+    ----------
+    poses : Path, optional
+        Where the readings are, if not beside the images.
+    sensor : {"tracker", "orientation"}
+
+    Raises
+    ------
+    InsufficientDataError
+        If there is no such sensor.
+    """
+    if sensor not in ("tracker", "orientation"):
+        raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
+    sweep = _load(images, pixel_mm)
+    readings, offset = _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor)
+    pictures, grid = _grey(sweep)
+    size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+    return Recording(
+        pictures, size, grid.first_sample_depth_mm / size[1], sweep.frame_time_s, readings, offset
+    )
+
+
+def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:
+    given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB)
+    if pixel_mm is not None:
+        if not min(pixel_mm) > 0:
+            raise InvalidInputError(f"--pixel-mm: expected two values above zero, got {pixel_mm}")
+        column, row = pixel_mm
+        given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, column_pitch_mm=column, row_spacing_mm=row)
+    try:
+        return load_sweep(path, given)
+    except InvalidInputError as error:
+        if pixel_mm is None and str(error).endswith(("give column_pitch_mm", "give row_spacing_mm")):
+            raise InvalidInputError(
+                f"{path}: the header does not say how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
+            ) from None
+        raise
+
+
+def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
+    """Grey levels as they are, or log-compressed from RF."""
+    if isinstance(sweep.signal, BModeSettings):
+        return sweep.frames, sweep.grid
+    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False)
+    return pictures, pictures.grid
+
+
+def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
+    found = sweep.orientation if sensor == "orientation" else sweep.tracker
+    if found is None:
+        others = "a tracker (--sensor tracker uses its orientation)" if sweep.tracker else "none"
+        raise InsufficientDataError(
+            f"{path}: expected readings of the {sensor} sensor there or in --poses, got {others}"
+            if sensor == "orientation"
+            else f"{path}: expected readings of a tracker there or in --poses, got none"
+        )
+    return found.readings, found.time_offset_s
+
+
+def _readings_of(path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
+    if sniff(path) == "hdf5":
+        return _readings(load_sweep(path), path, sensor)
+    tracker = read_poses(path)
+    return tracker.readings, tracker.time_offset_s
