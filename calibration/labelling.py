@@ -218,9 +218,10 @@ def _label(
     if best > s.residual_mm:
         raise InsufficientDataError("no dots fit the wires")
     like = np.flatnonzero(fits.rms_mm <= best + _LIKE_MM)
-    # Dots count by their rank, and the usual way round decides where the same dots fit either way.
-    rank = [(-float(score[chosen[i]].sum()), _unusual(dots_mm[chosen[i]])) for i in like]
-    return np.asarray(chosen[like[min(range(len(like)), key=lambda k: rank[k])]])
+    # Rounded, so that the usual way round decides where the same dots fit either way.
+    strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
+    usual = [-_unusual(dots_mm[chosen[i]]) for i in like]
+    return np.asarray(chosen[like[np.lexsort((usual, strength))[-1]]])
 
 
 def _unusual(labelled_mm: FloatArray) -> int:

@@ -108,3 +108,24 @@ def plus_results(folder, kind):
     errors = [[e.get("ErrorMm") for e in f.find("ReprojectionError3DList")] for f in done]
     frames = np.array([int(f.get("Index")) for f in done])
     return frames, np.array(points, dtype=float), np.array(errors, dtype=float), matrix
+
+
+def candidates(shown, seed, noise_mm=0.1, wrong=6, missing=()):
+    """Dots as found, strongest first: most wires and, weaker, wrong dots and ringing under some wires.
+
+    Returns frame, pixels, score; `missing` holds (frame, wire) pairs without a dot.
+    """
+    rng = np.random.default_rng(seed)
+    found = []
+    for i, true in enumerate(shown.pixels):
+        there = [w for w in range(len(true)) if (i, w) not in missing]
+        wires = true[there] + rng.normal(size=(len(there), 2)) * noise_mm / PIXEL_MM
+        ringing = wires[rng.permutation(len(wires))[:4]] + [0.0, 1.2 / PIXEL_MM[1]]
+        anywhere = rng.uniform(0, 1, (wrong, 2)) * SHAPE
+        pixels = np.concatenate([wires, ringing, anywhere])
+        score = np.concatenate(
+            [rng.uniform(60, 150, len(wires)), rng.uniform(20, 50, 4), rng.uniform(20, 100, wrong)]
+        )
+        order = np.argsort(-score)
+        found.append((np.full(len(score), i), pixels[order], score[order]))
+    return tuple(np.concatenate(column) for column in zip(*found, strict=True))
