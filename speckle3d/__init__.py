@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from speckle3d.config import Config, load_config
+    from speckle3d.core.calibration import Calibration, calibrated
     from speckle3d.core.curves import DecorrelationCurves
     from speckle3d.core.errors import Speckle3DError
     from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.core.sweep import Sweep
     from speckle3d.imaging.volume import compound
+    from speckle3d.io.calibrations import read_calibration as load_calibration
+    from speckle3d.io.calibrations import write_calibration
     from speckle3d.io.curves import read_curves as load_curves
     from speckle3d.io.curves import write_curves
     from speckle3d.io.load import load_sweep
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOME = {
+    "Calibration": "core.calibration",
     "Config": "config",
     "DecorrelationCurves": "core.curves",
     "JobResult": "study.job",
@@ -41,10 +45,12 @@ _HOME = {
     "Sweep": "core.sweep",
     "Tracked": "solution",
     "calibrate_curves": "pipeline",
+    "calibrated": "core.calibration",
     "compare_modes": "study.metrics",
     "compound": "imaging.volume",
     "correct": "pipeline",
     "grey_images": "study.images",
+    "load_calibration": "io.calibrations:read_calibration",
     "load_config": "config",
     "load_curves": "io.curves:read_curves",
     "load_sweep": "io.load",
@@ -53,6 +59,7 @@ _HOME = {
     "run_job": "study.job",
     "simulate": "simulation.presets",
     "track": "pipeline",
+    "write_calibration": "io.calibrations",
     "write_curves": "io.curves",
     "write_sweep": "io.sweep_writer",
     "write_volume": "io.volumes",
@@ -60,6 +67,7 @@ _HOME = {
 """Where each public name lives, and what it is called there if that differs."""
 
 __all__ = [
+    "Calibration",
     "Config",
     "DecorrelationCurves",
     "JobResult",
@@ -70,10 +78,12 @@ __all__ = [
     "Sweep",
     "Tracked",
     "calibrate_curves",
+    "calibrated",
     "compare_modes",
     "compound",
     "correct",
     "grey_images",
+    "load_calibration",
     "load_config",
     "load_curves",
     "load_sweep",
@@ -82,6 +92,7 @@ __all__ = [
     "run_job",
     "simulate",
     "track",
+    "write_calibration",
     "write_curves",
     "write_sweep",
     "write_volume",

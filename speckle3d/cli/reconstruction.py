@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from speckle3d.cli.common import ConfigFile, Json, app, emit, note, progress_bar
+from speckle3d.cli.mounting import CalibrationFiles, mount
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -29,6 +30,7 @@ def reconstruct(
     drift_curves: Annotated[
         str | None, typer.Option(help="Correction cubic in time (published) or in distance (for reversals).")
     ] = None,
+    calibration: CalibrationFiles = None,
     config_file: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -43,8 +45,11 @@ def reconstruct(
     modes = list(dict.fromkeys(drift or ()))
     sweep = load_sweep(sweep_file)
     curves = read_curves(_find_curves(curves_file, sweep_file))
+    mount(sweep, calibration or ())
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
-        result = run_job(sweep, sweep_file, curves, out, modes, reference, settings, progress)
+        result = run_job(
+            sweep, sweep_file, curves, out, modes, reference, settings, progress, calibration or ()
+        )
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
         return

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
 
 SENSORS = ("tracker", "orientation")
 
@@ -138,3 +139,48 @@ class Calibration:
             raise InsufficientDataError("expected a calibration with a pixel size, got one without")
         scale = np.diag([*self.pixel_mm, float(self.pixel_mm.mean()), 1.0])
         return np.asarray(self.sensor_from_image.as_matrix() @ scale)
+
+
+def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
+    """Put a calibration on a sweep's sensor, in place of what the sweep says of it.
+
+    The sensor's clock offset is replaced if the calibration knows one; the image grid stays as it is.
+
+    Raises
+    ------
+    MismatchError
+        If the sweep has no such sensor.
+    InsufficientDataError
+        If it is for a tracker and knows no translation.
+    """
+    if calibration.sensor == "tracker":
+        return replace(sweep, tracker=_tracker(sweep, calibration))
+    return replace(sweep, orientation=_orientation(sweep, calibration))
+
+
+def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
+    """How far a calibration's pixels are from a grid's: the larger relative difference; zero if unknown."""
+    if calibration.pixel_mm is None:
+        return 0.0
+    size_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+    return float(np.abs(calibration.pixel_mm / size_mm - 1.0).max())
+
+
+def _tracker(sweep: Sweep, calibration: Calibration) -> Tracker:
+    held = sweep.tracker
+    if held is None:
+        raise MismatchError(f"{sweep.name}: expected the calibration's sensor, a tracker, got none")
+    offset_s = _known(calibration.time_offset_s, held.time_offset_s)
+    return replace(held, sensor_from_image=calibration.sensor_from_image, time_offset_s=offset_s)
+
+
+def _orientation(sweep: Sweep, calibration: Calibration) -> OrientationSensor:
+    held = sweep.orientation
+    if held is None:
+        raise MismatchError(f"{sweep.name}: expected the calibration's sensor, of orientation, got none")
+    offset_s = _known(calibration.time_offset_s, held.time_offset_s)
+    return replace(held, sensor_from_image=calibration.rotation, time_offset_s=offset_s)
+
+
+def _known(found_s: float | None, held_s: float) -> float:
+    return held_s if found_s is None else found_s

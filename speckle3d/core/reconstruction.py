@@ -54,12 +54,22 @@ class FramePairs:
 
 
 @dataclass(frozen=True)
+class CalibrationFile:
+    """A calibration file that replaced what a sweep says of one of its sensors."""
+
+    sensor: str
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True)
 class Provenance:
     """Where a reconstruction came from."""
 
     input_path: str
     input_sha256: str
     package_version: str
+    calibrations: tuple[CalibrationFile, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -10,20 +10,23 @@ where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 
 import h5py
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source, calibrated
+from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.geometry import (
     FloatArray,
     require_finite,
     rotations_from_quaternions,
     transforms_from_matrices,
 )
+from speckle3d.core.reconstruction import CalibrationFile
+from speckle3d.core.sweep import Sweep
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
@@ -34,6 +37,7 @@ from speckle3d.io.hdf5 import (
     read_checked,
     read_text,
     require_dataset,
+    sha256_of,
 )
 
 FORMAT = "speckle3d.calibration"
@@ -70,10 +74,6 @@ def read_calibration(path: PathLike) -> Calibration:
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         rotation, translation = _read_pose(file)
-        size = 3 if translation is None else 6
-        covariance = read_checked(file, "covariance", (size, size))
-        if np.isnan(covariance).any():
-            raise InvalidInputError("/covariance: expected numbers, got NaN")
         pixel_mm = read_checked(file, "pixel_mm", (2,)) if "pixel_mm" in file else None
         return Calibration(
             method=read_text(file, "method"),
@@ -81,16 +81,38 @@ def read_calibration(path: PathLike) -> Calibration:
             rotation=rotation,
             translation_mm=translation,
             pixel_mm=pixel_mm,
-            covariance=covariance,
+            covariance=_read_covariance(file, 3 if translation is None else 6),
             parameters=_read_parameters(_group(file, "parameters")),
             rms=read_attribute(file, "rms"),
             rms_unit=read_text(file, "rms_unit"),
-            condition_number=float(file.attrs.get("condition_number", np.nan)),
+            condition_number=_read_condition(file),
             frames=_read_frames(_group(file, "frames")),
             time_offset_s=read_attribute(file, "time_offset_s") if "time_offset_s" in file.attrs else None,
             verdict=read_text(file, "verdict"),
             source=_read_source(_group(file, "source")),
         )
+
+
+def apply_calibrations(sweep: Sweep, paths: Sequence[PathLike]) -> tuple[Sweep, tuple[CalibrationFile, ...]]:
+    """Put calibration files on a sweep's sensors, one to a sensor, and tell which they were.
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        Naming the file and what in it is wrong.
+    MismatchError
+        If two are for one sensor, or the sweep has no such sensor.
+    """
+    held: list[CalibrationFile] = []
+    for path in paths:
+        calibration = read_calibration(path)
+        before = [one.path for one in held if one.sensor == calibration.sensor]
+        if before:
+            raise MismatchError(f"{path}: expected one calibration for a sensor, got {before[0]} for it too")
+        with naming(str(path)):
+            sweep = calibrated(sweep, calibration)
+        held.append(CalibrationFile(calibration.sensor, str(path), sha256_of(path)))
+    return sweep, tuple(held)
 
 
 def _write_parameters(group: h5py.Group, parameters: tuple[Parameter, ...]) -> None:
@@ -105,6 +127,7 @@ def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
     values = read_checked(group, "value", ("p",))
     require_finite(values, locate(group, "value"))
     errors = read_checked(group, "standard_error", (values.size,))
+    _require_spread(errors, locate(group, "standard_error"))
     names, units = (_read_texts(group, name, values.size) for name in ("name", "unit"))
     rows = zip(names, values.tolist(), errors.tolist(), units, strict=True)
     return tuple(Parameter(*row) for row in rows)
@@ -122,6 +145,11 @@ def _read_frames(group: h5py.Group) -> FramesUsed:
     dropped = read_checked(group, "dropped", ("d",), np.int64)
     reasons = _read_texts(group, "reason", dropped.size)
     given = int(read_attribute(group, "given"))
+    for name, numbers in (("used", used), ("dropped", dropped)):
+        bad = np.flatnonzero((numbers < 0) | (numbers >= given))
+        if bad.size:
+            where = f"{locate(group, name)}[{bad[0]}]"
+            raise InvalidInputError(f"{where}: expected a frame among {given}, got {numbers[bad[0]]}")
     return FramesUsed(given, tuple(used.tolist()), dict(zip(dropped.tolist(), reasons, strict=True)))
 
 
@@ -132,6 +160,29 @@ def _read_pose(file: h5py.File) -> tuple[Rotation, FloatArray | None]:
         return pose.rotation, np.asarray(pose.translation)
     quaternion = read_checked(file, "sensor_from_image_wxyz", (4,))
     return rotations_from_quaternions(quaternion[None], "/sensor_from_image_wxyz")[0], None
+
+
+def _read_covariance(file: h5py.File, size: int) -> FloatArray:
+    covariance = read_checked(file, "covariance", (size, size))
+    _require_spread(np.diag(covariance), locate(file, "covariance"))
+    if np.isnan(covariance).any():
+        raise InvalidInputError("/covariance: expected numbers, got NaN")
+    return covariance
+
+
+def _require_spread(values: FloatArray, where: str) -> None:
+    """What motion does not determine has an infinite spread; none has a negative one."""
+    bad = np.flatnonzero(~(values >= 0))
+    if bad.size:
+        raise InvalidInputError(f"{where}[{bad[0]}]: expected zero or a value above it, got {values[bad[0]]}")
+
+
+def _read_condition(file: h5py.File) -> float:
+    """Infinite if the motion leaves something open, so not read as other numbers are."""
+    raw = np.asarray(file.attrs.get("condition_number", np.nan))
+    if raw.dtype.kind not in "fiu" or raw.size != 1 or np.isnan(raw).any():
+        raise InvalidInputError("attribute condition_number: expected a number, got none")
+    return float(raw.ravel()[0])
 
 
 def _read_source(group: h5py.Group) -> Source:

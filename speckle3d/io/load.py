@@ -9,11 +9,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from speckle3d.core.calibration import Calibration, Parameter
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.geometry import relative_poses
+from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.io import reconstructions, sweeps
+from speckle3d.io import calibrations, reconstructions, sweeps
+from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, file_format, one_line, open_hdf5, reading
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.metaimage import ImportSettings, read_metaimage
@@ -159,6 +161,7 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
         ("input", result.provenance.input_path, ""),
         ("input SHA-256", result.provenance.input_sha256, ""),
         ("package version", result.provenance.package_version, ""),
+        *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
     ]
 
 
@@ -168,6 +171,56 @@ def _length_mm(result: Reconstruction, mode: str) -> float:
         return 0.0
     centre = result.grid.centre_mm
     return float(abs((relative_poses(result.poses[mode]).apply(centre) - centre)[:, 2].sum()))
+
+
+def _describe_calibration(path: PathLike) -> list[Row]:
+    held = read_calibration(path)
+    offset = "unknown" if held.time_offset_s is None else f"{held.time_offset_s:+.4f}"
+    return [
+        ("method", held.method, ""),
+        ("sensor", held.sensor, ""),
+        *_mounting_rows(held),
+        *(_parameter_row(one) for one in held.parameters),
+        ("RMS residual", *_readable(held.rms, held.rms_unit)),
+        ("condition number", f"{held.condition_number:.1f}", ""),
+        ("time offset", offset, "" if held.time_offset_s is None else "s"),
+        ("frames used", f"{len(held.frames.used)} of {held.frames.given}", ""),
+        *((f"dropped: {reason}", str(n), "frames") for reason, n in held.frames.reasons().items()),
+        ("verdict", held.verdict, ""),
+        ("input", held.source.input_path, ""),
+        ("input SHA-256", held.source.input_sha256, ""),
+        ("package version", held.source.package_version, ""),
+    ]
+
+
+def _mounting_rows(held: Calibration) -> list[Row]:
+    """Where the image is, angles in degrees, and how well that is known about and along the image's axes."""
+    angles = zip(("roll", "yaw", "tilt"), np.rad2deg(roll_yaw_tilt(held.rotation)), strict=True)
+    spread = np.sqrt(np.diag(held.covariance))
+    rows: list[Row] = [(f"sensor_from_image {name}", f"{angle:.3f}", "deg") for name, angle in angles]
+    if held.translation_mm is not None:
+        rows.append(("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
+    rows.append(("standard error, tilt, yaw, roll", _listed(np.rad2deg(spread[:3])), "deg"))
+    if held.translation_mm is not None:
+        rows.append(("standard error along the image's x, y, z", _listed(spread[3:]), "mm"))
+    if held.pixel_mm is not None:
+        rows.append(("pixel", " x ".join(f"{size:.5f}" for size in held.pixel_mm), "mm"))
+    return rows
+
+
+def _parameter_row(one: Parameter) -> Row:
+    value, unit = _readable(one.value, one.unit)
+    return (f"parameter {one.name}", f"{value} +- {_readable(one.standard_error, one.unit)[0]}", unit)
+
+
+def _readable(value: float, unit: str) -> tuple[str, str]:
+    if unit == "rad":
+        return f"{np.rad2deg(value):.3f}", "deg"
+    return f"{value:.{5 if unit == 'mm/pixel' else 3}f}", unit
+
+
+def _listed(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:
+    return ", ".join(f"{value:.3f}" for value in values)
 
 
 def _describe_members(path: PathLike) -> list[Row]:
@@ -230,5 +283,5 @@ _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
     sweeps.FORMAT: _describe_sweep,
     reconstructions.FORMAT: _describe_reconstruction,
     "speckle3d.curves": _describe_members,
-    "speckle3d.calibration": _describe_members,
+    calibrations.FORMAT: _describe_calibration,
 }

@@ -19,7 +19,14 @@ from speckle3d.core.geometry import (
     require_increasing,
     transforms_from_matrices,
 )
-from speckle3d.core.reconstruction import MODES, FramePairs, Provenance, Reconstruction, Trust
+from speckle3d.core.reconstruction import (
+    MODES,
+    CalibrationFile,
+    FramePairs,
+    Provenance,
+    Reconstruction,
+    Trust,
+)
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import (
     PathLike,
@@ -134,6 +141,10 @@ class ReconstructionWriter:
             self._file["frame_flags"] = trust.flags
         for name in _PROVENANCE_FIELDS:
             self._file.attrs[name] = getattr(provenance, name)
+        for used in provenance.calibrations:
+            self._file.require_group(f"calibrations/{used.sensor}").attrs.update(
+                path=used.path, sha256=used.sha256
+            )
         self._file["config_toml"] = config_toml
         self._finished = True
 
@@ -160,7 +171,7 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
                 frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
                 grid=_read_grid(file),
                 poses=_read_poses(file, times.size),
-                provenance=Provenance(**{name: read_text(file, name) for name in _PROVENANCE_FIELDS}),
+                provenance=_read_provenance(file),
                 config_toml=_read_config(file),
                 pairs=_read_pairs(file, times.size) if with_pairs else None,
                 trust=_read_trust(file, times.size),
@@ -205,6 +216,20 @@ def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
             f"{where}[{i}]: expected frames 0 <= first < second < {frames}, "
             f"got {pairs.first[i]} and {pairs.second[i]}"
         )
+
+
+def _read_provenance(file: h5py.File) -> Provenance:
+    held = find_group(file, "calibrations")
+    # Files from before calibrations could be given have no such group.
+    groups = {} if held is None else {sensor: find_group(held, sensor) for sensor in held}
+    calibrations = tuple(
+        CalibrationFile(sensor, read_text(group, "path"), read_text(group, "sha256"))
+        for sensor, group in groups.items()
+        if group is not None
+    )
+    return Provenance(
+        **{name: read_text(file, name) for name in _PROVENANCE_FIELDS}, calibrations=calibrations
+    )
 
 
 def _read_grid(file: h5py.File) -> ImageGrid:

@@ -22,7 +22,8 @@ from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
-from speckle3d.io.hdf5 import make_folder, sha256_of
+from speckle3d.io.calibrations import apply_calibrations
+from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.motion.intensity import Float32Array, IntensityExtractor
 from speckle3d.motion.quality import describe
@@ -66,6 +67,7 @@ def run_job(
     reference: str | None = None,
     config: Config | None = None,
     progress: Progress | None = None,
+    calibrations: Sequence[PathLike] = (),
 ) -> JobResult:
     """Reconstruct a sweep and write everything that belongs to it into `directory`.
 
@@ -78,9 +80,12 @@ def run_job(
         Correction modes beside `image`: "orientation", "pose".
     reference : {"tracker", "truth"}, optional
         What to compare with; by default the truth if stored, else the tracker, else nothing.
+    calibrations : sequence of path
+        Calibration files, at most one for each sensor, in place of what the sweep says of its sensors.
     """
     settings = config or Config()
     began = time.perf_counter()
+    sweep, mounted = apply_calibrations(sweep, calibrations)
     require_modes(sweep, drift)
     compared = find_reference(sweep, reference)
     make_folder(directory)
@@ -90,7 +95,7 @@ def run_job(
         tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep)
         corrections = correct(tracked, sweep, drift, settings)
         poses = {"image": tracked.image} | {mode: c.poses for mode, c in corrections.items()}
-        provenance = Provenance(str(source), sha256_of(source), version("speckle3d"))
+        provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     summary = _summarise(sweep, tracked, corrections, poses, compared, provenance)
     files = [path, *write_summary(directory, [summary])]

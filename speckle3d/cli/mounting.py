@@ -1,0 +1,75 @@
+"""Calibrations that a command puts on a sweep's sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from speckle3d.cli.common import note
+
+if TYPE_CHECKING:
+    from speckle3d.core.calibration import Calibration
+    from speckle3d.core.sweep import Sweep
+
+CalibrationFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calibration", help="Calibration to use for its sensor in place of the file's; may be repeated."
+    ),
+]
+
+NOTED_SIZE = 0.01
+"""Relative difference of pixel sizes from which it is told: 0.4 mm over an image of 40 mm."""
+
+NOTED_OFFSET_S = 0.001
+
+
+def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
+    """Put calibration files on a sweep's sensors, and say on stderr where they contradict the sweep."""
+    from speckle3d.io.calibrations import apply_calibrations, read_calibration
+
+    mounted, _ = apply_calibrations(sweep, paths)
+    for path in paths:
+        _note_differences(sweep, path, read_calibration(path))
+    return mounted
+
+
+def fitted_pixels(paths: Sequence[Path]) -> dict[str, float]:
+    """Pixel size of the first calibration that knows one, as import settings of B-mode; else nothing."""
+    from speckle3d.io.calibrations import read_calibration
+
+    for path in paths:
+        pixel_mm = read_calibration(path).pixel_mm
+        if pixel_mm is not None:
+            return {"column_pitch_mm": float(pixel_mm[0]), "row_spacing_mm": float(pixel_mm[1])}
+    return {}
+
+
+def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
+    """Put pixel sizes, by their names in the import settings, on a sweep of B-mode images."""
+    from speckle3d.core.sweep import BModeSettings
+
+    if not isinstance(sweep.signal, BModeSettings):
+        return sweep
+    names = {"column_pitch_mm": "vector_pitch_mm", "row_spacing_mm": "sample_spacing_mm"}
+    changed = {names[name]: size for name, size in sizes.items()}
+    return replace(sweep, grid=replace(sweep.grid, **changed))  # type: ignore[arg-type]
+
+
+def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> None:
+    from speckle3d.core.calibration import pixel_difference
+
+    grid, pixel_mm = sweep.grid, calibration.pixel_mm
+    if pixel_mm is not None and pixel_difference(grid, calibration) > NOTED_SIZE:
+        note(
+            f"{path}: found pixels of {pixel_mm[0]:.4g} x {pixel_mm[1]:.4g} mm, "
+            f"the sweep's are {grid.vector_pitch_mm:.4g} x {grid.sample_spacing_mm:.4g} mm and stay so"
+        )
+    sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
+    held_s, found_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
+    if held_s and found_s is not None and abs(found_s - held_s) > NOTED_OFFSET_S:
+        note(f"{path}: time offset {found_s:+.4f} s is used, not the sweep's {held_s:+.4f} s")
