@@ -1,0 +1,93 @@
+"""Commands run in this process, and what a small sweep of 24 frames gives."""
+
+import shutil
+import subprocess
+import sys
+
+import h5py
+import pytest
+from commands import SMALL, command
+
+from speckle3d import cli
+
+
+@pytest.fixture
+def run(monkeypatch, capfd):
+    """Run the command in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        capfd.readouterr()
+        monkeypatch.setattr(sys, "argv", ["speckle3d", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leave:
+            cli.main()
+        out, err = capfd.readouterr()
+        return leave.value.code, out, err
+
+    return call
+
+
+@pytest.fixture
+def refused(run, tmp_path):
+    """Run the command, which must refuse its input in one line and leave no file behind; returns the line."""
+
+    def call(*arguments, folder=tmp_path):
+        before = sorted(folder.rglob("*"))
+        code, out, err = run(*arguments)
+        # The bar's line, if frames were already being read, is not part of the message.
+        lines = [line for line in err.splitlines() if line.startswith("speckle3d: ")]
+        assert code == 2, err
+        assert len(lines) == 1, err
+        assert "Traceback" not in err
+        assert out == ""
+        left = [path for path in sorted(folder.rglob("*")) if path not in before and path.is_file()]
+        assert left == []
+        return lines[0]
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory):
+    """A folder with a small sweep and the curves for it, made by the command in a process of its own."""
+    folder = tmp_path_factory.mktemp("bench")
+    steps = ("--preset", "stepped", "--steps", "15", "--step-mm", "0.06", "--blocks", "2")
+    for arguments in (
+        ("simulate", folder / "sweep.h5", *SMALL, "--length-mm", "3", "--frames", "24"),
+        ("simulate", folder / "stepped.h5", *SMALL, *steps),
+        ("calibrate", "curves", folder / "stepped.h5", "-o", folder / "curves.h5"),
+    ):
+        done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="session")
+def reconstructed(bench):
+    """The folder of the small sweep's results."""
+    folder = bench / "out"
+    modes = ("--drift", "orientation", "--drift", "pose")
+    done = subprocess.run(
+        command("reconstruct", bench / "sweep.h5", "-o", folder, *modes),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[2] for line in done.stdout.splitlines()[2:]] == ["image", "orientation", "pose"]
+    return folder
+
+
+@pytest.fixture
+def changed(bench, tmp_path):
+    """The small sweep with something changed in it."""
+
+    def change(edit, name="sweep.h5"):
+        path = tmp_path / name
+        shutil.copy(bench / name, path)
+        if name == "sweep.h5":
+            shutil.copy(bench / "curves.h5", tmp_path / "curves.h5")
+        with h5py.File(path, "r+") as file:
+            edit(file)
+        return path
+
+    return change

@@ -1,0 +1,257 @@
+"""Calibration files on the command line: told, put on sensors, written into sweeps."""
+
+import json
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from io import StringIO
+
+import h5py
+import numpy as np
+import pytest
+import sweep_examples
+from calibration_files import made
+from image_examples import grey, tracked, write_mha
+from scipy.spatial.transform import Rotation
+
+from speckle3d import cli
+from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.hdf5 import sha256_of
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.sweep_writer import write_sweep
+
+MODES = ("--drift", "orientation", "--drift", "pose")
+
+
+def of_sweep(sweep, sensor, **changes):
+    """A calibration that says what the sweep itself says."""
+    held = getattr(sweep, sensor)
+    if sensor == "orientation":
+        own = {"rotation": held.sensor_from_image}
+    else:
+        own = {
+            "rotation": held.sensor_from_image.rotation,
+            "translation_mm": held.sensor_from_image.translation,
+            "pixel_mm": np.array([sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm]),
+        }
+    return made(sensor, **({"time_offset_s": held.time_offset_s} | own | changes))
+
+
+@pytest.fixture(scope="session")
+def sweep(bench):
+    return load_sweep(bench / "sweep.h5")
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Write a calibration; returns its path."""
+
+    def write(calibration, name="cal.h5"):
+        write_calibration(tmp_path / name, calibration)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def uncalibrated(bench):
+    """The small sweep without calibrations and with other clock offsets."""
+
+    def forget(path):
+        with h5py.File(path, "r+") as file:
+            del file["orientation"].attrs["sensor_from_image_wxyz"]
+            del file["tracker"].attrs["sensor_from_image"]
+            for name in ("orientation", "tracker"):
+                file[name].attrs["time_offset_s"] = 0.04
+
+    path = bench / "uncalibrated.h5"
+    path.write_bytes((bench / "sweep.h5").read_bytes())
+    forget(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def calibrated_run(bench, sweep, uncalibrated):
+    """A reconstruction whose calibrations all come from files; its folder and what was said on stderr."""
+    options = []
+    for sensor in ("tracker", "orientation"):
+        write_calibration(bench / f"{sensor}-cal.h5", of_sweep(sweep, sensor))
+        options += ["--calibration", bench / f"{sensor}-cal.h5"]
+    arguments = ("reconstruct", uncalibrated, "-o", bench / "calibrated", *MODES, *options)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(StringIO()),
+        redirect_stderr(StringIO()) as said,
+    ):
+        patch.setattr(sys, "argv", ["speckle3d", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leave:
+            cli.main()
+    assert leave.value.code == 0, said.getvalue()
+    return bench / "calibrated", said.getvalue()
+
+
+def test_info_shows_a_calibration(run, saved):
+    code, out, _ = run("info", saved(made()))
+    assert code == 0
+    assert "4 of 9" in out
+    assert "44.220 deg" in out
+    code, out, _ = run("info", saved(made("orientation")), "--json")
+    rows = {row["description"]: row["value"] for row in json.loads(out)}
+    assert (rows["sensor"], rows["verdict"]) == ("orientation", "The motion was sufficient.")
+
+
+def test_calibrations_from_files_do_what_those_in_the_sweep_do(calibrated_run, reconstructed):
+    got, before = (
+        read_reconstruction(folder / "reconstruction.h5").poses
+        for folder in (calibrated_run[0], reconstructed)
+    )
+    assert set(got) == {"image", "orientation", "pose"}
+    for mode, poses in before.items():
+        # The same numbers but for a rotation that went through a matrix.
+        np.testing.assert_allclose(got[mode].as_matrix(), poses.as_matrix(), atol=1e-6)
+
+
+def test_the_files_are_told_in_the_reconstruction_the_summary_and_info(run, calibrated_run, uncalibrated):
+    folder, _ = calibrated_run
+    provenance = read_reconstruction(folder / "reconstruction.h5").provenance
+    paths = {sensor: uncalibrated.parent / f"{sensor}-cal.h5" for sensor in ("tracker", "orientation")}
+    expected = {sensor: (str(path), sha256_of(path)) for sensor, path in paths.items()}
+    assert {one.sensor: (one.path, one.sha256) for one in provenance.calibrations} == expected
+    assert provenance.input_sha256 == sha256_of(uncalibrated)
+    told = json.loads((folder / "summary.json").read_text())["sweeps"][0]["details"]["provenance"]
+    assert {one["sensor"]: (one["path"], one["sha256"]) for one in told["calibrations"]} == expected
+    rows = {
+        r["description"]: r["value"]
+        for r in json.loads(run("info", folder / "reconstruction.h5", "--json")[1])
+    }
+    assert rows["calibration of tracker"] == str(paths["tracker"])
+
+
+def test_volume_and_reslice_still_find_the_sweep(run, calibrated_run, tmp_path):
+    path = calibrated_run[0] / "reconstruction.h5"
+    options = ("--mode", "pose", "--voxel-mm", "0.5")
+    assert run("volume", path, "-o", tmp_path / "v.nrrd", *options)[0] == 0
+    assert run("reslice", path, "-o", tmp_path / "r.png", "--mode", "orientation")[0] == 0
+
+
+def test_another_clock_offset_is_said_but_the_same_pixels_are_not(calibrated_run, sweep):
+    said = calibrated_run[1]
+    assert f"time offset {sweep.orientation.time_offset_s:+.4f} s is used, not the sweep's +0.0400 s" in said
+    assert "pixels" not in said
+
+
+def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_path):
+    """The image turned by 30 degrees about its own normal: the world's poses turn with it."""
+    about_z = Rotation.from_euler("z", 30, degrees=True)
+    own = sweep.tracker.sensor_from_image.rotation
+    path = saved(of_sweep(sweep, "tracker", rotation=own * about_z, time_offset_s=None))
+    options = ("--drift", "pose", "--calibration", path)
+    code, _, err = run("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *options)
+    assert code == 0, err
+    plain = sweep.tracker.world_from_image(sweep.frame_time_s[:1]).rotation
+    first = read_reconstruction(tmp_path / "o" / "reconstruction.h5").poses["pose"][0].rotation
+    # The correction smooths the tracker's jitter of some tenths of a degree.
+    assert np.rad2deg(((plain * about_z).inv() * first).magnitude()) < 2.0
+
+
+def test_pixels_that_differ_are_said(run, sweep, bench, saved, tmp_path):
+    for share, said in ((1.02, True), (1.005, False)):
+        size = np.array([share * sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm])
+        path = saved(of_sweep(sweep, "tracker", pixel_mm=size))
+        code, _, err = run("convert", bench / "sweep.h5", tmp_path / "out.h5", "--calibration", path)
+        assert code == 0
+        assert ("found pixels of" in err) == said
+
+
+@pytest.mark.parametrize("sensor", ["tracker", "orientation"])
+def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, saved, tmp_path, sensor):
+    path = saved(made(sensor))
+    code, _, err = run("convert", uncalibrated, tmp_path / "out.h5", "--calibration", path)
+    assert code == 0, err
+    before, got = load_sweep(uncalibrated), load_sweep(tmp_path / "out.h5")
+    mounting = getattr(got, sensor).sensor_from_image
+    rotation = mounting.rotation if sensor == "tracker" else mounting
+    assert (rotation.inv() * made().rotation).magnitude() < 1e-9
+    assert getattr(got, sensor).time_offset_s == -0.0125
+    other = {"tracker": "orientation", "orientation": "tracker"}[sensor]
+    assert getattr(got, other).sensor_from_image is None
+    # RF says itself how far apart its samples are.
+    assert got.grid == before.grid
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """B-mode images as PLUS writes them: poses of the probe, no pixel size."""
+    return write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2])
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ((), (0.137, 0.138)),
+        (("--column-pitch-mm", "0.2"), (0.2, 0.138)),
+        (("--row-spacing-mm", "0.3"), (0.137, 0.3)),
+        (("--column-pitch-mm", "0.2", "--row-spacing-mm", "0.3"), (0.2, 0.3)),
+    ],
+)
+def test_images_get_the_fitted_pixels_unless_given(run, sequence, saved, tmp_path, options, expected):
+    arguments = (sequence, tmp_path / "out.h5", "--dynamic-range-db", "60", *options)
+    code, _, err = run("convert", *arguments, "--calibration", saved(made()))
+    assert code == 0, err
+    got = load_sweep(tmp_path / "out.h5")
+    assert (got.grid.vector_pitch_mm, got.grid.sample_spacing_mm) == expected
+    np.testing.assert_allclose(
+        got.tracker.sensor_from_image.as_matrix(), made().sensor_from_image.as_matrix(), atol=1e-12
+    )
+    assert ("found pixels of" in err) == bool(options)
+
+
+def test_fitted_pixels_go_before_those_of_a_sweep_file_of_images(run, saved, tmp_path):
+    write_sweep(tmp_path / "in.h5", sweep_examples.bmode_sweep())
+    options = ("--calibration", saved(made()))
+    assert run("convert", tmp_path / "in.h5", tmp_path / "out.h5", *options)[0] == 0
+    grid = load_sweep(tmp_path / "out.h5").grid
+    assert (grid.vector_pitch_mm, grid.sample_spacing_mm) == (0.137, 0.138)
+    assert (
+        run("convert", tmp_path / "in.h5", tmp_path / "turn.h5", "--calibration", saved(made("orientation")))[
+            0
+        ]
+        == 0
+    )
+    assert load_sweep(tmp_path / "turn.h5").grid == sweep_examples.bmode_sweep().grid
+
+
+def test_calibrations_that_do_not_fit_are_refused(refused, bench, saved, sequence, tmp_path):
+    sweep, out = bench / "sweep.h5", tmp_path / "o"
+    turn, place, again = saved(made("orientation"), "turn.h5"), saved(made()), saved(made(), "again.h5")
+    message = refused("convert", sequence, out, "--dynamic-range-db", "60", "--column-pitch-mm", "0.1",
+                      "--row-spacing-mm", "0.1", "--calibration", turn)  # fmt: skip
+    assert "turn.h5: a: expected the calibration's sensor, of orientation, got none" in message
+    for names in (("convert", sweep, out), ("reconstruct", sweep, "-o", out)):
+        message = refused(*names, "--calibration", place, "--calibration", again)
+        assert "again.h5: expected one calibration for a sensor" in message
+        assert "expected format 'speckle3d.calibration'" in refused(
+            *names, "--calibration", bench / "curves.h5"
+        )
+        assert "none.h5: expected a file, got none" in refused(*names, "--calibration", tmp_path / "none.h5")
+        with_nothing = saved(replace(made("orientation"), sensor="tracker"), "short.h5")
+        message = refused(*names, "--calibration", with_nothing)
+        assert "short.h5: expected a calibration with a translation" in message
+
+
+def test_a_calibration_for_a_sensor_that_the_sweep_lacks(refused, changed, saved, tmp_path):
+    def forget(file):
+        del file["tracker"]
+
+    message = refused("reconstruct", changed(forget), "-o", tmp_path / "o", "--calibration", saved(made()))
+    assert "cal.h5: sweep: expected the calibration's sensor, a tracker, got none" in message
+
+
+def test_in_python_it_is_two_calls(sweep, saved):
+    import speckle3d
+
+    calibration = speckle3d.load_calibration(saved(made()))
+    got = speckle3d.calibrated(replace(sweep, truth=None), calibration)
+    assert isinstance(calibration, speckle3d.Calibration)
+    assert got.tracker.time_offset_s == -0.0125

@@ -1,0 +1,98 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sweep_examples
+from calibration_files import ROTATION, made
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.calibration import calibrated, pixel_difference
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.sweep import ImageGrid
+
+
+def test_a_trackers_calibration_goes_on_the_tracker_and_nothing_else():
+    sweep, calibration = sweep_examples.rf_sweep(), made()
+    got = calibrated(sweep, calibration)
+    expected = RigidTransform.from_components([-270.86, 4.86, -65.08], ROTATION)
+    np.testing.assert_allclose(got.tracker.sensor_from_image.as_matrix(), expected.as_matrix())
+    assert got.tracker.time_offset_s == -0.0125
+    assert got.tracker.readings is sweep.tracker.readings
+    assert replace(got, tracker=None) == replace(sweep, tracker=None)
+
+
+def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():
+    sweep = calibrated(sweep_examples.rf_sweep(), made(time_offset_s=0.0))
+    time_s = sweep.tracker.readings.time_s[4]
+    world_from_sensor = sweep.tracker.readings.world_from_sensor[4].as_matrix()
+    column, row = 3.0, 7.0
+    expected = world_from_sensor @ made().pixel_matrix() @ [column, row, 0.0, 1.0]
+    got = sweep.tracker.world_from_image(time_s).apply([0.137 * column, 0.138 * row, 0.0])
+    np.testing.assert_allclose(got, expected[:3], atol=1e-9)
+
+
+def test_an_orientation_sensors_calibration_goes_on_that_sensor_and_nothing_else():
+    sweep = sweep_examples.rf_sweep()
+    got = calibrated(sweep, made("orientation"))
+    assert (got.orientation.sensor_from_image.inv() * ROTATION).magnitude() < 1e-12
+    assert got.orientation.time_offset_s == -0.0125
+    assert got.orientation.accelerometer_m_s2 is sweep.orientation.accelerometer_m_s2
+    assert replace(got, orientation=None) == replace(sweep, orientation=None)
+
+
+@pytest.mark.parametrize("sensor", ["tracker", "orientation"])
+def test_an_unknown_clock_offset_leaves_the_sweeps_own(sensor):
+    sweep = sweep_examples.rf_sweep()
+    got = calibrated(sweep, made(sensor, time_offset_s=None))
+    assert getattr(got, sensor).time_offset_s == getattr(sweep, sensor).time_offset_s != 0.0
+
+
+@pytest.mark.parametrize("sensor", ["tracker", "orientation"])
+def test_a_sweep_without_the_sensor_is_refused(sensor):
+    sweep = replace(sweep_examples.rf_sweep(), **{sensor: None})
+    with pytest.raises(
+        MismatchError, match=f"example: expected the calibration's sensor, .*{sensor}, got no"
+    ):
+        calibrated(sweep, made(sensor))
+
+
+def test_a_tracker_needs_a_translation():
+    turn = replace(made("orientation"), sensor="tracker")
+    with pytest.raises(InsufficientDataError, match="expected a calibration with a translation"):
+        calibrated(sweep_examples.rf_sweep(), turn)
+
+
+@pytest.mark.parametrize(
+    ("pixel_mm", "expected"),
+    [((0.1, 0.2), 0.0), ((0.103, 0.2), 0.03), ((0.1, 0.19), 0.05), ((0.102, 0.204), 0.02)],
+)
+def test_pixels_are_compared_by_the_worse_axis(pixel_mm, expected):
+    grid = ImageGrid(10, 20, 0.1, 0.2)
+    assert pixel_difference(grid, made(pixel_mm=np.array(pixel_mm))) == pytest.approx(expected, abs=1e-12)
+    assert pixel_difference(grid, made("orientation")) == 0.0
+
+
+def test_reasons_are_counted_most_frequent_first():
+    assert list(made().frames.reasons().items()) == [("no line", 2), ("contradicts the others", 1)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sensor": "camera"}, "sensor: expected one of tracker, orientation, got 'camera'"),
+        ({"covariance": np.eye(3)}, r"covariance: expected shape \(6, 6\), got \(3, 3\)"),
+        ({"translation_mm": None}, r"covariance: expected shape \(3, 3\), got \(6, 6\)"),
+        ({"pixel_mm": np.array([0.1, -0.1])}, "pixel_mm: expected values above zero"),
+        ({"pixel_mm": np.array([np.nan, 0.1])}, "pixel_mm: expected values above zero"),
+    ],
+)
+def test_what_cannot_be_a_calibration_is_refused(changes, message):
+    with pytest.raises(InvalidInputError, match=message):
+        replace(made(), **changes)
+
+
+def test_a_matrix_in_pixels_needs_a_pixel_size_and_a_translation():
+    with pytest.raises(InsufficientDataError, match="pixel size"):
+        made(pixel_mm=None).pixel_matrix()
+    with pytest.raises(InsufficientDataError, match="translation"):
+        _ = made("orientation").sensor_from_image

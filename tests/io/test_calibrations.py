@@ -1,0 +1,293 @@
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import sweep_examples
+from calibration_files import made
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, Speckle3DError
+from speckle3d.io.calibrations import apply_calibrations, read_calibration, write_calibration
+from speckle3d.io.hdf5 import sha256_of
+from speckle3d.io.load import describe
+
+PLAIN = ("method", "sensor", "parameters", "rms", "rms_unit", "condition_number", "frames", "time_offset_s",
+         "verdict", "source")  # fmt: skip
+
+# HDF5 holds no NUL and UTF-8 no surrogates.
+texts = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
+numbers = st.floats(-1e6, 1e6)
+spreads = st.one_of(st.floats(0, 1e6), st.just(np.inf))
+
+
+def array(size, elements=numbers):
+    return st.lists(elements, min_size=size, max_size=size).map(np.array)
+
+
+@st.composite
+def frames_used(draw):
+    given = draw(st.integers(0, 30))
+    used = draw(st.sets(st.integers(0, given - 1))) if given else set()
+    left = sorted(set(range(given)) - used)
+    return FramesUsed(given, tuple(sorted(used)), {n: draw(texts) for n in left if draw(st.booleans())})
+
+
+@st.composite
+def calibrations(draw):
+    turned = draw(st.booleans())
+    size = 3 if turned else 6
+    root = draw(array(size * size, st.floats(-10, 10))).reshape(size, size)
+    return Calibration(
+        method=draw(texts),
+        sensor="orientation" if turned else "tracker",
+        rotation=Rotation.random(rng=np.random.default_rng(draw(st.integers(0, 2**32 - 1)))),
+        translation_mm=None if turned else draw(array(3)),
+        pixel_mm=draw(st.none() | array(2, st.floats(1e-6, 10))),
+        covariance=root @ root.T,
+        parameters=tuple(draw(st.lists(st.builds(Parameter, texts, numbers, spreads, texts), max_size=4))),
+        rms=draw(st.floats(0, 1e6)),
+        rms_unit=draw(texts),
+        condition_number=draw(st.one_of(st.floats(1, 1e12), st.just(np.inf))),
+        frames=draw(frames_used()),
+        time_offset_s=draw(st.none() | st.floats(-10, 10)),
+        verdict=draw(texts),
+        source=draw(st.builds(Source, texts, texts, texts, texts)),
+    )
+
+
+def require_same(got, written):
+    for name in PLAIN:
+        assert getattr(got, name) == getattr(written, name), name
+    for name in ("translation_mm", "pixel_mm", "covariance"):
+        a, b = getattr(got, name), getattr(written, name)
+        assert (a is None) == (b is None), name
+        if a is not None:
+            np.testing.assert_array_equal(a, b)
+    # A matrix of rounded numbers is made a rotation again: a few times the precision of a double.
+    assert (got.rotation.inv() * written.rotation).magnitude() < 1e-14 * 100
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_calibration(tmp_path / "cal.h5", made())
+    return tmp_path / "cal.h5"
+
+
+@settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(written=calibrations())
+def test_a_calibration_comes_back(tmp_path, written):
+    write_calibration(tmp_path / "c.h5", written)
+    require_same(read_calibration(tmp_path / "c.h5"), written)
+
+
+def test_nothing_is_left_where_writing_fails(tmp_path):
+    with pytest.raises(FileError, match="nowhere"):
+        write_calibration(tmp_path / "nowhere" / "c.h5", made())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_older_file_stays_whole_when_writing_fails(path):
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        write_calibration(path, made(rms=object()))
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["covariance", "parameters/name", "parameters/value", "parameters/standard_error", "parameters/unit",
+     "frames/used", "frames/dropped", "frames/reason"],
+)  # fmt: skip
+def test_a_missing_data_set_is_named(path, name):
+    with h5py.File(path, "r+") as file:
+        del file[name]
+    with pytest.raises(InvalidInputError, match=rf"cal\.h5: /{name}: expected a data set, got none"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize("name", ["parameters", "frames", "source"])
+def test_a_missing_group_is_named(path, name):
+    with h5py.File(path, "r+") as file:
+        del file[name]
+    with pytest.raises(InvalidInputError, match=rf"cal\.h5: /{name}: expected a group, got none"):
+        read_calibration(path)
+
+
+def test_a_file_without_a_mounting_is_refused(path):
+    with h5py.File(path, "r+") as file:
+        del file["sensor_from_image"]
+    with pytest.raises(InvalidInputError, match=r"cal\.h5: /sensor_from_image_wxyz: expected a data set"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("node", "name"),
+    [(node, name)
+     for node, names in {"/": ("method", "sensor", "rms", "rms_unit", "condition_number", "verdict", "format",
+                               "version"),
+                         "frames": ("given",),
+                         "source": ("input_path", "input_sha256", "package_version", "settings_json")}.items()
+     for name in names],
+)  # fmt: skip
+def test_a_missing_attribute_is_named(path, node, name):
+    with h5py.File(path, "r+") as file:
+        del file[node].attrs[name]
+    with pytest.raises(InvalidInputError, match=name) as error:
+        read_calibration(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("sensor_from_image", lambda a: 1.01 * a, r"/sensor_from_image.*: expected a rigid 4x4 matrix"),
+        (
+            "sensor_from_image",
+            lambda a: a @ np.diag([1, 1, -1, 1]),
+            r"/sensor_from_image.*: expected a rigid",
+        ),
+        ("sensor_from_image", lambda a: a * np.nan, "/sensor_from_image.*: expected a finite value"),
+        ("sensor_from_image", lambda a: a[:3], r"/sensor_from_image: expected shape \(4, 4\), got \(3, 4\)"),
+        ("pixel_mm", lambda a: -a, "pixel_mm: expected values above zero"),
+        ("pixel_mm", lambda a: a[:1], r"/pixel_mm: expected shape \(2,\), got \(1,\)"),
+        ("covariance", lambda a: a[:3, :3], r"/covariance: expected shape \(6, 6\), got \(3, 3\)"),
+        ("covariance", lambda a: -a, r"/covariance\[0\]: expected zero or a value above it"),
+        ("covariance", lambda a: a + np.nan, "/covariance"),
+        ("covariance", lambda a: np.where(np.eye(6), a, np.nan), "/covariance: expected numbers, got NaN"),
+        ("parameters/value", lambda a: a * np.nan, r"/parameters/value\[0\]: expected a finite value"),
+        (
+            "parameters/value",
+            lambda a: a[:1],
+            r"/parameters/standard_error: expected shape \(1,\), got \(2,\)",
+        ),
+        ("parameters/standard_error", lambda a: -a, r"/parameters/standard_error\[0\]: expected zero or"),
+        ("parameters/name", lambda a: a[:1], "/parameters/name: expected 2 texts"),
+        ("parameters/name", lambda a: np.arange(2), "/parameters/name: expected 2 texts"),
+        ("frames/used", lambda a: a + 5, r"/frames/used\[2\]: expected a frame among 9, got 9"),
+        ("frames/dropped", lambda a: -a, r"/frames/dropped\[0\]: expected a frame among 9, got -2"),
+        ("frames/used", lambda a: a + 0.5, "/frames/used: expected numbers of type int64"),
+        ("frames/reason", lambda a: a[:1], "/frames/reason: expected 3 texts"),
+    ],
+)
+def test_what_is_wrong_is_said_with_the_file(path, name, change, message):
+    with h5py.File(path, "r+") as file:
+        spoiled = change(file[name][()])
+        del file[name]
+        file[name] = spoiled
+    with pytest.raises(InvalidInputError, match=message) as error:
+        read_calibration(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_quaternion_must_be_of_length_one(path):
+    write_calibration(path, made("orientation"))
+    with h5py.File(path, "r+") as file:
+        file["sensor_from_image_wxyz"][0] = 2.0
+    with pytest.raises(InvalidInputError, match=r"/sensor_from_image_wxyz.*: expected a unit quaternion"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("sensor", "camera", "sensor: expected one of tracker, orientation, got 'camera'"),
+        ("format", "speckle3d.sweep", r"expected format 'speckle3d\.calibration', got 'speckle3d\.sweep'"),
+        ("version", 2, "version 1, got 2"),
+        ("rms", np.nan, "rms: expected finite"),
+        ("rms", "small", "rms: expected 1 number"),
+        ("condition_number", np.nan, "condition_number: expected a number"),
+        ("condition_number", "good", "condition_number: expected a number"),
+        ("condition_number", [1.0, 2.0], "condition_number: expected a number"),
+        ("time_offset_s", np.inf, "time_offset_s: expected finite"),
+        ("verdict", 1, "verdict"),
+    ],
+)
+def test_an_attribute_that_is_wrong_is_named(path, name, value, message):
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+    with pytest.raises(InvalidInputError, match=message) as error:
+        read_calibration(path)
+    assert str(path) in str(error.value)
+
+
+def test_files_that_are_not_calibrations(tmp_path):
+    with pytest.raises(FileError, match="expected a file, got none"):
+        read_calibration(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("calibration")
+    with pytest.raises(FileError, match="expected an HDF5 file"):
+        read_calibration(tmp_path / "text.h5")
+
+
+@settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_damaged_file_is_an_error_of_one_line_or_harmless(path, tmp_path, data):
+    whole = path.read_bytes()
+    damaged = bytearray(whole[: data.draw(st.sampled_from([len(whole), len(whole) // 2, 600]))])
+    for _ in range(data.draw(st.integers(1, 4))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    (tmp_path / "damaged.h5").write_bytes(damaged)
+    try:
+        read_calibration(tmp_path / "damaged.h5")
+        describe(tmp_path / "damaged.h5")
+    except Speckle3DError as error:
+        message = str(error)
+        assert "\n" not in message
+
+
+def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):
+    turn = path.with_name("turn.h5")
+    write_calibration(turn, made("orientation"))
+    sweep, held = apply_calibrations(sweep_examples.rf_sweep(), [path, turn])
+    assert (sweep.tracker.sensor_from_image.rotation.inv() * made().rotation).magnitude() < 1e-12
+    assert (sweep.orientation.sensor_from_image.inv() * made().rotation).magnitude() < 1e-12
+    assert [(one.sensor, one.path, one.sha256) for one in held] == [
+        ("tracker", str(path), sha256_of(path)),
+        ("orientation", str(turn), sha256_of(turn)),
+    ]
+
+
+def test_two_for_one_sensor_or_one_for_none_are_refused_with_the_file(path):
+    again = path.with_name("again.h5")
+    write_calibration(again, made())
+    with pytest.raises(
+        MismatchError, match=r"again\.h5: expected one calibration for a sensor, got .*cal\.h5"
+    ):
+        apply_calibrations(sweep_examples.rf_sweep(), [path, again])
+    with pytest.raises(MismatchError, match=r"cal\.h5: example: expected the calibration's sensor"):
+        apply_calibrations(replace(sweep_examples.rf_sweep(), tracker=None), [path])
+
+
+def test_a_trackers_calibration_is_described_for_people(path):
+    rows = {name: (value, unit) for name, value, unit in describe(path)}
+    assert rows["format"] == ("speckle3d.calibration", "")
+    assert rows["sensor"] == ("tracker", "")
+    angles = [rows[f"sensor_from_image {name}"] for name in ("roll", "yaw", "tilt")]
+    assert angles == [("-0.550", "deg"), ("44.220", "deg"), ("-90.370", "deg")]
+    assert rows["sensor_from_image x, y, z"] == ("-270.860, 4.860, -65.080", "mm")
+    # 0.002, 0.003 and 0.004 rad.
+    assert rows["standard error, tilt, yaw, roll"] == ("0.115, 0.172, 0.229", "deg")
+    assert rows["standard error along the image's x, y, z"] == ("0.100, 0.200, 0.300", "mm")
+    assert rows["pixel"] == ("0.13700 x 0.13800", "mm")
+    assert rows["parameter s_x"] == ("0.13700 +- 0.00004", "mm/pixel")
+    assert rows["parameter gamma"] == ("28.648 +- 0.573", "deg")
+    assert rows["RMS residual"] == ("0.850", "mm")
+    assert rows["condition number"] == ("211.0", "")
+    assert rows["time offset"] == ("-0.0125", "s")
+    assert rows["frames used"] == ("4 of 9", "")
+    assert rows["dropped: no line"] == ("2", "frames")
+    assert rows["verdict"] == ("The motion was sufficient.", "")
+    assert rows["input"] == ("plane.mha", "")
+
+
+def test_an_orientation_sensors_calibration_has_no_place_to_describe(path):
+    write_calibration(path, made("orientation", time_offset_s=None))
+    rows = {name: (value, unit) for name, value, unit in describe(path)}
+    assert rows["RMS residual"] == ("0.573", "deg")
+    assert rows["time offset"] == ("unknown", "")
+    assert not [name for name in rows if "x, y, z" in name or name == "pixel"]
