@@ -24,7 +24,9 @@ def made(sensor="tracker", **changes):
         rms=0.85,
         rms_unit="mm",
         condition_number=211.0,
-        frames=FramesUsed(9, (0, 1, 4, 8), {2: "no line", 3: "no line", 5: "contradicts the others"}),
+        frames=FramesUsed(
+            9, (0, 1, 4, 8), {2: "no line: 3 of 9", 3: "no line: 4 of 9", 5: "contradicts by 2.5 mm"}
+        ),
         time_offset_s=-0.0125,
         verdict="The motion was sufficient.",
         source=Source("plane.mha", "ab" * 32, "0.1.0", '{"columns": 64}'),

@@ -13,7 +13,7 @@ from speckle3d.cli.common import note
 
 if TYPE_CHECKING:
     from speckle3d.core.calibration import Calibration
-    from speckle3d.core.sweep import Sweep
+    from speckle3d.core.sweep import ImageGrid, Sweep
 
 CalibrationFiles = Annotated[
     list[Path] | None,
@@ -55,21 +55,35 @@ def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
 
     if not isinstance(sweep.signal, BModeSettings):
         return sweep
-    names = {"column_pitch_mm": "vector_pitch_mm", "row_spacing_mm": "sample_spacing_mm"}
-    changed = {names[name]: size for name, size in sizes.items()}
-    return replace(sweep, grid=replace(sweep.grid, **changed))  # type: ignore[arg-type]
+    grid = sweep.grid
+    column_mm = sizes.get("column_pitch_mm", grid.vector_pitch_mm)
+    row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
+    # A calibration counts rows from the probe's face, also those above the first that is stored.
+    first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
+    resized = replace(
+        grid, vector_pitch_mm=column_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm
+    )
+    return replace(sweep, grid=resized)
 
 
 def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> None:
     from speckle3d.core.calibration import pixel_difference
 
-    grid, pixel_mm = sweep.grid, calibration.pixel_mm
+    grid, pixel_mm = _image_grid(sweep), calibration.pixel_mm
     if pixel_mm is not None and pixel_difference(grid, calibration) > NOTED_SIZE:
         note(
             f"{path}: found pixels of {pixel_mm[0]:.4g} x {pixel_mm[1]:.4g} mm, "
-            f"the sweep's are {grid.vector_pitch_mm:.4g} x {grid.sample_spacing_mm:.4g} mm and stay so"
+            f"those of the sweep's images are {grid.vector_pitch_mm:.4g} x {grid.sample_spacing_mm:.4g} mm"
+            " and stay so"
         )
     sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
     held_s, found_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
     if held_s and found_s is not None and abs(found_s - held_s) > NOTED_OFFSET_S:
         note(f"{path}: time offset {found_s:+.4f} s is used, not the sweep's {held_s:+.4f} s")
+
+
+def _image_grid(sweep: Sweep) -> ImageGrid:
+    """Grid of the images, in which a calibration counts pixels: from RF they are made with fewer samples."""
+    from speckle3d.motion.intensity import IntensityExtractor
+
+    return IntensityExtractor.for_sweep(sweep).grid

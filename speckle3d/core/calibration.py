@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,11 +44,12 @@ class FramesUsed:
     dropped: dict[int, str] = field(default_factory=dict)
 
     def reasons(self) -> dict[str, int]:
-        """How many frames were dropped for each reason, most frequent first."""
-        counted: dict[str, int] = {}
-        for reason in self.dropped.values():
-            counted[reason] = counted.get(reason, 0) + 1
-        return dict(sorted(counted.items(), key=lambda item: -item[1]))
+        """How many frames were dropped for each reason, most frequent first.
+
+        A reason counts without its details, after a colon or "by", which differ from frame to frame.
+        """
+        plain = (reason.split(":")[0].split(" by ")[0] for reason in self.dropped.values())
+        return dict(Counter(plain).most_common())
 
 
 @dataclass(frozen=True)

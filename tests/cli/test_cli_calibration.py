@@ -20,8 +20,15 @@ from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.study.images import GreyImages
 
 MODES = ("--drift", "orientation", "--drift", "pose")
+
+
+def pixels_of(sweep):
+    """Those of the images made from RF, as a calibration sees them."""
+    grid = GreyImages(sweep, 60.0).grid
+    return np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
 
 
 def of_sweep(sweep, sensor, **changes):
@@ -33,7 +40,7 @@ def of_sweep(sweep, sensor, **changes):
         own = {
             "rotation": held.sensor_from_image.rotation,
             "translation_mm": held.sensor_from_image.translation,
-            "pixel_mm": np.array([sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm]),
+            "pixel_mm": pixels_of(sweep),
         }
     return made(sensor, **({"time_offset_s": held.time_offset_s} | own | changes))
 
@@ -138,7 +145,7 @@ def test_volume_and_reslice_still_find_the_sweep(run, calibrated_run, tmp_path):
 def test_another_clock_offset_is_said_but_the_same_pixels_are_not(calibrated_run, sweep):
     said = calibrated_run[1]
     assert f"time offset {sweep.orientation.time_offset_s:+.4f} s is used, not the sweep's +0.0400 s" in said
-    assert "pixels" not in said
+    assert "found pixels" not in said
 
 
 def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_path):
@@ -157,8 +164,7 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_
 
 def test_pixels_that_differ_are_said(run, sweep, bench, saved, tmp_path):
     for share, said in ((1.02, True), (1.005, False)):
-        size = np.array([share * sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm])
-        path = saved(of_sweep(sweep, "tracker", pixel_mm=size))
+        path = saved(of_sweep(sweep, "tracker", pixel_mm=pixels_of(sweep) * [1.0, share]))
         code, _, err = run("convert", bench / "sweep.h5", tmp_path / "out.h5", "--calibration", path)
         assert code == 0
         assert ("found pixels of" in err) == said
@@ -208,18 +214,17 @@ def test_images_get_the_fitted_pixels_unless_given(run, sequence, saved, tmp_pat
 
 
 def test_fitted_pixels_go_before_those_of_a_sweep_file_of_images(run, saved, tmp_path):
-    write_sweep(tmp_path / "in.h5", sweep_examples.bmode_sweep())
-    options = ("--calibration", saved(made()))
-    assert run("convert", tmp_path / "in.h5", tmp_path / "out.h5", *options)[0] == 0
-    grid = load_sweep(tmp_path / "out.h5").grid
+    source, out = tmp_path / "in.h5", tmp_path / "out.h5"
+    held = sweep_examples.bmode_sweep()
+    write_sweep(source, replace(held, grid=replace(held.grid, first_sample_depth_mm=0.9)))
+    code, _, err = run("convert", source, out, "--calibration", saved(made()))
+    assert (code, "found pixels" in err) == (0, False)
+    grid = load_sweep(out).grid
+    # Ten rows of 0.09 mm above the first stored one become ten rows of 0.138 mm.
     assert (grid.vector_pitch_mm, grid.sample_spacing_mm) == (0.137, 0.138)
-    assert (
-        run("convert", tmp_path / "in.h5", tmp_path / "turn.h5", "--calibration", saved(made("orientation")))[
-            0
-        ]
-        == 0
-    )
-    assert load_sweep(tmp_path / "turn.h5").grid == sweep_examples.bmode_sweep().grid
+    assert grid.first_sample_depth_mm == pytest.approx(1.38)
+    assert run("convert", source, out, "--calibration", saved(made("orientation")))[0] == 0
+    assert load_sweep(out).grid == load_sweep(source).grid
 
 
 def test_calibrations_that_do_not_fit_are_refused(refused, bench, saved, sequence, tmp_path):
