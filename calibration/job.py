@@ -18,7 +18,7 @@ from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
 from calibration.report import Shot
 from calibration.results import as_calibration
 from calibration.solution import Solution
-from calibration.wires import calibrate_crossing, calibrate_wires
+from calibration.wires import Registration, calibrate_crossing, calibrate_wires
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
@@ -177,13 +177,13 @@ def wires_job(
     job: Job,
     phantom: WirePhantom,
     fit_pixels: bool = True,
-    fit_registration: bool = False,
+    registration: Registration = "turned",
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes."""
 
     def calibrate(points: ImagePoints) -> Solution:
         return calibrate_wires(
-            points, phantom, recording.pixel_mm, fit_pixels, fit_registration, job.outlier_sigma
+            points, phantom, recording.pixel_mm, fit_pixels, registration, job.outlier_sigma
         )
 
     return _finished(recording, seen, job, calibrate, "n-wire" if phantom.n_shapes else "three-wire")

@@ -69,9 +69,10 @@ class LineSettings(BaseModel):
         0.7, gt=0, le=1, description="Part that must agree of the columns whose region the line meets."
     )
     place: Place = Field(
-        "front",
-        description="Where on an echo the line is put: where it has risen half way, where the smoothed image "
-        "is steepest (up to smoothing_mm above a thin echo), or where it is brightest.",
+        "peak",
+        description="Where on an echo the line is put: where it has risen half way (front), where the "
+        "smoothed image is steepest (slope; up to smoothing_mm above a thin echo), or where it is brightest "
+        "(peak; a beam met by a wall at an angle has its middle there, its nearer edge at the front).",
     )
 
 

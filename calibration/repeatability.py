@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.chain import Chain, ImagePoints, Phantom
+from calibration.chain import Chain, ImagePoints, residuals_and_jacobian
 from calibration.plane import solve
 from calibration.solution import Solution
 from speckle3d.core.calibration import Calibration
@@ -94,17 +94,37 @@ def _centre_and_corners(calibration: Calibration, size_px: tuple[int, int]) -> F
     return np.asarray((flat @ calibration.pixel_matrix().T)[:, :3])
 
 
-def validate(chain: Chain, phantom: Phantom, points: ImagePoints) -> Solution:
-    """Hold a calibration and see how well it explains another recording; only the phantom's place is fitted.
+@dataclass(frozen=True)
+class Validation:
+    """How well a calibration explains a recording that it was not made from.
 
-    Returns
-    -------
-    Solution
-        Its `rms` is the error on the validation set, no frame left out.
+    Attributes
+    ----------
+    residuals : ndarray, shape (n, r)
+        Of all points, none left out, mm.
+    """
+
+    chain: Chain
+    residuals: FloatArray
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+
+def validate(solution: Solution, points: ImagePoints) -> Validation:
+    """Hold a calibration and see how well it explains another recording.
+
+    A plane is found anew, for it may be another; wires are held where they were.
 
     Raises
     ------
     InsufficientDataError
-        If the recording is too short to find the phantom in.
+        If the recording is too short to find the plane in.
     """
-    return solve(points, phantom, chain, probe=(), outlier_sigma=np.inf)
+    chain, phantom = solution.chain, solution.phantom
+    if phantom.seen_as == "line":
+        found = solve(points, phantom, chain, probe=(), outlier_sigma=np.inf)
+        return Validation(found.chain, found.residuals)
+    return Validation(chain, residuals_and_jacobian(chain.parameters(), points, phantom)[0])

@@ -76,13 +76,17 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
     if beam:
-        lines += ["", "On a bare wall the thickness of the beam puts the image too near to the probe, by"]
+        lines += ["", "On a bare wall, lines at the first echo put the image too near to the probe, by"]
         lines += [
             f"  {abs(one.simulated_mm[1]):.2f} mm if the beam is {one.width_mm:g} mm thick "
             f"(closed form {abs(one.closed_form_mm):.2f} mm; it leaves an RMS of {one.rms_mm:.3f} mm)"
             for one in beam
         ]
-        lines.append("A thin bar that stays in the middle of the beam does not have this bias.")
+        lines += [
+            "Lines at the brightest part of the echo (--place peak) have little of this bias, a thin bar that "
+            "stays in",
+            "the middle of the beam has none.",
+        ]
     return "\n".join([*lines, *(["", *notes] if notes else [])]) + "\n"
 
 

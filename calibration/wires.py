@@ -9,7 +9,8 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -23,6 +24,9 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray, rotation_from_axes
 from speckle3d.core.wires import WirePhantom
 
+Registration = Literal["held", "turned", "free"]
+
+_ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}
 _FEWEST_FRAMES = 6
 _STARTS = 6
 
@@ -47,18 +51,13 @@ class Wires:
     Parameters
     ----------
     geometry : WirePhantom
-    registered : bool
-        The phantom's place in the tracker's world is known and held; else it is estimated.
+    determined : tuple of str
+        What of the phantom's place in the tracker's world is estimated; the rest is held.
     """
 
     geometry: WirePhantom
-    registered: bool
-    seen_as: Seen = field(default="dot")
-
-    @property
-    def determined(self) -> tuple[str, ...]:
-        """All of `TARGET`, unless the phantom is registered."""
-        return () if self.registered else TARGET
+    determined: tuple[str, ...] = TARGET
+    seen_as: Seen = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the wire, along two directions across it."""
@@ -99,7 +98,7 @@ def calibrate_wires(
     geometry: WirePhantom,
     pixel_mm: FloatArray | None = None,
     fit_pixels: bool = True,
-    fit_registration: bool = False,
+    registration: Registration = "turned",
     outlier_sigma: float = OUTLIER_SIGMA,
 ) -> Solution:
     """Calibrate a 6-DOF sensor from dots on straight wires.
@@ -109,28 +108,50 @@ def calibrate_wires(
     points : ImagePoints
         With the wire each lies on.
     geometry : WirePhantom
-        If it says where it is in the tracker's world that is held, unless `fit_registration`; the three-wire
-        phantom's place is always estimated (fourteen parameters).
+        Where it does not say where it is in the tracker's world, that is estimated, too: fourteen parameters
+        in all, as for the three-wire phantom.
+    registration : {"held", "turned", "free"}
+        What to do with a place that `geometry` says: hold it; hold the wires' middle and estimate how the
+        phantom is turned about it; or estimate all. Stylus registrations find a place to half a millimetre,
+        and, over 50 mm, a turn only to a degree.
 
     Raises
     ------
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
-    place = geometry.world_from_phantom
-    phantom = Wires(geometry, registered=place is not None and not fit_registration)
+    if registration not in _ESTIMATED:
+        raise InvalidInputError(
+            f"registration: expected one of {', '.join(_ESTIMATED)}, got {registration!r}"
+        )
+    centred = _about_middle(geometry)
+    place = centred.world_from_phantom
     if place is not None:
+        phantom = Wires(centred, _ESTIMATED[registration])
         start = _linear_start(points, phantom, place.inv(), fitted=False)[0]
     else:
-        few = some(points)
-        tried = [_linear_start(few, phantom, turn, fitted=True) for turn in rotations_all_over()]
-        best = sorted(tried, key=lambda one: one[1])[:_STARTS]
-        probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
-        settled = [
-            solve(few, phantom, _sized(chain, pixel_mm, fit_pixels), probe, np.inf) for chain, _ in best
-        ]
-        start = min(settled, key=lambda solution: solution.sigma).chain
+        phantom = Wires(centred)
+        start = _anywhere(some(points), phantom, pixel_mm, fit_pixels)
     return _finished(points, phantom, start, pixel_mm, fit_pixels, outlier_sigma)
+
+
+def _about_middle(geometry: WirePhantom) -> WirePhantom:
+    """The same wires in a frame whose origin is the middle of them, about which the phantom may be turned."""
+    ends = geometry.points_mm if geometry.ends_mm is None else geometry.ends_mm.reshape(-1, 3)
+    middle = ends.mean(axis=0)
+    place = geometry.world_from_phantom
+    moved = None if place is None else place * RigidTransform.from_translation(middle)
+    shifted = None if geometry.ends_mm is None else geometry.ends_mm - middle
+    return replace(geometry, points_mm=geometry.points_mm - middle, ends_mm=shifted, world_from_phantom=moved)
+
+
+def _anywhere(few: ImagePoints, phantom: Wires, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
+    """Best start with the phantom turned every way there is."""
+    tried = [_linear_start(few, phantom, turn, fitted=True) for turn in rotations_all_over()]
+    best = sorted(tried, key=lambda one: one[1])[:_STARTS]
+    probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
+    settled = [solve(few, phantom, _sized(chain, pixel_mm, fit_pixels), probe, np.inf) for chain, _ in best]
+    return min(settled, key=lambda solution: solution.sigma).chain
 
 
 def _finished(

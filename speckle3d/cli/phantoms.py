@@ -14,6 +14,7 @@ from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
+    from calibration.chain import ImagePoints
     from calibration.job import Job, Outcome, Recording, Seen
     from calibration.lines import LineSettings
     from speckle3d.core.geometry import FloatArray
@@ -64,6 +65,14 @@ class Reflector(StrEnum):
 
     wall = "wall"
     bar = "bar"
+
+
+class Registration(StrEnum):
+    """What to do with the place of a wire phantom that a configuration says."""
+
+    held = "held"
+    turned = "turned"
+    free = "free"
 
 
 class Viewed(StrEnum):
@@ -164,9 +173,10 @@ def calibrate_wires(
     poses: Poses = None,
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
-    fit_registration: Annotated[
-        bool, typer.Option("--fit-registration", help="Estimate where the phantom is, too.")
-    ] = False,
+    registration: Annotated[
+        Registration,
+        typer.Option(help="The place a configuration says: hold it, its middle only, or estimate it."),
+    ] = Registration.turned,
     region: Region = None,
     time_offset: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
@@ -190,12 +200,12 @@ def calibrate_wires(
             outcome = crossing_job(recording, seen, job, not fixed_pixels)
         else:
             geometry = _three_wires() if config is None else config.phantom
-            outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, fit_registration)
-    notes = []
+            outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, registration.value)
+    notes = _nwire_notes(outcome, outcome.solution.points)
     if validation is not None:
         other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
         other_seen = _seen_wires(other, phantom, config, None, region, validation)
-        notes = _validated(outcome, other, other_seen, validation)
+        notes += _validated(outcome, other, other_seen, validation)
     _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
 
 
@@ -306,9 +316,23 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
 
     with naming(str(path)):
         points, _ = paired(other, seen, outcome.calibration.time_offset_s or other.time_offset_s)
-        checked = validate(outcome.solution.chain, outcome.solution.phantom, points)
+        checked = validate(outcome.solution, points)
     frames = len(set(points.frame.tolist()))
-    return [f"on {path.name}, not used: RMS residual {checked.rms:.3f} mm, {frames} frames, none left out"]
+    notes = [f"on {path.name}, not used: RMS residual {checked.rms:.3f} mm, {frames} frames, none left out"]
+    return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, points)]
+
+
+def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
+    """PLUS's 3-D error, where there are N-shapes."""
+    from calibration.nwires import nwire_errors_mm, pixel_matrix
+    from calibration.wires import Wires
+
+    chain, phantom = outcome.solution.chain, outcome.solution.phantom
+    if not isinstance(phantom, Wires) or not phantom.geometry.n_shapes:
+        return []
+    place = chain.target_from_world.inv()
+    mean, sd = nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place).trimmed()
+    return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
 
 
 def _finish(

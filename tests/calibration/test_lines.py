@@ -14,6 +14,8 @@ from calibration.lines import EchoLines, LineSettings, NoLineError, detect_line,
 from speckle3d.core.errors import InvalidInputError
 
 PIXEL_MM = (0.25, 0.08)
+FRONT = LineSettings(place="front")
+"""The steadiest place in speckle; where a scatterer's echo is, is known for it."""
 SHAPE = (160, 300)
 WAVELENGTH_MM = 0.3
 BEAM_MM, PULSE_MM = 0.45, 0.16
@@ -112,7 +114,7 @@ def assert_on_floor(line, depth_mm, degrees):
     ids=["clean", "noise", "haze", "side lobes", "reverberations as bright", "drop-out", "fading by 24 dB"],
 )
 def test_a_floor_is_found_where_it_is(conditions, degrees):
-    line = detect_line(floor_image(1, 10.0, degrees, **conditions), PIXEL_MM)
+    line = detect_line(floor_image(1, 10.0, degrees, **conditions), PIXEL_MM, FRONT)
     assert_on_floor(line, 10.0, degrees)
     assert 0.7 * line.possible <= line.consensus <= line.possible <= 61
 
@@ -121,7 +123,7 @@ def test_a_floor_is_found_where_it_is(conditions, degrees):
 def test_a_floor_is_found_in_levels_of_any_kind(kind):
     amplitude = floor_echo(2, 10.0, 4.0)
     image = grey(amplitude, 40.0) if isinstance(kind, str) else (1000 * amplitude).astype(kind)
-    assert_on_floor(detect_line(image, PIXEL_MM), 10.0, 4.0)
+    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 10.0, 4.0)
 
 
 def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independently():
@@ -140,7 +142,9 @@ def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independent
 
 def test_neighbouring_columns_likeness_counts():
     image = floor_image(3, 10.0, 0.0)
-    few, many = (detect_line(image, PIXEL_MM, LineSettings(columns=n)).point_sd_mm for n in (40, 160))
+    few, many = (
+        detect_line(image, PIXEL_MM, LineSettings(columns=n, place="front")).point_sd_mm for n in (40, 160)
+    )
     # Beams 0.45 mm wide: columns 0.25 mm apart tell little that those 1 mm apart do not, which as independent
     # ones would halve the error.
     assert many > 0.7 * few
@@ -159,17 +163,17 @@ def test_where_on_the_echo_the_line_is_put():
 
 def test_a_threshold_decides_what_counts_as_an_echo():
     image = floor_image(5, 12.0, 0.0, lobes=0.04, haze=0.0, rough_mm=0.1)
-    low, high = (detect_line(image, PIXEL_MM, LineSettings(threshold=t)) for t in (20.0, 90.0))
+    low, high = (detect_line(image, PIXEL_MM, LineSettings(threshold=t, place="front")) for t in (20.0, 90.0))
     assert abs(too_deep_mm(low, 0.8 * 12.0, 0.0).mean() + LEAD_MM) < 0.5
     assert_on_floor(high, 12.0, 0.0)
-    assert_on_floor(detect_line(image, PIXEL_MM), 12.0, 0.0)
+    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 12.0, 0.0)
 
 
 def test_noise_has_no_line():
     for seed in range(20):
         image = np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8)
         with pytest.raises(NoLineError, match=r"^no line: \d+ of \d+ possible columns agree, \d+ needed$"):
-            detect_line(image, PIXEL_MM)
+            detect_line(image, PIXEL_MM, FRONT)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +188,7 @@ def test_noise_has_no_line():
 )
 def test_a_frame_without_content_says_so(image, reason):
     with pytest.raises(NoLineError, match=f"^no line: .*{re.escape(reason)}"):
-        detect_line(image, PIXEL_MM)
+        detect_line(image, PIXEL_MM, FRONT)
 
 
 class TestRegion:
@@ -221,12 +225,12 @@ def test_only_what_is_inside_a_region_that_is_not_convex_counts():
     image[20:140, 40:70] = 255  # a bar across the water
     image[60:90, 40:160] = 0  # and no floor in the middle
     around = [(0, 80), (0, 290), (159, 290), (159, 80), (95, 80), (90, 250), (60, 250), (55, 80)]
-    line = detect_line(image, PIXEL_MM, region_px=around)
+    line = detect_line(image, PIXEL_MM, FRONT, region_px=around)
     assert_on_floor(line, 12.0, 2.0)
     assert line.possible < 50
     assert not ((line.inlier_px[:, 0] > 61) & (line.inlier_px[:, 0] < 89)).any()
     with pytest.raises(NoLineError):
-        detect_line(image, PIXEL_MM, region_px=[(0, 0), (159, 0), (159, 60), (0, 60)])
+        detect_line(image, PIXEL_MM, FRONT, region_px=[(0, 0), (159, 0), (159, 60), (0, 60)])
 
 
 @settings(deadline=None, max_examples=60)
@@ -261,16 +265,16 @@ def test_mirrored_shifted_and_amplified_images_have_mirrored_shifted_and_equal_l
     seed, degrees, gain, level, down, right
 ):
     image = floor_image(seed, 9.0, degrees, (100, 240), haze=0.0).astype(float)
-    line = detect_line(image, PIXEL_MM)
-    other = detect_line(image[::-1], PIXEL_MM)
+    line = detect_line(image, PIXEL_MM, FRONT)
+    other = detect_line(image[::-1], PIXEL_MM, FRONT)
     np.testing.assert_allclose(other.points_px[::-1], line.points_px * [-1, 1] + [99, 0], atol=1e-3)
     assert other.point_sd_mm == pytest.approx(line.point_sd_mm, rel=1e-3)
-    other = detect_line(gain * image + level, PIXEL_MM)
+    other = detect_line(gain * image + level, PIXEL_MM, FRONT)
     np.testing.assert_allclose(other.points_px, line.points_px, atol=0.02)  # float32 levels
     dark = np.pad(image, ((right, 5), (down, 0)), constant_values=0.0)
     corners = np.array([(0, 10), (99, 10), (99, 239), (0, 239)])
     inside, moved = (
-        detect_line(im, PIXEL_MM, region_px=corners + by)
+        detect_line(im, PIXEL_MM, FRONT, region_px=corners + by)
         for im, by in ((image, (0, 0)), (dark, (right, down)))
     )
     np.testing.assert_allclose(moved.points_px, inside.points_px + np.array([right, down]), atol=1e-3)
@@ -305,7 +309,7 @@ def test_a_sequence_has_its_lines_and_its_reasons():
     images[3] = np.zeros_like(images[3])
     images[5] = np.random.default_rng(0).integers(0, 256, SHAPE, dtype=np.uint8)
     calls = []
-    found = detect_lines(Reading(images), PIXEL_MM, progress=lambda *done: calls.append(done))
+    found = detect_lines(Reading(images), PIXEL_MM, FRONT, progress=lambda *done: calls.append(done))
     assert isinstance(found, EchoLines)
     assert found.frame.tolist() == [0, 1, 2, 4, 6, 7]
     assert len(found) == 6
@@ -340,7 +344,7 @@ def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
         screen[100:160, 10:22] = letters
         screen[-60:, 150:162] = letters
         screens.append(screen)
-    found = detect_lines(Reading(screens), PIXEL_MM)
+    found = detect_lines(Reading(screens), PIXEL_MM, FRONT)
     found.points_px[:] -= [70, 40]
     assert found.dropped == {}
     assert_on_floors(found, depths, degrees)
@@ -349,7 +353,7 @@ def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
 def test_a_probe_held_still_does_not_hide_the_floor():
     images = [floor_image(7, 10.0, 3.0, noise=0.0)] * 4 + [floor_image(7, 10.0, 3.0, noise=0.01)]
     for sequence in (images[:4], images):
-        found = detect_lines(Reading(sequence), PIXEL_MM)
+        found = detect_lines(Reading(sequence), PIXEL_MM, FRONT)
         assert found.dropped == {}
         assert_on_floors(found, [10.0] * 5, [3.0] * 5)
 
@@ -357,8 +361,8 @@ def test_a_probe_held_still_does_not_hide_the_floor():
 def test_a_region_is_taken_as_it_is():
     images, *_ = moving_floor(4)
     region = [(20, 60), (140, 60), (140, 290), (20, 290)]
-    found = detect_lines(Reading(images), PIXEL_MM, region_px=region)
-    each = [detect_line(image, PIXEL_MM, region_px=region) for image in images]
+    found = detect_lines(Reading(images), PIXEL_MM, FRONT, region_px=region)
+    each = [detect_line(image, PIXEL_MM, FRONT, region_px=region) for image in images]
     np.testing.assert_array_equal(found.points_px, [line.points_px for line in each])
 
 
@@ -387,10 +391,10 @@ def test_images_of_another_kind_are_refused():
     with pytest.raises(InvalidInputError, match=r"expected shape \(column, row\), got \(2, 160, 300\)"):
         detect_line(np.zeros((2, *SHAPE)), PIXEL_MM)
     with pytest.raises(InvalidInputError, match="expected real values, got complex128"):
-        detect_line(np.zeros(SHAPE, complex), PIXEL_MM)
+        detect_line(np.zeros(SHAPE, complex), PIXEL_MM, FRONT)
     for frames in (np.zeros(SHAPE), np.zeros((2, *SHAPE), complex)):
         with pytest.raises(InvalidInputError, match=r"expected real values of shape \(n, column, row\), got"):
-            detect_lines(frames, PIXEL_MM)
+            detect_lines(frames, PIXEL_MM, FRONT)
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def compared(lines, plus):
 
 @pytest.mark.parametrize("region", [FAN, None])
 def test_the_brightest_part_of_every_floor_is_where_plus_puts_it(frames, plus, region):
-    lines = detect_lines(frames, PIXEL_MM, LineSettings(place="peak"), region)
+    lines = detect_lines(frames, PIXEL_MM, region_px=region)
     assert lines.dropped == {}
     assert len(lines) == 201
     beneath, turned = compared(lines, plus)
@@ -57,7 +57,7 @@ def test_the_brightest_part_of_every_floor_is_where_plus_puts_it(frames, plus, r
 
 @pytest.mark.parametrize("region", [FAN, None])
 def test_the_front_of_every_floor_lies_one_part_of_a_pulse_above(frames, plus, region):
-    lines = detect_lines(frames, PIXEL_MM, region_px=region)
+    lines = detect_lines(frames, PIXEL_MM, LineSettings(place="front"), region)
     assert lines.dropped == {}
     beneath, turned = compared(lines, plus)
     # From half the brightness to all of it: 3.8 pixels, 0.3 mm, and the same in all frames up to 1.5 pixels.
