@@ -34,7 +34,7 @@ from calibration.solution import Solution
 from calibration.stages import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
-from speckle3d.core.leastsquares import Fit, clustered_covariance, levenberg_marquardt
+from speckle3d.core.leastsquares import Fit, clustered_covariance, correlated_lags, levenberg_marquardt
 
 ANGLES = PROBE[5:]
 _FEWEST_LINES = 6
@@ -148,13 +148,17 @@ def solve(
         phantom,
         free,
         fit,
-        clustered_covariance(jacobian, fit.residuals, points.frame[used]),
+        _covariance(jacobian, fit.residuals, points.frame[used]),
         points,
         used,
         residuals,
         sigma,
         condition_number(points[used], phantom, chain, free),
     )
+
+
+def _covariance(jacobian: FloatArray, residuals: FloatArray, frame: IntArray) -> FloatArray:
+    return clustered_covariance(jacobian, residuals, frame, correlated_lags(residuals, frame))
 
 
 def robust_sigma(residuals: FloatArray) -> float:

@@ -83,9 +83,8 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
             for one in beam
         ]
         lines += [
-            "Lines at the brightest part of the echo (--place peak) have little of this bias, a thin bar that "
-            "stays in",
-            "the middle of the beam has none.",
+            "Lines at the brightest part of an echo (--place peak) have little of this bias;",
+            "a thin bar that stays in the middle of the beam has none.",
         ]
     return "\n".join([*lines, *(["", *notes] if notes else [])]) + "\n"
 

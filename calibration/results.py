@@ -8,7 +8,7 @@ from calibration.adequacy import judge
 from calibration.chain import CHAIN, SCALES, residuals_and_jacobian
 from calibration.solution import Solution
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
-from speckle3d.core.leastsquares import clustered_covariance
+from speckle3d.core.leastsquares import clustered_covariance, correlated_lags
 
 IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
@@ -51,7 +51,8 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
     residuals, jacobian = residuals_and_jacobian(values, used, solution.phantom)
     columns = [CHAIN.index(name) for name in solution.free]
     matrix = jacobian.reshape(-1, len(CHAIN))[:, columns]
-    errors = np.sqrt(np.diag(clustered_covariance(matrix, residuals.ravel(), used.frame)))
+    lags = correlated_lags(residuals.ravel(), used.frame)
+    errors = np.sqrt(np.diag(clustered_covariance(matrix, residuals.ravel(), used.frame, lags)))
     return tuple(
         Parameter(name, float(values[column]), float(error), _unit(name))
         for name, column, error in zip(solution.free, columns, errors, strict=True)

@@ -24,8 +24,8 @@ class Solution:
         Of the points used, in frames that lie on the image and on the phantom: there the angles are
         small rotations about the image's z, y and x, wherever the sensor is mounted.
     covariance : ndarray, shape (p, p)
-        In the same frames, in the order of `free`; residuals of one frame may be correlated (a sensor's error
-        moves all its points), so that they count as one piece of evidence.
+        In the same frames, in the order of `free`; residuals may be correlated within a frame (a sensor's
+        error moves all its points) and from frame to frame (it drifts).
     points : ImagePoints
         All that were given.
     used : ndarray of bool, shape (n,)

@@ -125,8 +125,10 @@ def levenberg_marquardt(
     )
 
 
-def clustered_covariance(jacobian: FloatArray, residuals: FloatArray, cluster: IntArray) -> FloatArray:
-    """Covariance of least squares whose residuals are correlated within clusters.
+def clustered_covariance(
+    jacobian: FloatArray, residuals: FloatArray, cluster: IntArray, lags: int = 0
+) -> FloatArray:
+    """Covariance of least squares whose residuals are correlated within clusters, and from one to the next.
 
     Parameters
     ----------
@@ -134,12 +136,16 @@ def clustered_covariance(jacobian: FloatArray, residuals: FloatArray, cluster: I
     residuals : ndarray, shape (m,)
         Some to each point, in the order of the points.
     cluster : ndarray of int, shape (n,)
-        Of each point.
+        Of each point; numbered in their order in time, if `lags` are given.
+    lags : int
+        Clusters so many apart may still be correlated (`correlated_lags`).
 
     References
     ----------
     .. [1] R. M. Bell and D. F. McCaffrey, "Bias reduction in standard errors for linear regression with
        multi-stage samples", Survey Methodology, 2002 (the jackknife form, CR3).
+    .. [2] W. K. Newey and K. D. West, "A simple, positive semi-definite, heteroskedasticity and
+       autocorrelation consistent covariance matrix", Econometrica, 1987.
     """
     index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
     bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-15, hermitian=True)
@@ -151,7 +157,29 @@ def clustered_covariance(jacobian: FloatArray, residuals: FloatArray, cluster: I
         left = np.eye(len(rows)) - rows @ bread @ rows.T
         unpulled = np.linalg.lstsq(left, residuals[members], rcond=1e-9)[0]
         scores[index[members[0]]] = rows.T @ unpulled
-    return np.asarray(bread @ (scores.T @ scores) @ bread)
+    spread = scores.T @ scores
+    for lag in range(1, min(lags, len(scores) - 1) + 1):
+        together = scores[lag:].T @ scores[:-lag]
+        spread += (1.0 - lag / (lags + 1.0)) * (together + together.T)
+    return np.asarray(bread @ spread @ bread)
+
+
+def correlated_lags(residuals: FloatArray, cluster: IntArray) -> int:
+    """How many clusters apart residuals are still correlated: up to where that could be chance.
+
+    Parameters
+    ----------
+    residuals, cluster
+        See `clustered_covariance`; the mean of each cluster counts.
+    """
+    index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
+    means = np.bincount(index, residuals) / np.bincount(index)
+    means = means - means.mean()
+    energy, most = float(means @ means), len(means) // 4
+    for lag in range(1, most + 1):
+        if means[lag:] @ means[:-lag] < 2.0 * energy / np.sqrt(len(means)):
+            return lag - 1
+    return most
 
 
 def _diagnose(
