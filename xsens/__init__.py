@@ -1,1 +1,38 @@
-"""The orientation sensor: usable without speckle3d's upper floors."""
+"""The orientation sensor: its messages, logs and orientation; usable without speckle3d's upper floors.
+
+The public names below are loaded when first used (PEP 562), so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from xsens.samples import Gap, ImuLog
+
+_HOME = {
+    "Gap": "samples",
+    "ImuLog": "samples",
+}
+"""Where each public name lives."""
+
+__all__ = [
+    "Gap",
+    "ImuLog",
+]
+
+
+if not TYPE_CHECKING:  # or every misspelt name would pass as an object
+
+    def __getattr__(name: str) -> object:
+        """Load a public name on first use."""
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

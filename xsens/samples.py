@@ -1,0 +1,139 @@
+"""What a log of the sensor holds, whatever file it came from: samples on the sensor's own clock.
+
+The world of an orientation is x magnetic north, y west, z up (the MT9-B's own, NWU), whatever frame the sensor
+was set to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, require_increasing
+from speckle3d.core.streams import DEFAULT_MAX_GAP_S, BoolArray, TimedRotations
+
+IntArray = npt.NDArray[np.int64]
+
+_VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A pause in which the sensor sampled, but nothing arrived.
+
+    Attributes
+    ----------
+    after_index : int
+        Index of the last sample before the pause.
+    lost : int
+        How many samples are missing; 0 if only the pause is known.
+    duration_s : float
+        From the last sample before to the first after.
+    """
+
+    after_index: int
+    lost: int
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class ImuLog:
+    """Samples of one sensor on its own clock.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (m,)
+        Strictly increasing.
+    accelerometer_m_s2, gyroscope_rad_s, magnetometer_au : ndarray, shape (m, 3), optional
+        In the sensor's axes; a row is NaN where that sample lacks it. The field is in arbitrary units, about 1
+        where the sensor was calibrated.
+    world_from_sensor : Rotation, length m, optional
+        The sensor's own orientation; NaN where that sample lacks it.
+    counter : ndarray of int, shape (m,), optional
+        The sensor's own count, made to rise beyond its word length.
+    gaps : tuple of Gap
+        In order; found from the counter or the clock.
+    notes : tuple of str
+        What was skipped, assumed, or is not compensated.
+    source : str
+        Where the samples came from.
+
+    Raises
+    ------
+    InvalidInputError
+        If the clock does not rise or there is no sample.
+    MismatchError
+        If the lengths differ.
+    """
+
+    time_s: FloatArray
+    accelerometer_m_s2: FloatArray | None = None
+    gyroscope_rad_s: FloatArray | None = None
+    magnetometer_au: FloatArray | None = None
+    world_from_sensor: Rotation | None = None
+    counter: IntArray | None = None
+    gaps: tuple[Gap, ...] = ()
+    notes: tuple[str, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
+        if self.time_s.size == 0:
+            raise InvalidInputError(f"{self.source or 'log'}: expected at least one sample, got none")
+        for name in _VECTORS:
+            self._require_shape(name, (len(self), 3))
+        self._require_shape("counter", (len(self),))
+        if self.world_from_sensor is not None and len(self.world_from_sensor) != len(self):
+            raise MismatchError(
+                f"world_from_sensor: expected {len(self)} samples, got {len(self.world_from_sensor)}"
+            )
+
+    def _require_shape(self, name: str, shape: tuple[int, ...]) -> None:
+        values = getattr(self, name)
+        if values is not None and np.shape(values) != shape:
+            raise MismatchError(f"{name}: expected shape {shape}, got {np.shape(values)}")
+
+    def __len__(self) -> int:
+        return int(self.time_s.size)
+
+    @cached_property
+    def rate_hz(self) -> float:
+        """Samples per second, by the median step of the clock; NaN for a single sample."""
+        return float(1.0 / np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+    @property
+    def lost(self) -> int:
+        """How many samples are known to be missing."""
+        return sum(gap.lost for gap in self.gaps)
+
+    @property
+    def oriented(self) -> BoolArray:
+        """Which samples carry the sensor's own orientation, shape (m,)."""
+        if self.world_from_sensor is None:
+            return np.zeros(len(self), dtype=bool)
+        return np.asarray(np.isfinite(self.world_from_sensor.as_quat()).all(axis=1))
+
+    def rotations(self, max_gap_s: float = DEFAULT_MAX_GAP_S) -> TimedRotations:
+        """The sensor's own orientation, of the samples that carry it.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no sample does.
+        """
+        there = self.oriented
+        if self.world_from_sensor is None or not there.any():
+            raise InsufficientDataError(
+                f"{self.source or 'log'}: expected samples with the sensor's own orientation, got none"
+            )
+        return TimedRotations(self.time_s[there], self.world_from_sensor[there], max_gap_s)
