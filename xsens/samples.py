@@ -1,7 +1,7 @@
 """What a log of the sensor holds, whatever file it came from: samples on the sensor's own clock.
 
-The world of an orientation is x magnetic north, y west, z up (the MT9-B's own, NWU), whatever frame the sensor
-was set to.
+The world of an orientation is x magnetic north, y west, z up (the MT9-B's own, NWU), whatever frame the
+sensor was set to.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class ImuLog:
     time_s : ndarray, shape (m,)
         Strictly increasing.
     accelerometer_m_s2, gyroscope_rad_s, magnetometer_au : ndarray, shape (m, 3), optional
-        In the sensor's axes; a row is NaN where that sample lacks it. The field is in arbitrary units, about 1
-        where the sensor was calibrated.
+        In the sensor's axes; a row is NaN where that sample lacks it. The field is in arbitrary units, about
+        1 where the sensor was calibrated.
     world_from_sensor : Rotation, length m, optional
-        The sensor's own orientation; NaN where that sample lacks it.
+        The sensor's own orientation; meaningless (the identity) where `oriented` is false.
     counter : ndarray of int, shape (m,), optional
         The sensor's own count, made to rise beyond its word length.
     gaps : tuple of Gap
@@ -62,6 +62,8 @@ class ImuLog:
         What was skipped, assumed, or is not compensated.
     source : str
         Where the samples came from.
+    oriented : ndarray of bool, shape (m,), optional
+        Which samples carry the sensor's own orientation; by default all, or none without `world_from_sensor`.
 
     Raises
     ------
@@ -80,11 +82,15 @@ class ImuLog:
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
     source: str = ""
+    oriented: BoolArray = None  # type: ignore[assignment]  # settled when made
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
         if self.time_s.size == 0:
             raise InvalidInputError(f"{self.source or 'log'}: expected at least one sample, got none")
+        if self.oriented is None:
+            object.__setattr__(self, "oriented", np.full(len(self), self.world_from_sensor is not None))
+        self._require_shape("oriented", (len(self),))
         for name in _VECTORS:
             self._require_shape(name, (len(self), 3))
         self._require_shape("counter", (len(self),))
@@ -116,13 +122,6 @@ class ImuLog:
         """How many samples are known to be missing."""
         return sum(gap.lost for gap in self.gaps)
 
-    @property
-    def oriented(self) -> BoolArray:
-        """Which samples carry the sensor's own orientation, shape (m,)."""
-        if self.world_from_sensor is None:
-            return np.zeros(len(self), dtype=bool)
-        return np.asarray(np.isfinite(self.world_from_sensor.as_quat()).all(axis=1))
-
     def rotations(self, max_gap_s: float = DEFAULT_MAX_GAP_S) -> TimedRotations:
         """The sensor's own orientation, of the samples that carry it.
 
@@ -131,9 +130,9 @@ class ImuLog:
         InsufficientDataError
             If no sample does.
         """
-        there = self.oriented
-        if self.world_from_sensor is None or not there.any():
+        if self.world_from_sensor is None or not self.oriented.any():
             raise InsufficientDataError(
                 f"{self.source or 'log'}: expected samples with the sensor's own orientation, got none"
             )
-        return TimedRotations(self.time_s[there], self.world_from_sensor[there], max_gap_s)
+        rotations = self.world_from_sensor[self.oriented]
+        return TimedRotations(self.time_s[self.oriented], rotations, max_gap_s)
