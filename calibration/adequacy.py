@@ -27,6 +27,10 @@ returned: what a ruler and a protractor on the probe achieve."""
 WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
 """Standard error from which on the verdict says so; 1 degree is the published precision (Housden 2008)."""
 
+MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
+"""Root mean square residual that no phantom leaves: the worst published is 3.5 mm as a distance, with early
+magnetic trackers (TR 303, section 5), 2 mm in each component."""
+
 _TURN_RAD, _SHIFT_MM = np.deg2rad(15.0), 10.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
@@ -57,7 +61,7 @@ MOTIONS = (
 
 @dataclass(frozen=True)
 class Adequacy:
-    """How well the motion determines a calibration.
+    """How well the motion determines a calibration, if the phantom explains the images.
 
     Attributes
     ----------
@@ -83,7 +87,8 @@ def require_adequate(solution: Solution) -> Solution:
     Raises
     ------
     InsufficientDataError
-        Naming the missing motion, if the answer is too uncertain to be used.
+        Naming the missing motion, if the answer is too uncertain to be used; or if the phantom does not
+        explain the images.
     """
     found = judge(solution)
     if found.refused:
@@ -92,17 +97,24 @@ def require_adequate(solution: Solution) -> Solution:
 
 
 def judge(solution: Solution) -> Adequacy:
-    """Judge the motion of a solution; its image is taken to reach as far as the phantom was seen in it."""
+    """Judge the motion of a solution, and whether the phantom explains the images at all.
+
+    The image is taken to reach as far as the phantom was seen in it.
+    """
     angular = solution.phantom.seen_as == "direction"
     weak, limit = (WEAK_RAD, REFUSED_RAD) if angular else (WEAK_MM, REFUSED_MM)
     information = _information(solution, solution.points[solution.used])
     error = _standard_error(solution, information)
     condition = solution.fit.condition_number
+    share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
+    # Not where a phantom that fits would be no help: the solver runs off along the way that is left open.
+    if share < 1 and share * error <= limit:
+        return Adequacy(error, condition, (), True, _misfit(solution))
     refused = bool(error > limit or not condition <= MAX_CONDITION)
-    missing = tuple(_missing(solution, information, weak)) if refused or error > weak else ()
-    size = f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm at the image's corners"
-    state = f"standard error {size}, condition number {condition:.3g}"
-    advice = "; and ".join(missing) if missing else "record more frames over a wider range"
+    missing = tuple(_missing(solution, information, weak)) if error > weak else ()
+    where = "" if angular else " at the image's corners"
+    state = f"standard error {_size(error, angular)}{where}, condition number {condition:.3g}"
+    advice = "; and ".join(missing) if missing else _more(error <= weak)
     if refused:
         verdict = f"the motion does not determine the calibration ({state}): {advice}"
     elif error > weak:
@@ -110,6 +122,25 @@ def judge(solution: Solution) -> Adequacy:
     else:
         verdict = f"the motion was sufficient ({state})"
     return Adequacy(error, condition, missing, refused, verdict)
+
+
+def _misfit(solution: Solution) -> str:
+    return (
+        "the phantom does not explain the images (they miss it by "
+        f"{_size(solution.rms, solution.phantom.seen_as == 'direction')}): do the images and the sensor "
+        "readings belong together, and are the phantom, its wires and their numbers the ones named?"
+    )
+
+
+def _size(error: float, angular: bool) -> str:
+    return f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm"
+
+
+def _more(image_is_known: bool) -> str:
+    """What helps where no motion does."""
+    if image_is_known:
+        return "what stays unknown is where the phantom is: show more of it, all its wires"
+    return "record more frames over a wider range"
 
 
 def _information(solution: Solution, points: ImagePoints) -> FloatArray:

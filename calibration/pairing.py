@@ -31,8 +31,12 @@ def covered(
     readings: TimedPoses | TimedRotations, frame_time_s: FloatArray, offset_s: float, slack_s: float = 0.0
 ) -> BoolArray:
     """Which frames have a reading, for any offset within `slack_s` of `offset_s`."""
-    shifts = {-slack_s, 0.0, slack_s}
-    return np.asarray(np.all([readings.covers(frame_time_s - offset_s - shift) for shift in shifts], axis=0))
+    asked, sampled = np.asarray(frame_time_s) - offset_s, readings.time_s
+    inside = (asked - slack_s >= sampled[0]) & (asked + slack_s <= sampled[-1])
+    gaps = np.flatnonzero(np.diff(sampled) > readings.max_gap_s)
+    first, last = asked[:, None] - slack_s, asked[:, None] + slack_s
+    in_gap = (last > sampled[gaps]) & (first < sampled[gaps + 1])
+    return np.asarray(inside & ~in_gap.any(axis=1))
 
 
 def estimate_offset(
@@ -59,11 +63,13 @@ def estimate_offset(
         raise InsufficientDataError(
             f"expected a clock offset within {search_s:g} s that gives a calibration, got none"
         )
-    if best in (0, len(tried) - 1):
+    # The last step but one does not count either: the curvature is measured a step further on.
+    if not 1 < best < len(tried) - 2:
         raise InsufficientDataError(
             f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its end"
         )
-    used = calibrate(float(tried[best])).used
+    nearest = calibrate(float(tried[best]))
+    used, count = nearest.used, nearest.residuals[nearest.used].size
 
     def cost(offset: float) -> float:
         return float(np.sum(calibrate(offset).residuals[used] ** 2))
@@ -71,7 +77,7 @@ def estimate_offset(
     near = minimize_scalar(
         cost, bounds=(tried[best - 1], tried[best + 1]), method="bounded", options={"xatol": _TOLERANCE_S}
     )
-    return Offset(float(near.x), _standard_error(cost, float(near.x), int(used.sum())))
+    return Offset(float(near.x), _standard_error(cost, float(near.x), count))
 
 
 def _sigma(calibrate: Callable[[float], Solution], offset: float) -> float:
