@@ -1,0 +1,317 @@
+"""How well an orientation sensor measures the angles between frames, against a reference.
+
+Only rotations between frames count, so that the two worlds may differ: neither a heading offset nor the
+choice of north matters.
+
+References
+----------
+.. [1] R. J. Housden et al., "Calibration of an orientation sensor for freehand 3D ultrasound and its use in a
+   hybrid acquisition system", BioMedical Engineering OnLine, 2008, "Assessing calibration precision and
+   reconstruction accuracy", table 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import TimedRotations
+
+IntArray = npt.NDArray[np.int64]
+
+ANGLES = ("roll", "yaw", "tilt")
+"""In this order everywhere: about the image's z, y and x."""
+
+MOST_ERRORS = 5_000_000
+"""Frame pairs times calibrations that are held at once: some 400 MB while they are being made."""
+
+ENOUGH_FRAMES = 77
+"""Frames taken from a recording unless told otherwise: as many as orientations in [1]_."""
+
+_MOUNTING_LIMIT = np.deg2rad(2.0)
+"""Rotation about the second axis (RMS, between frames) below which the motion says nothing about a mounting:
+a sensor good to half a degree would leave it a quarter of a radian open."""
+
+
+@dataclass(frozen=True)
+class PairErrors:
+    """Angles between the frames of every pair, as the reference has them, and the errors of the sensor's.
+
+    Attributes
+    ----------
+    first, second : ndarray of int, shape (p,)
+        The pair's frames, first < second: 0 1, 0 2 and so on, 1 2 and so on.
+    reference_rad : ndarray, shape (p, 3)
+        Roll, yaw and tilt of the second frame seen from the first, about the pair's mean z, y and x.
+    error_rad : ndarray, shape (k, p, 3)
+        Measured less reference, for every calibration.
+    """
+
+    first: IntArray
+    second: IntArray
+    reference_rad: FloatArray
+    error_rad: FloatArray
+
+    def __len__(self) -> int:
+        """Number of errors: pairs times calibrations."""
+        return int(self.error_rad.shape[0] * self.error_rad.shape[1])
+
+    @property
+    def frames(self) -> int:
+        """Number of orientations."""
+        return int(self.second.max()) + 1
+
+    @property
+    def measured_rad(self) -> FloatArray:
+        """Angles the sensor measured, shape (k, p, 3)."""
+        return self.reference_rad + self.error_rad
+
+
+@dataclass(frozen=True)
+class AccuracyRow:
+    """Errors of one experiment over all pairs and calibrations; each array is roll, yaw, tilt, radians.
+
+    The mean depends on the order of the frames, since a pair taken the other way round has the opposite
+    error: it is what grows from earlier frames to later ones. `rms_rad` does not depend on it.
+    `calibration_sd_rad` is how much of the scatter comes with the calibrations: the deviation of a pair's
+    errors from their mean over the calibrations, zero where there is but one.
+    """
+
+    name: str
+    frames: int
+    calibrations: int
+    errors: int
+    mean_rad: FloatArray
+    sd_rad: FloatArray
+    rms_rad: FloatArray
+    worst_rad: FloatArray
+    calibration_sd_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class AccuracyTable:
+    """One row per experiment, as in table 2 of [1]_.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008.
+    """
+
+    rows: tuple[AccuracyRow, ...]
+
+    @classmethod
+    def of(cls, experiments: Mapping[str, PairErrors]) -> AccuracyTable:
+        """Summarise the errors of every experiment, by its name."""
+        return cls(tuple(_row(name, errors) for name, errors in experiments.items()))
+
+    def text(self) -> str:
+        """Mean and standard deviation in degrees, laid out for reading."""
+        width = max([len("degrees"), *(len(row.name) for row in self.rows)])
+        lines = [f"{'degrees':{width}}" + "".join(f"  {angle.capitalize():>18}" for angle in ANGLES)]
+        for row in self.rows:
+            pairs = zip(np.rad2deg(row.mean_rad), np.rad2deg(row.sd_rad), strict=True)
+            cells = "".join(f"  {f'{mean:+.4f} ± {sd:.4f}':>18}" for mean, sd in pairs)
+            lines.append(f"{row.name:{width}}{cells}")
+        return "\n".join(lines)
+
+    def values(self) -> tuple[tuple[str, float, str], ...]:
+        """Everything as rows of description, value, unit."""
+        return tuple(value for row in self.rows for value in _values(row))
+
+
+def pair_errors(
+    world_from_sensor: Rotation,
+    reference_from_image: Rotation,
+    sensor_from_image: Rotation | Sequence[Rotation],
+) -> PairErrors:
+    """Compare the angles between all pairs of frames, with every calibration.
+
+    The rotation from one frame to another is taken as one turn; its parts along the pair's mean axes are the
+    angles. They are the rotation vector's entries, the same in either frame and half-way between them.
+
+    Parameters
+    ----------
+    world_from_sensor : Rotation, length n
+        The sensor's reading for each frame.
+    reference_from_image : Rotation, length n
+        The same frames as the reference has them, in any world at rest.
+    sensor_from_image : Rotation, single or length k, or sequence of k single Rotations
+        Calibrations of the sensor.
+
+    Raises
+    ------
+    MismatchError
+        If there is not one reading per reference.
+    InsufficientDataError
+        If there are fewer than two frames or no calibration.
+    InvalidInputError
+        If pairs times calibrations exceed `MOST_ERRORS`.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008.
+    """
+    matrices = _calibrations(sensor_from_image)
+    first, second = _pairs(world_from_sensor, reference_from_image, len(matrices))
+    reference = _turns(reference_from_image, first, second)
+    # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T seen from the image, so that
+    # each pair's rotation vector is found once for all calibrations.
+    turns = _turns(world_from_sensor, first, second)
+    measured = np.einsum("kji,pj->kpi", matrices, turns)
+    errors = _nearest_turn(measured, reference) - reference
+    return PairErrors(first, second, reference[:, ::-1].copy(), errors[..., ::-1].copy())
+
+
+def common_readings(
+    sensor: TimedRotations,
+    reference: TimedRotations,
+    sensor_offset_s: float = 0.0,
+    frames: int = ENOUGH_FRAMES,
+) -> tuple[Rotation, Rotation]:
+    """Readings of both at the same moments, evenly spread over the time that both cover.
+
+    Parameters
+    ----------
+    sensor, reference : TimedRotations
+        Each on its own clock.
+    sensor_offset_s : float
+        A reading taken at sensor time t belongs to reference time t + `sensor_offset_s`.
+    frames : int
+        How many moments; the reference's own samples, so that only the sensor is interpolated.
+
+    Returns
+    -------
+    sensor, reference : Rotation, length m
+        With m = `frames`, or as many as there are.
+
+    Raises
+    ------
+    InsufficientDataError
+        If fewer than two of the reference's samples are covered by the sensor's.
+    """
+    if frames < 2:
+        raise InvalidInputError(f"frames: expected at least 2, got {frames}")
+    covered = np.flatnonzero(sensor.covers(reference.time_s - sensor_offset_s))
+    if covered.size < 2:
+        raise InsufficientDataError(
+            f"expected at least 2 samples of the reference covered by the sensor's, got {covered.size}: the "
+            f"reference spans {_span(reference.time_s)}, the sensor with an offset of {sensor_offset_s:g} s "
+            f"{_span(sensor.time_s + sensor_offset_s)}"
+        )
+    some = covered[np.unique(np.linspace(0, covered.size - 1, frames).round().astype(int))]
+    return sensor.at(reference.time_s[some] - sensor_offset_s), reference.world_from_sensor[some]
+
+
+def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
+    """How the body that the reference follows sits on the one the sensor measures: ``reference_from_image``.
+
+    For a reference whose axes are not the image's and that nobody has calibrated, such as an optical target:
+    of two rigidly joined bodies the turns between frames differ by the mounting only, and least squares over
+    all pairs gives it. A constant calibration error of the sensor disappears with it.
+
+    Parameters
+    ----------
+    measured : Rotation, length n
+        ``world_from_image`` by the sensor, with one calibration.
+    reference : Rotation, length n
+        ``world_from_target`` by the reference; ``reference * mounting`` is then the image's.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the frames turn about one axis only, or hardly at all.
+    """
+    first, second = _pairs(measured, reference, 1)
+    target, image = _turns(reference, first, second), _turns(measured, first, second)
+    spread = np.linalg.svd(target, compute_uv=False) / np.sqrt(len(target))
+    if spread.size < 2 or spread[1] < _MOUNTING_LIMIT:
+        raise InsufficientDataError(
+            f"expected turns about two axes, {np.rad2deg(_MOUNTING_LIMIT):.0f} degrees RMS between frames, "
+            f"got {np.rad2deg(spread[1] if spread.size > 1 else 0.0):.2g} about the second: the motion does "
+            "not tell how the reference is mounted"
+        )
+    mounting, _ = Rotation.align_vectors(target, image)
+    return mounting
+
+
+def _calibrations(sensor_from_image: Rotation | Sequence[Rotation]) -> FloatArray:
+    """Matrices, shape (k, 3, 3)."""
+    alone = isinstance(sensor_from_image, Rotation) and sensor_from_image.single
+    if not alone and not len(sensor_from_image):
+        raise InsufficientDataError("sensor_from_image: expected at least one calibration, got none")
+    listed = [sensor_from_image] if isinstance(sensor_from_image, Rotation) else sensor_from_image
+    return np.concatenate([each.as_matrix().reshape(-1, 3, 3) for each in listed])
+
+
+def _pairs(measured: Rotation, reference: Rotation, calibrations: int) -> tuple[IntArray, IntArray]:
+    """Indices of all pairs of frames, first < second."""
+    n = 0 if measured.single else len(measured)
+    found = 0 if reference.single else len(reference)
+    if found != n:
+        raise MismatchError(f"expected one reference per reading, got {found} and {n}")
+    if n < 2:
+        raise InsufficientDataError(f"expected at least 2 orientations, got {n}")
+    if n * (n - 1) // 2 * calibrations > MOST_ERRORS:
+        raise InvalidInputError(
+            f"expected at most {MOST_ERRORS} frame pairs times calibrations, got {n * (n - 1) // 2} pairs of "
+            f"{n} orientations times {calibrations}: take fewer orientations"
+        )
+    first, second = np.triu_indices(n, 1)
+    return first, second
+
+
+def _turns(world_from_body: Rotation, first: IntArray, second: IntArray) -> FloatArray:
+    """Rotation vectors from the first to the second of each pair, about the body's x, y, z, shape (p, 3)."""
+    return np.asarray((world_from_body[first].inv() * world_from_body[second]).as_rotvec())
+
+
+def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
+    """The way round, of the two to the same orientation, that is nearer to the reference's.
+
+    Near half a turn a small error changes which way round is the shorter.
+    """
+    angle = np.linalg.norm(turns, axis=-1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        other = np.where(angle > 0, turns * (1.0 - 2.0 * np.pi / angle), turns)
+    nearer = np.linalg.norm(other - reference, axis=-1) < np.linalg.norm(turns - reference, axis=-1)
+    return np.where(nearer[..., None], other, turns)
+
+
+def _row(name: str, errors: PairErrors) -> AccuracyRow:
+    by_pair = errors.error_rad.mean(axis=0)
+    return AccuracyRow(
+        name=name,
+        frames=errors.frames,
+        calibrations=len(errors.error_rad),
+        errors=len(errors),
+        mean_rad=errors.error_rad.mean(axis=(0, 1)),
+        sd_rad=errors.error_rad.std(axis=(0, 1)),
+        rms_rad=np.sqrt(np.square(errors.error_rad).mean(axis=(0, 1))),
+        worst_rad=np.abs(errors.error_rad).max(axis=(0, 1)),
+        calibration_sd_rad=np.sqrt(np.square(errors.error_rad - by_pair).mean(axis=(0, 1))),
+    )
+
+
+def _values(row: AccuracyRow) -> list[tuple[str, float, str]]:
+    shown = {
+        "mean": row.mean_rad,
+        "standard deviation": row.sd_rad,
+        "RMS": row.rms_rad,
+        "largest": row.worst_rad,
+        "standard deviation with the calibration": row.calibration_sd_rad,
+    }
+    return [
+        (f"{row.name}: {angle} error, {what}", float(value), "degrees")
+        for what, radians in shown.items()
+        for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
+    ]
+
+
+def _span(time_s: FloatArray) -> str:
+    return f"{time_s[0]:.3f} to {time_s[-1]:.3f} s"

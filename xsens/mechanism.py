@@ -1,0 +1,211 @@
+"""Settings of a mechanism that holds the probe at known orientations, as comma-separated text.
+
+::
+
+    # anything after a hash is a comment
+    tilt,yaw,roll,time_s,until_s
+    -16.4,-5.5,0,12.0,14.5
+    -14.5,-5.5,0,17.0,19.5
+
+Degrees. The columns may be in any order and separated by commas, semicolons, tabs or blanks; ``roll`` may be
+missing and is then 0; ``time_s`` is the sensor's clock, when the mechanism had come to rest, and ``until_s``
+when it left. Without a header the columns are tilt, yaw and, if there is a third, roll.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.streams import TimedRotations
+
+_COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
+
+_LARGEST_BYTES = 16 * 2**20
+"""A mechanism set by hand or motor to a quarter of a million orientations: no file of settings is larger."""
+
+_AXIS = {"roll": "Z", "yaw": "Y", "tilt": "X"}
+
+
+@dataclass(frozen=True)
+class MechanismSettings:
+    """Orientations the mechanism was set to.
+
+    Attributes
+    ----------
+    base_from_image : Rotation, length n
+        The probe as set, seen from the mechanism's base.
+    time_s, until_s : ndarray, shape (n,), optional
+        On the sensor's clock, from when to when the mechanism stood still; without `until_s` a moment.
+    """
+
+    base_from_image: Rotation
+    time_s: FloatArray | None = None
+    until_s: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        for name, times in (("time_s", self.time_s), ("until_s", self.until_s)):
+            if times is not None:
+                require_finite(times, name)
+                if times.shape != (len(self),):
+                    raise MismatchError(f"{name}: expected {len(self)} times, got shape {times.shape}")
+        if self.until_s is None:
+            return
+        if self.time_s is None:
+            raise InvalidInputError("until_s: expected time_s beside it, got none")
+        bad = np.flatnonzero(self.until_s < self.time_s)
+        if bad.size:
+            until_s, time_s = self.until_s[bad[0]], self.time_s[bad[0]]
+            raise InvalidInputError(
+                f"until_s[{bad[0]}]: expected no less than time_s, {time_s:g} s, got {until_s:g} s"
+            )
+
+    def __len__(self) -> int:
+        return len(self.base_from_image)
+
+
+def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, tilt") -> MechanismSettings:
+    """Read the settings of a mechanism, one orientation per line.
+
+    Parameters
+    ----------
+    path : path
+        Text as in the module's description.
+    turns : str
+        The mechanism's axes from its base to the probe: each turn carries the axes after it. The default
+        is the convention of the fixed angles, R = Rz(roll) Ry(yaw) Rx(tilt).
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the file and the line that is not what it must be.
+    """
+    sequence = _sequence(turns)
+    text = _read(Path(path))
+    table = _table(text, str(path))
+    angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
+    order = "".join(_AXIS[name] for name in sequence)
+    rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
+    try:
+        return MechanismSettings(rotation, table.get("time_s"), table.get("until_s"))
+    except InvalidInputError as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
+def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
+    """The sensor's reading for each setting, averaged over the time the mechanism stood still.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the settings have no times and are not as many as the readings, or the sensor has no reading there.
+    """
+    if settings.time_s is None:
+        if len(sensor) != len(settings):
+            raise InsufficientDataError(
+                f"expected times with the {len(settings)} settings, or as many readings, got no times and "
+                f"{len(sensor)} readings"
+            )
+        return sensor.world_from_sensor
+    if settings.until_s is None:
+        return sensor.at(settings.time_s)
+    spans = zip(settings.time_s, settings.until_s, strict=True)
+    return Rotation.concatenate([_mean_between(sensor, start, end) for start, end in spans])
+
+
+def _mean_between(sensor: TimedRotations, start_s: float, end_s: float) -> Rotation:
+    low, high = np.searchsorted(sensor.time_s, [start_s, end_s])
+    if high - low < 2:
+        return sensor.at(0.5 * (start_s + end_s))
+    return sensor.world_from_sensor[low:high].mean()
+
+
+def _sequence(turns: str) -> list[str]:
+    names = re.split(r"[\s,-]+", turns.strip().lower())
+    if sorted(names) != sorted(_AXIS):
+        raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
+    return names
+
+
+def _read(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LARGEST_BYTES + 1)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(data) > _LARGEST_BYTES:
+        raise InvalidInputError(f"{path}: expected at most {_LARGEST_BYTES} bytes of settings, got more")
+    return data.decode("utf-8-sig", errors="replace")
+
+
+def _table(text: str, where: str) -> dict[str, FloatArray]:
+    """Columns by name."""
+    lines = list(_lines(text))
+    if not lines:
+        raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got an empty file")
+    named = any(_number(cell) is None for cell in lines[0][1])
+    names = _names(lines[0][1], f"{where}:{lines[0][0]}") if named else list(_COLUMNS[: len(lines[0][1])])
+    if not named and len(names) not in (2, 3):
+        raise InvalidInputError(
+            f"{where}:{lines[0][0]}: expected a header or 2 or 3 columns, got {len(names)}"
+        )
+    rows = [_row(cells, names, f"{where}:{at}") for at, cells in lines[named:]]
+    if not rows:
+        raise InvalidInputError(f"{where}: expected settings below the header, got none")
+    return dict(zip(names, np.array(rows).T.copy(), strict=True))
+
+
+def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and cells of the lines that say something."""
+    for at, line in enumerate(text.splitlines(), 1):
+        content = line.partition("#")[0].strip()
+        if not content:
+            continue
+        separator = next((mark for mark in ";,\t" if mark in content), None)
+        cells = [cell.strip() for cell in content.split(separator)]
+        # Where the decimal sign is a comma, semicolons separate.
+        yield at, [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
+
+
+def _names(cells: list[str], where: str) -> list[str]:
+    names = [_name(cell) for cell in cells]
+    if len(set(names)) != len(names) or not {"tilt", "yaw"} <= set(names) <= set(_COLUMNS):
+        raise InvalidInputError(
+            f"{where}: expected columns tilt and yaw, perhaps roll, time_s and until_s, "
+            f"got {', '.join(cells)[:80]}"
+        )
+    return names
+
+
+def _name(cell: str) -> str:
+    """``Tilt_deg``, ``tilt/deg`` and ``tilt(deg)`` are all tilt; ``time`` is ``time_s``."""
+    word = re.split(r"[^a-z]", cell.lower().strip('"'))[0]
+    return f"{word}_s" if word in ("time", "until") else word
+
+
+def _row(cells: list[str], names: list[str], where: str) -> list[float]:
+    if len(cells) != len(names):
+        raise InvalidInputError(f"{where}: expected {len(names)} columns, got {len(cells)}")
+    values = [_number(cell) for cell in cells]
+    for cell, value in zip(cells, values, strict=True):
+        if value is None or not math.isfinite(value):
+            raise InvalidInputError(f"{where}: expected a finite number, got {cell[:40]!r}")
+    return [value for value in values if value is not None]
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None
