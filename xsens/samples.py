@@ -6,7 +6,7 @@ sensor was set to.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -82,13 +82,13 @@ class ImuLog:
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
     source: str = ""
-    oriented: BoolArray = None  # type: ignore[assignment]  # settled when made
+    oriented: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
         if self.time_s.size == 0:
             raise InvalidInputError(f"{self.source or 'log'}: expected at least one sample, got none")
-        if self.oriented is None:
+        if self.oriented.size == 0:
             object.__setattr__(self, "oriented", np.full(len(self), self.world_from_sensor is not None))
         self._require_shape("oriented", (len(self),))
         for name in _VECTORS:

@@ -1,0 +1,263 @@
+"""Messages among bytes: the framing that all of the vendor's sensors share.
+
+A message is ``FA, bus id, message id, length, payload, checksum``; a length of 255 says that a 16-bit length
+follows. All bytes after the first, the checksum included, sum to zero modulo 256. Streams start in the middle
+of a message and lose bytes, so every byte FA may begin a message and none must: a message counts if its
+checksum holds, and of two that overlap the one counts whose end is where another begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import InvalidInputError
+
+ByteArray = npt.NDArray[np.uint8]
+IntArray = npt.NDArray[np.int64]
+
+PREAMBLE = 0xFA
+MASTER = 0xFF
+"""Bus id of a single sensor, or of the master among several."""
+
+MOST_PAYLOAD = 8192
+"""Longest payload that the vendor's own software accepts; no sensor sends more than 2048 bytes. Lengths
+beyond it are damage, and waiting for so many bytes would stop a live stream."""
+
+_EXTENDED = 0xFF
+_BLOCK = 1 << 22
+"""Bytes looked at in one go, which bounds the memory that a file of nothing but FA takes."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message, without its framing.
+
+    Attributes
+    ----------
+    mid : int
+        Message id, 0 to 255.
+    payload : bytes
+        At most `MOST_PAYLOAD` bytes.
+    bid : int
+        Bus id, 0 to 255.
+    """
+
+    mid: int
+    payload: bytes = b""
+    bid: int = MASTER
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.mid <= 255 and 0 <= self.bid <= 255):
+            raise InvalidInputError(f"message: expected ids of one byte, got {self.mid} and {self.bid}")
+        if len(self.payload) > MOST_PAYLOAD:
+            raise InvalidInputError(
+                f"message {self.mid:#04x}: expected at most {MOST_PAYLOAD} bytes, got {len(self.payload)}"
+            )
+
+
+def encode(message: Message) -> bytes:
+    """Bytes of `message`, with preamble, length and checksum."""
+    size = len(message.payload)
+    length = bytes([size]) if size < _EXTENDED else bytes([_EXTENDED, size >> 8, size & 0xFF])
+    body = bytes([message.bid, message.mid]) + length + message.payload
+    return bytes([PREAMBLE]) + body + bytes([-sum(body) & 0xFF])
+
+
+def decode(data: bytes) -> list[Message]:
+    """Messages in `data`, in order; bytes that belong to none are left out (see `find_frames`)."""
+    return list(find_frames(data).messages())
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Where the messages lie in a run of bytes.
+
+    Attributes
+    ----------
+    data : ndarray of uint8, shape (size,)
+    start, end : ndarray of int, shape (n,)
+        First byte, and the one after the checksum; in order, without overlap.
+    """
+
+    data: ByteArray
+    start: IntArray
+    end: IntArray
+
+    def __len__(self) -> int:
+        return int(self.start.size)
+
+    def __getitem__(self, which: npt.NDArray[np.bool_] | npt.NDArray[np.integer] | slice) -> Frames:
+        return Frames(self.data, self.start[which], self.end[which])
+
+    @cached_property
+    def bid(self) -> ByteArray:
+        """Bus ids, shape (n,)."""
+        return np.asarray(self.data[self.start + 1])
+
+    @cached_property
+    def mid(self) -> ByteArray:
+        """Message ids, shape (n,)."""
+        return np.asarray(self.data[self.start + 2])
+
+    @cached_property
+    def payload_start(self) -> IntArray:
+        """First bytes of the payloads, shape (n,)."""
+        return np.asarray(self.start + 4 + 2 * (self.data[self.start + 3] == _EXTENDED))
+
+    @property
+    def payload_size(self) -> IntArray:
+        """Bytes in the payloads, shape (n,)."""
+        return self.end - 1 - self.payload_start
+
+    def payloads(self) -> ByteArray:
+        """Payloads as rows, shape (n, size); they must all be as long as the first."""
+        size = int(self.payload_size[0]) if len(self) else 0
+        return np.asarray(self.data[self.payload_start[:, None] + np.arange(size)])
+
+    def message(self, index: int) -> Message:
+        """The message at `index`."""
+        payload = self.data[self.payload_start[index] : self.end[index] - 1].tobytes()
+        return Message(int(self.mid[index]), payload, int(self.bid[index]))
+
+    def messages(self) -> Iterator[Message]:
+        """All messages, in order."""
+        return (self.message(i) for i in range(len(self)))
+
+    def skipped(self) -> list[tuple[int, int]]:
+        """Runs of bytes that belong to no message, as (first byte, length)."""
+        before = np.concatenate(([0], self.end))
+        size = np.concatenate((self.start, [self.data.size])) - before
+        there = size > 0
+        return list(zip(before[there].tolist(), size[there].tolist(), strict=True))
+
+
+def find_frames(data: bytes | ByteArray) -> Frames:
+    """Every message in `data`, wherever it starts and whatever lies between.
+
+    Time and memory grow with the size of `data` alone, whatever lengths it claims.
+    """
+    array = np.frombuffer(data, dtype=np.uint8) if not isinstance(data, np.ndarray) else data
+    starts, ends, at = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
+    while at < array.size:
+        block = array[at : at + _BLOCK]
+        start, end, used = _scan(block, at + _BLOCK >= array.size)
+        starts.append(start + at)
+        ends.append(end + at)
+        at += used
+    return Frames(array, np.concatenate(starts), np.concatenate(ends))
+
+
+class Framer:
+    """Finds messages in a live stream, whatever pieces it comes in.
+
+    Attributes
+    ----------
+    skipped_bytes : int
+        How many belonged to no message so far.
+    """
+
+    def __init__(self) -> None:
+        self.skipped_bytes = 0
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Messages completed by `data`; an unfinished one is kept for the next call."""
+        return self._take(self._rest + data, False)
+
+    def close(self) -> list[Message]:
+        """Messages that an unfinished one seemed to hold, now that no more bytes will come."""
+        return self._take(self._rest, True)
+
+    def _take(self, data: bytes, final: bool) -> list[Message]:
+        array = np.frombuffer(data, dtype=np.uint8)
+        start, end, used = _scan(array, final)
+        self._rest = data[used:]
+        self.skipped_bytes += used - int((end - start).sum())
+        return list(Frames(array, start, end).messages())
+
+
+def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
+    """First and end bytes of messages in `data`, and how many bytes need not be looked at again.
+
+    Unless `final`, a message that may be finished by bytes to come keeps its bytes.
+    """
+    start, end, whole = _candidates(data)
+    unfinished = np.zeros(0, dtype=np.int64) if final else start[~whole]
+    start, end = start[whole], end[whole]
+    valid = _checksum_holds(data, start, end)
+    return _chain(start[valid], end[valid], unfinished, data.size)
+
+
+def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, npt.NDArray[np.bool_]]:
+    """Where messages may begin, where they would end, and whether all of their bytes are there."""
+    start = np.flatnonzero(data == PREAMBLE)
+    last = data.size - 1
+    length = data[np.minimum(start + 3, last)].astype(np.int64)
+    extended = (length == _EXTENDED) & (start + 3 <= last)
+    at = np.minimum(start[extended] + 4, last)
+    length[extended] = 256 * data[at].astype(np.int64) + data[np.minimum(at + 1, last)]
+    end = start + 5 + 2 * extended + length
+    header = start + 4 + 2 * extended <= data.size
+    plausible = ~header | (length <= MOST_PAYLOAD)
+    return start[plausible], end[plausible], (header & (end <= data.size))[plausible]
+
+
+def _checksum_holds(data: ByteArray, start: IntArray, end: IntArray) -> npt.NDArray[np.bool_]:
+    summed = np.cumsum(data, dtype=np.uint8)
+    return np.asarray(summed[end - 1] == summed[start])
+
+
+def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> tuple[IntArray, IntArray, int]:
+    """Of messages that may overlap, those that count, and where the first still unfinished one begins."""
+    waiting = _outside(unfinished, start, end)
+    tangled = bool(np.any(start[1:] < end[:-1]) or np.any(waiting[:1] < end[-1:]))
+    if tangled:
+        followed = np.isin(end, start)
+        chosen = _choose(start.tolist(), end.tolist(), followed.tolist(), unfinished.tolist())
+        start, end = start[chosen], end[chosen]
+        waiting = unfinished[unfinished >= (end[-1] if end.size else 0)]
+    return start, end, int(waiting[0]) if waiting.size else size
+
+
+def _outside(points: IntArray, start: IntArray, end: IntArray) -> IntArray:
+    """Those of `points` that lie in none of the intervals."""
+    if not start.size:
+        return points
+    before = np.searchsorted(start, points, side="right") - 1
+    return points[(before < 0) | (points >= end[before])]
+
+
+def _choose(start: list[int], end: list[int], followed: list[bool], unfinished: list[int]) -> list[int]:
+    """Indices of the messages that count."""
+    chosen: list[int] = []
+    free = wait = i = 0
+    while i < len(start):
+        if start[i] < free:
+            i += 1
+            continue
+        while wait < len(unfinished) and unfinished[wait] < free:
+            wait += 1
+        better = i if followed[i] else _followed_within(i, start, end, followed)
+        if better > i:
+            i = better
+            continue
+        if not followed[i] and wait < len(unfinished) and unfinished[wait] < start[i]:
+            break  # it may lie inside the unfinished one
+        chosen.append(i)
+        free = end[i]
+    return chosen
+
+
+def _followed_within(i: int, start: list[int], end: list[int], followed: list[bool]) -> int:
+    """The first message that begins inside message `i` and is followed by another; else `i`."""
+    j = i + 1
+    while j < len(start) and start[j] < end[i]:
+        if followed[j]:
+            return j
+        j += 1
+    return i
