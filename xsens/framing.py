@@ -19,6 +19,7 @@ from speckle3d.core.errors import InvalidInputError
 
 ByteArray = npt.NDArray[np.uint8]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 PREAMBLE = 0xFA
 MASTER = 0xFF
@@ -91,7 +92,7 @@ class Frames:
     def __len__(self) -> int:
         return int(self.start.size)
 
-    def __getitem__(self, which: npt.NDArray[np.bool_] | npt.NDArray[np.integer] | slice) -> Frames:
+    def __getitem__(self, which: BoolArray | npt.NDArray[np.integer] | slice) -> Frames:
         return Frames(self.data, self.start[which], self.end[which])
 
     @cached_property
@@ -193,7 +194,7 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
     return _chain(start[valid], end[valid], unfinished, data.size)
 
 
-def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, npt.NDArray[np.bool_]]:
+def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Where messages may begin, where they would end, and whether all of their bytes are there."""
     start = np.flatnonzero(data == PREAMBLE)
     last = data.size - 1
@@ -207,29 +208,40 @@ def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, npt.NDArray[np.boo
     return start[plausible], end[plausible], (header & (end <= data.size))[plausible]
 
 
-def _checksum_holds(data: ByteArray, start: IntArray, end: IntArray) -> npt.NDArray[np.bool_]:
+def _checksum_holds(data: ByteArray, start: IntArray, end: IntArray) -> BoolArray:
     summed = np.cumsum(data, dtype=np.uint8)
     return np.asarray(summed[end - 1] == summed[start])
 
 
 def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> tuple[IntArray, IntArray, int]:
     """Of messages that may overlap, those that count, and where the first still unfinished one begins."""
-    waiting = _outside(unfinished, start, end)
-    tangled = bool(np.any(start[1:] < end[:-1]) or np.any(waiting[:1] < end[-1:]))
-    if tangled:
-        followed = np.isin(end, start)
-        chosen = _choose(start.tolist(), end.tolist(), followed.tolist(), unfinished.tolist())
-        start, end = start[chosen], end[chosen]
-        waiting = unfinished[unfinished >= (end[-1] if end.size else 0)]
+    counts = _clear(start, end, unfinished)
+    rest = np.flatnonzero(~counts)
+    if rest.size:
+        chosen = _choose(
+            start[rest].tolist(), end[rest].tolist(), _is_in(end[rest], start).tolist(), unfinished.tolist()
+        )
+        counts[rest[chosen]] = True
+    start, end = start[counts], end[counts]
+    waiting = unfinished[unfinished >= (end[-1] if end.size else 0)]
     return start, end, int(waiting[0]) if waiting.size else size
 
 
-def _outside(points: IntArray, start: IntArray, end: IntArray) -> IntArray:
-    """Those of `points` that lie in none of the intervals."""
+def _clear(start: IntArray, end: IntArray, unfinished: IntArray) -> BoolArray:
+    """Which messages overlap no other and no unfinished one: nearly all, and they need no choice."""
     if not start.size:
-        return points
-    before = np.searchsorted(start, points, side="right") - 1
-    return points[(before < 0) | (points >= end[before])]
+        return np.zeros(0, dtype=bool)
+    reach = np.maximum.accumulate(end)
+    opens = np.concatenate(([True], start[1:] >= reach[:-1], [True]))
+    clear = opens[:-1] & opens[1:]
+    if unfinished.size:
+        clear &= reach <= unfinished[0]
+    return np.asarray(clear)
+
+
+def _is_in(points: IntArray, increasing: IntArray) -> BoolArray:
+    at = np.minimum(np.searchsorted(increasing, points), increasing.size - 1)
+    return np.asarray(increasing[at] == points)
 
 
 def _choose(start: list[int], end: list[int], followed: list[bool], unfinished: list[int]) -> list[int]:
