@@ -19,6 +19,9 @@ from calibration.solution import Solution
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
 
+_ROUNDING = 1e-20
+"""Variance of cosines that are all the same but for rounding; tilts of a tenth of a degree make 1e-13."""
+
 
 @dataclass(frozen=True)
 class BeamBias:
@@ -71,7 +74,7 @@ def bias_along_beam_mm(normal_in_image: FloatArray, width_mm: float) -> float:
     """
     oblique, along = np.abs(normal_in_image[:, 2]), np.abs(normal_in_image[:, 1])
     spread = float(np.var(along))
-    if spread == 0.0:
+    if spread < _ROUNDING:
         return float("nan")
     return width_mm / 2.0 * float(np.mean((oblique - oblique.mean()) * (along - along.mean()))) / spread
 
