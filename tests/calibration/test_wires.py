@@ -169,8 +169,8 @@ def points_of(pixels, rows):
 def test_points_picked_by_hand_are_explained_to_a_millimetre(picked):
     solution = calibrate_crossing(points_of(*picked), outlier_sigma=np.inf)
     assert solution.used.all()
-    # 0.980 mm, and as much with nine free numbers instead of a rigid mounting and two scales, which make image
-    # axes 89.9 degrees apart: nothing is left that any mounting could explain.
+    # 0.980 mm, and as much with nine free numbers instead of a rigid mounting and two scales, which make
+    # image axes 89.9 degrees apart: nothing is left that any mounting could explain.
     assert np.sqrt(np.mean(np.sum(solution.residuals**2, axis=1))) <= 1.2
     assert solution.condition_number < 20
     matrix = np.concatenate(

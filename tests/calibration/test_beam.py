@@ -1,0 +1,116 @@
+"""The bias of a thick beam on a bare wall: closed form, and prediction against scans with such a beam."""
+
+import numpy as np
+import pytest
+from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane
+
+from calibration.beam import bias_along_beam_mm, depth_error_mm, focal_width_mm, predict_bias
+from calibration.plane import calibrate_plane
+from speckle3d.core.errors import InvalidInputError
+
+
+def tilted(angles_rad):
+    """Normals of a wall in images that are tilted about their x axis."""
+    zero = np.zeros_like(angles_rad)
+    return np.column_stack([zero, -np.cos(angles_rad), np.sin(angles_rad)])
+
+
+def of_uniform_tilt(reach):
+    """Half the covariance of sine and cosine over the variance of the cosine, of tilts up to `reach`."""
+    sine, cosine = (1 - np.cos(reach)) / reach, np.sin(reach) / reach
+    product, square = np.sin(reach) ** 2 / (2 * reach), 0.5 + np.sin(2 * reach) / (4 * reach)
+    return 0.5 * (product - sine * cosine) / (square - cosine**2)
+
+
+def moved_mm(found, columns_and_rows):
+    """Displacement of a pixel from where the true mounting has it, along the image's axes."""
+    before, after = (
+        mounting.apply(np.append(columns_and_rows * pixel_mm, 0.0))
+        for mounting, pixel_mm in ((TRIAL_1, PIXEL_MM), (found.sensor_from_image, found.pixel_mm))
+    )
+    return TRIAL_1.rotation.inv().apply(after - before)
+
+
+@pytest.mark.parametrize("width_mm", [0.6, 1.0, 3.0])
+def test_the_closed_form_is_the_integral_for_tilt_alone(width_mm):
+    angles = np.deg2rad(np.linspace(-25, 25, 20001))
+    assert of_uniform_tilt(np.deg2rad(25)) == pytest.approx(-2.11, abs=0.005)
+    found = bias_along_beam_mm(tilted(angles), width_mm)
+    # A sum over 20,001 angles differs from the integral by some 1e-4.
+    assert found == pytest.approx(of_uniform_tilt(np.deg2rad(25)) * width_mm, rel=3e-4)
+
+
+@pytest.mark.parametrize("reach_deg", [10.0, 40.0])
+def test_the_less_the_probe_is_tilted_the_larger_the_bias(reach_deg):
+    found = bias_along_beam_mm(tilted(np.deg2rad(np.linspace(-reach_deg, reach_deg, 20001))), 1.0)
+    assert found == pytest.approx(of_uniform_tilt(np.deg2rad(reach_deg)), rel=3e-4)
+    assert (found < of_uniform_tilt(np.deg2rad(25))) == (reach_deg < 25)
+
+
+def test_the_nearer_edge_of_the_beam_is_as_much_nearer_as_geometry_says():
+    # The two faces of a sheet 2 mm thick, at z = -1 and 1, meet the wall at these depths.
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(50, 3)) * [0.3, 1.0, 0.3]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[:, 1] = -np.abs(normal[:, 1])
+    height = rng.uniform(10, 30, 50)
+    centre, *edges = (-(height + normal[:, 2] * z) / normal[:, 1] for z in (0.0, -1.0, 1.0))
+    np.testing.assert_allclose(depth_error_mm(normal, 2.0), centre - np.minimum(*edges), atol=1e-12)
+
+
+def test_heights_that_never_change_say_nothing():
+    assert np.isnan(bias_along_beam_mm(tilted(np.full(10, 0.1)), 1.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("width_mm", [1.0, 3.0])
+def test_what_is_predicted_is_what_a_thick_beam_does(seed, width_mm):
+    thin, thick = (
+        calibrate_plane(scan_plane(np.random.default_rng(seed), beam_mm=w).lines, outlier_sigma=np.inf)
+        for w in (0.0, width_mm)
+    )
+    middle = thin.points.pixels.mean(axis=0)
+    happened = moved_mm(thick.chain, middle)
+    size = np.linalg.norm(happened)
+    # From exact lines; and, as on real ones, from lines that the beam has already moved.
+    for solution in (thin, thick):
+        predicted = predict_bias(solution, width_mm)
+        np.testing.assert_allclose(predicted.simulated_mm, happened, atol=0.005 * size)
+        assert predicted.closed_form_mm == pytest.approx(happened[1], rel=0.05)
+        assert predicted.rms_mm == pytest.approx(thick.rms, rel=0.01)
+        assert predicted.width_mm == width_mm
+    assert happened[1] < 0
+    assert abs(happened[1]) > 0.99 * size
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_hardly_changes_the_prediction(seed):
+    thick, thin = (
+        calibrate_plane(scan_plane(np.random.default_rng(seed), beam_mm=w, noisy=noisy).lines)
+        for w, noisy in ((2.0, True), (0.0, False))
+    )
+    expected = predict_bias(thin, 2.0).simulated_mm
+    np.testing.assert_allclose(predict_bias(thick, 2.0).simulated_mm, expected, atol=0.05 * 4.18)
+
+
+def test_held_pixels_stay_held():
+    scan = scan_plane(np.random.default_rng(0), beam_mm=2.0)
+    solution = calibrate_plane(scan.lines, PIXEL_MM, fit_pixels=False, outlier_sigma=np.inf)
+    happened = moved_mm(solution.chain, solution.points.pixels.mean(axis=0))
+    np.testing.assert_allclose(predict_bias(solution, 2.0).simulated_mm, happened, atol=0.02 * 4.18)
+
+
+def test_no_thickness_no_bias():
+    solution = calibrate_plane(scan_plane(np.random.default_rng(0), 100, line_noise_mm=0.2).lines)
+    predicted = predict_bias(solution, 0.0)
+    np.testing.assert_allclose(predicted.simulated_mm, 0.0, atol=1e-9)
+    assert predicted.closed_form_mm == 0.0
+    with pytest.raises(InvalidInputError, match="width_mm"):
+        predict_bias(solution, -1.0)
+
+
+def test_focal_width_of_the_published_probe():
+    # TR 303, appendix D: 20 mm x 0.2 mm / 7 mm, printed as 0.6 mm.
+    assert focal_width_mm(20.0, 0.2, 7.0) == pytest.approx(0.571, abs=0.001)
+    with pytest.raises(InvalidInputError, match="above zero"):
+        focal_width_mm(20.0, 0.2, 0.0)
