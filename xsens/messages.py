@@ -112,7 +112,7 @@ class State(Enum):
 
 _IN_BOTH = {MessageId.GO_TO_CONFIG, MessageId.RESET, MessageId.RESET_ORIENTATION, MessageId.REQ_DID}
 _WHILE_MEASURING = {MessageId.REQ_DATA}
-_STATE_AFTER = {
+_STATE_AFTER: dict[int, State] = {
     MessageId.GO_TO_MEASUREMENT_ACK: State.MEASUREMENT,
     MessageId.MT_DATA: State.MEASUREMENT,
     MessageId.MT_DATA2: State.MEASUREMENT,
@@ -130,7 +130,7 @@ def valid_in(request: int, state: State) -> bool:
 
 def state_after(message: Message, state: State) -> State:
     """The sensor's state once it has sent `message`, `state` being the one before."""
-    return _STATE_AFTER.get(MessageId(message.mid), state) if message.mid in set(MessageId) else state
+    return _STATE_AFTER.get(message.mid, state)
 
 
 def reply_to(request: int) -> int:

@@ -111,6 +111,8 @@ class DataLayout:
             raise InvalidInputError(
                 f"output settings: expected orientation as 0, 1 or 2, got 3 in {self.settings:#x}"
             )
+        if not self.fields:
+            raise InvalidInputError(f"output settings: expected some output, got {self.settings:#x}")
 
     @property
     def number_format(self) -> NumberFormat:
