@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import TracebackType
@@ -16,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
 from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, atomic_hdf5, open_hdf5
+from speckle3d.io.hdf5 import PathLike, atomic_hdf5, atomic_path, open_hdf5, opened
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames
 
 Compression = Literal["gzip", "lzf"] | None
@@ -101,15 +102,7 @@ class SweepWriter:
 
     def write_orientation(self, sensor: OrientationSensor) -> None:
         """Write the orientation sensor's stream."""
-        group = self._file.create_group("orientation")
-        group["time_s"] = sensor.readings.time_s
-        group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
-        for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
-            if (values := getattr(sensor, name)) is not None:
-                group[name] = np.asarray(values, dtype=np.float64)
-        if sensor.sensor_from_image is not None:
-            group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
-        group.attrs["time_offset_s"] = sensor.time_offset_s
+        _fill_orientation(self._file.create_group("orientation"), sensor)
 
     def write_tracker(self, tracker: Tracker) -> None:
         """Write the 6-DOF sensor's stream."""
@@ -213,6 +206,42 @@ def write_sweep(
             writer.write_simulation(simulation)
         if isinstance(sweep.frames, HDF5Frames):
             writer.copy_unknown(sweep.frames.path)
+
+
+def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool = False) -> None:
+    """Put an orientation sensor's stream into a sweep file that is already there.
+
+    The file is copied, changed and put back in one step, so that it is never half written.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or written.
+    InvalidInputError
+        If it is no sweep file, or has a stream already and `replace` is not given.
+    """
+    with opened(path, FORMAT, VERSION) as file:
+        if "orientation" in file and not replace:
+            raise InvalidInputError(
+                f"{path}: expected a sweep without an orientation sensor's stream, got one: say to replace it"
+            )
+    with atomic_path(path) as part:
+        shutil.copyfile(path, part)
+        with h5py.File(part, "r+") as file:
+            if "orientation" in file:
+                del file["orientation"]
+            _fill_orientation(file.create_group("orientation"), sensor)
+
+
+def _fill_orientation(group: h5py.Group, sensor: OrientationSensor) -> None:
+    group["time_s"] = sensor.readings.time_s
+    group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
+    for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+        if (values := getattr(sensor, name)) is not None:
+            group[name] = np.asarray(values, dtype=np.float64)
+    if sensor.sensor_from_image is not None:
+        group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
+    group.attrs["time_offset_s"] = sensor.time_offset_s
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
