@@ -31,6 +31,10 @@ MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
 """Root mean square residual that no phantom leaves: the worst published is 3.5 mm as a distance, with early
 magnetic trackers (TR 303, section 5), 2 mm in each component."""
 
+SMALLEST_IMAGE_MM = 1.0
+"""Pixels that make an image smaller have shrunk to nothing: the image is then one point, which hovers at the
+same height if the probe was turned about a point of it."""
+
 _TURN_RAD, _SHIFT_MM = np.deg2rad(15.0), 10.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
@@ -50,12 +54,15 @@ class Motion:
     turns: bool
 
 
+_UP_AND_DOWN = Motion("move the probe up and down (the phantom then appears at other depths)", 1, False)
+_SHRUNK = "the motion does not determine the pixel size"
+
 MOTIONS = (
     Motion("tilt the probe to and fro (rotate about the image's lateral axis)", 0, True),
     Motion("rotate about the beam axis", 1, True),
     Motion("roll the probe from side to side (rotate about the elevational axis)", 2, True),
     Motion("shift the probe sideways (the phantom then appears elsewhere across the image)", 0, False),
-    Motion("move the probe up and down (the phantom then appears at other depths)", 1, False),
+    _UP_AND_DOWN,
 )
 
 
@@ -110,11 +117,13 @@ def judge(solution: Solution) -> Adequacy:
     # Not where a phantom that fits would be no help: the solver runs off along the way that is left open.
     if share < 1 and share * error <= limit:
         return Adequacy(error, condition, (), True, _misfit(solution))
+    if not angular and _image_mm(solution).min() < SMALLEST_IMAGE_MM:
+        return Adequacy(error, condition, (_UP_AND_DOWN.advice,), True, f"{_SHRUNK}: {_UP_AND_DOWN.advice}")
     refused = bool(error > limit or not condition <= MAX_CONDITION)
     missing = tuple(_missing(solution, information, weak)) if error > weak else ()
     where = "" if angular else " at the image's corners"
     state = f"standard error {_size(error, angular)}{where}, condition number {condition:.3g}"
-    advice = "; and ".join(missing) if missing else _more(error <= weak)
+    advice = "; and ".join(missing) if missing else _more(solution.phantom.seen_as == "dot" and error <= weak)
     if refused:
         verdict = f"the motion does not determine the calibration ({state}): {advice}"
     elif error > weak:
@@ -122,6 +131,11 @@ def judge(solution: Solution) -> Adequacy:
     else:
         verdict = f"the motion was sufficient ({state})"
     return Adequacy(error, condition, missing, refused, verdict)
+
+
+def _image_mm(solution: Solution) -> FloatArray:
+    """How far right and down the phantom was seen."""
+    return np.asarray(solution.points.pixels[solution.used].max(axis=0) * solution.chain.pixel_mm)
 
 
 def _misfit(solution: Solution) -> str:
@@ -136,9 +150,9 @@ def _size(error: float, angular: bool) -> str:
     return f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm"
 
 
-def _more(image_is_known: bool) -> str:
+def _more(only_phantom_unknown: bool) -> str:
     """What helps where no motion does."""
-    if image_is_known:
+    if only_phantom_unknown:
         return "what stays unknown is where the phantom is: show more of it, all its wires"
     return "record more frames over a wider range"
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.adequacy import require_adequate
+from calibration.adequacy import judge, require_adequate
 from calibration.chain import (
     CHAIN,
     PROBE,
@@ -43,9 +43,12 @@ _FEWEST_LINES = 6
 _SOME_FRAMES = 100
 """Frames that choose among starting points, all of them refining the answer afterwards."""
 
+_PIXEL_MM = 0.15
+"""Of an image some hundred pixels high of tissue some centimetres deep, where nobody says."""
+
 OUTLIER_SIGMA = 4.0
-"""Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals one
-in 16,000, so that nothing is lost where nothing is wrong."""
+"""Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals of
+one size one in 16,000; of dots, which are known less well out of the image than in it, one in a hundred."""
 
 MAD_TO_SIGMA = 1.4826
 _REWEIGHTINGS = 8
@@ -288,7 +291,25 @@ def calibrate_plane(
     held = None if fit_pixels else np.asarray(pixel_mm, dtype=float)
     probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
     start = _three_stages(lines, held) if stages == "three" else _one_stage(lines, held, probe)
-    return facing_up(require_adequate(solve(lines, Plane(), start, probe, outlier_sigma)))
+    solution = solve(lines, Plane(), start, probe, outlier_sigma)
+    if fit_pixels and judge(solution).refused:
+        size = np.full(2, _PIXEL_MM) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
+        solution = _from_plausible_pixels(lines, size, outlier_sigma)
+    return facing_up(require_adequate(solution))
+
+
+def _from_plausible_pixels(lines: ImagePoints, pixel_mm: FloatArray, outlier_sigma: float) -> Solution:
+    """Try once more, pixels held at first: free ones may shrink to nothing where the motion is poor.
+
+    If they do so again, the solution with held pixels is returned as one with free ones, to be judged by.
+    """
+    start = _three_stages(lines, pixel_mm)
+    held = solve(lines, Plane(), start, PROBE[len(SCALES) :], outlier_sigma)
+    again = solve(lines, Plane(), held.chain, PROBE, outlier_sigma)
+    if not judge(again).refused:
+        return again
+    shown = replace(held, free=again.free, fit=again.fit)
+    return shown if judge(shown).refused else again
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
