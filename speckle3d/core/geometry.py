@@ -8,6 +8,8 @@ Lengths are millimetres, angles radians.
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -42,9 +44,11 @@ def roll_yaw_tilt(rotation: Rotation) -> FloatArray:
     Returns
     -------
     ndarray, shape (..., 3)
-        Roll, yaw, tilt in radians.
+        Roll, yaw, tilt in radians; tilt is zero where yaw is a right angle, and roll and tilt are one.
     """
-    return np.asarray(rotation.as_euler("ZYX"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Gimbal lock", UserWarning)
+        return np.asarray(rotation.as_euler("ZYX"))
 
 
 def relative_poses(world_from_image: RigidTransform) -> RigidTransform:

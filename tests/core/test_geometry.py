@@ -145,3 +145,10 @@ def test_times_that_stand_still_or_run_back_are_named_by_index(times):
 def test_times_must_be_a_row():
     with pytest.raises(InvalidInputError, match=r"t: expected shape \(m,\), got \(1, 2\)"):
         require_increasing([[0.0, 1.0]], "t")
+
+
+def test_a_yaw_of_a_right_angle_is_no_reason_to_warn():
+    # Roll and tilt are then one angle, and which of them it is given to does not matter.
+    rotation = rotation_from_fixed_angles(0.3, np.pi / 2, -0.2)
+    again = rotation_from_fixed_angles(*roll_yaw_tilt(rotation))
+    assert (rotation.inv() * again).magnitude() < 1e-7
