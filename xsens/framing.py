@@ -110,7 +110,7 @@ class Frames:
         """First bytes of the payloads, shape (n,)."""
         return np.asarray(self.start + 4 + 2 * (self.data[self.start + 3] == _EXTENDED))
 
-    @property
+    @cached_property
     def payload_size(self) -> IntArray:
         """Bytes in the payloads, shape (n,)."""
         return self.end - 1 - self.payload_start
@@ -118,7 +118,9 @@ class Frames:
     def payloads(self) -> ByteArray:
         """Payloads as rows, shape (n, size); they must all be as long as the first."""
         size = int(self.payload_size[0]) if len(self) else 0
-        return np.asarray(self.data[self.payload_start[:, None] + np.arange(size)])
+        if size == 0 or not len(self):
+            return np.zeros((len(self), size), dtype=np.uint8)
+        return np.asarray(np.lib.stride_tricks.sliding_window_view(self.data, size)[self.payload_start])
 
     def message(self, index: int) -> Message:
         """The message at `index`."""

@@ -124,8 +124,9 @@ class RawCalibration:
         ndarray, shape (3, n, 3)
         """
         scaled = (np.asarray(counts, dtype=float) - self.offsets) / self.gains
-        inverses = np.linalg.inv(self.misalignments)
-        return np.stack([scaled[:, i] @ inverses[i].T for i in range(3)])
+        x, y, z = (np.moveaxis(scaled[..., i : i + 1], 0, 1) for i in range(3))
+        columns = np.swapaxes(np.linalg.inv(self.misalignments), 1, 2)[:, :, None]
+        return np.asarray(x * columns[:, 0] + y * columns[:, 1] + z * columns[:, 2])
 
     def to_counts(self, values: FloatArray) -> npt.NDArray[np.uint16]:
         """Counts, shape (n, 3, 3), that `to_units` takes to `values`, shape (3, n, 3), clipped to 16 bits."""
