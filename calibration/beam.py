@@ -34,7 +34,8 @@ class BeamBias:
     closed_form_mm : float
         Displacement of the image along its y axis, from the heights alone; negative: towards the probe.
     simulated_mm : ndarray, shape (3,)
-        Displacement of the image's centre along its axes when all parameters are estimated.
+        Displacement of the middle of the lines' points along the image's axes when all parameters are
+        estimated.
     rms_mm : float
         Residual that the thickness leaves.
     """
@@ -87,9 +88,9 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     Raises
     ------
     InvalidInputError
-        If `width_mm` is negative.
+        If `width_mm` is negative or not finite.
     """
-    if width_mm < 0:
+    if not (np.isfinite(width_mm) and width_mm >= 0):
         raise InvalidInputError(f"width_mm: expected zero or more, got {width_mm:g}")
     points, chain = solution.points[solution.used], solution.chain
     near = chain.target_from_image(points)

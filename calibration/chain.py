@@ -11,7 +11,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol
 
@@ -96,6 +96,12 @@ class ImagePoints:
         """Two points of a line in each frame: m frames and poses, `points_px` of shape (m, 2, 2)."""
         twice = np.repeat(np.arange(len(frame)), 2)
         return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], world_from_sensor[twice])
+
+
+def as_directions(lines: ImagePoints) -> ImagePoints:
+    """Directions of lines given by two points each; their poses keep the rotation alone."""
+    turns = RigidTransform.from_rotation(lines.world_from_sensor[::2].rotation)
+    return replace(lines[::2], pixels=lines.pixels[1::2] - lines.pixels[::2], world_from_sensor=turns)
 
 
 class Phantom(Protocol):

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
-from calibration.chain import ImagePoints, IntArray
+from calibration.chain import ImagePoints, IntArray, as_directions
 from calibration.lines import EchoLines, LineSettings, detect_lines
 from calibration.orientation import Viewed, calibrate_orientation
 from calibration.pairing import Offset, covered, estimate_offset
@@ -71,10 +71,13 @@ class Job:
     ----------
     estimate_offset : bool
         Find the clock offset that explains the images best, near the recording's own.
+    offset_given : bool
+        The recording's clock offset was given, and belongs to the calibration even if it is zero.
     """
 
     estimate_offset: bool = False
     outlier_sigma: float = OUTLIER_SIGMA
+    offset_given: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,7 @@ def plane_job(
     beam_mm: Sequence[float] = (),
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with a plane; `beam_mm` are thicknesses whose bias the report shows."""
+    _require_poses(recording)
 
     def calibrate(points: ImagePoints) -> Solution:
         return calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma)
@@ -149,10 +153,11 @@ def orientation_job(
     """Calibrate an orientation sensor with a plane."""
 
     def calibrate(points: ImagePoints) -> Solution:
+        lines = as_directions(points)
         return calibrate_orientation(
-            points.pixels[1::2] - points.pixels[::2],
-            points.frame[::2],
-            points.world_from_sensor.rotation[::2],
+            lines.pixels,
+            lines.frame,
+            lines.world_from_sensor.rotation,
             recording.pixel_mm,
             level,
             viewed_from,
@@ -164,6 +169,7 @@ def orientation_job(
 
 def crossing_job(recording: Recording, seen: Seen, job: Job, fit_pixels: bool = True) -> Outcome:
     """Calibrate a 6-DOF sensor with two crossing wires or a bead."""
+    _require_poses(recording)
 
     def calibrate(points: ImagePoints) -> Solution:
         return calibrate_crossing(points, recording.pixel_mm, fit_pixels, job.outlier_sigma)
@@ -180,6 +186,7 @@ def wires_job(
     registration: Registration = "turned",
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes."""
+    _require_poses(recording)
 
     def calibrate(points: ImagePoints) -> Solution:
         return calibrate_wires(
@@ -248,7 +255,8 @@ def _finished(
     points, told = paired(recording, seen, used_offset)
     solution = calibrate(points)
     frames = FramesUsed(recording.images.shape[0], (), told.dropped)
-    stored = used_offset if offset is not None or recording.time_offset_s != 0.0 else None
+    known = offset is not None or job.offset_given or recording.time_offset_s != 0.0
+    stored = used_offset if known else None
     calibration = as_calibration(solution, method, frames, stored)
     return Outcome(solution, calibration, _shots(recording, seen, calibration), (), offset)
 
@@ -282,7 +290,7 @@ def _shot(recording: Recording, seen: Seen, number: int, note: str) -> Shot:
     )
 
 
-def require_poses(recording: Recording) -> None:
+def _require_poses(recording: Recording) -> None:
     """Raise `InvalidInputError` unless the sensor tells positions."""
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(

@@ -28,6 +28,7 @@ from calibration.chain import (
     IntArray,
     Phantom,
     Seen,
+    as_directions,
     residuals_and_jacobian,
 )
 from calibration.solution import Solution
@@ -335,9 +336,7 @@ def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str
 
 def _directions(lines: ImagePoints) -> ImagePoints:
     """From one end to the other of some of the lines."""
-    few = some(lines)
-    first, second = few[::2], few[1::2]
-    return replace(first, pixels=second.pixels - first.pixels)
+    return as_directions(some(lines))
 
 
 def _ratio(pixel_mm: FloatArray | None) -> float:

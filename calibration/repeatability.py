@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.chain import Chain, ImagePoints, residuals_and_jacobian
+from calibration.chain import Chain, ImagePoints, as_directions, residuals_and_jacobian
 from calibration.plane import solve
 from calibration.solution import Solution
 from speckle3d.core.calibration import Calibration
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import FloatArray
 
 
@@ -60,9 +60,13 @@ def repeatability(
     ------
     InsufficientDataError
         If there are fewer than two.
+    InvalidInputError
+        If the image has no size.
     MismatchError
         If they are not of one kind of sensor.
     """
+    if size_px is not None and min(size_px) < 1:
+        raise InvalidInputError(f"size_px: expected columns and rows above zero, got {size_px}")
     if len(calibrations) < 2:
         raise InsufficientDataError(f"expected at least two calibrations to compare, got {len(calibrations)}")
     sensors = sorted({one.sensor for one in calibrations})
@@ -101,7 +105,7 @@ class Validation:
     Attributes
     ----------
     residuals : ndarray, shape (n, r)
-        Of all points, none left out, mm.
+        Of all points, none left out, mm (sines of angles for directions).
     """
 
     chain: Chain
@@ -116,7 +120,12 @@ class Validation:
 def validate(solution: Solution, points: ImagePoints) -> Validation:
     """Hold a calibration and see how well it explains another recording.
 
-    A plane is found anew, for it may be another; wires are held where they were.
+    A plane is found anew, for it may be another, unless it is level; wires are held where they were.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        Dots, or two points of each line.
 
     Raises
     ------
@@ -124,7 +133,8 @@ def validate(solution: Solution, points: ImagePoints) -> Validation:
         If the recording is too short to find the plane in.
     """
     chain, phantom = solution.chain, solution.phantom
-    if phantom.seen_as == "line":
+    points = as_directions(points) if phantom.seen_as == "direction" else points
+    if phantom.seen_as != "dot" and phantom.determined:
         found = solve(points, phantom, chain, probe=(), outlier_sigma=np.inf)
         return Validation(found.chain, found.residuals)
     return Validation(chain, residuals_and_jacobian(chain.parameters(), points, phantom)[0])

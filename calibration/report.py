@@ -14,13 +14,14 @@ from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
 from calibration.solution import Solution
-from speckle3d.core.calibration import Calibration, Parameter
+from speckle3d.core.calibration import Calibration, readable
 from speckle3d.core.geometry import FloatArray, roll_yaw_tilt
 
 USED, DROPPED = "#0072B2", "#D55E00"
 """Of Okabe and Ito's palette, told apart with any colour vision."""
 
 _LONGEST_REASONS = 6
+_MOST_NAMED = 20
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Shot:
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
     """What was found as description, value and unit, angles in degrees."""
     rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
-    rows += [_row(parameter) for parameter in calibration.parameters]
+    rows += [parameter.row() for parameter in calibration.parameters]
     names = ("roll", "yaw", "tilt")
     angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
     errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
@@ -54,14 +55,14 @@ def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
         (f"sensor_from_image, {name}", f"{angle:.3f} +- {error:.3f}", "deg")
         for name, angle, error in zip(names, angles, errors, strict=True)
     ]
-    rms = np.rad2deg(calibration.rms) if calibration.rms_unit == "rad" else calibration.rms
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
     rows += [
-        ("RMS residual", f"{rms:.3f}", "deg" if calibration.rms_unit == "rad" else calibration.rms_unit),
+        ("RMS residual", *readable(calibration.rms, calibration.rms_unit)),
         ("condition number", f"{calibration.condition_number:.1f}", ""),
         ("frames used", used, ""),
     ]
-    rows += [(f"dropped: {reason}", str(count), "frames") for reason, count in _reasons(calibration)]
+    reasons = list(calibration.frames.reasons().items())[:_LONGEST_REASONS]
+    rows += [(f"dropped: {reason}", str(count), "frames") for reason, count in reasons]
     if calibration.time_offset_s is not None:
         rows.append(("sensor clock offset", f"{calibration.time_offset_s:+.4f}", "s"))
     return [*rows, ("verdict", calibration.verdict, "")]
@@ -72,6 +73,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
     rows = rows_of(calibration)
     width = max(len(description) for description, _, _ in rows)
     lines = [f"{description.ljust(width)}  {value} {unit}".rstrip() for description, value, unit in rows]
+    lines += _left_out(calibration)
     if calibration.translation_mm is not None and calibration.pixel_mm is not None:
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
@@ -87,6 +89,16 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
             "a thin bar that stays in the middle of the beam has none.",
         ]
     return "\n".join([*lines, *(["", *notes] if notes else [])]) + "\n"
+
+
+def _left_out(calibration: Calibration) -> list[str]:
+    """The frames that do not count, by number, with the whole reason."""
+    dropped = sorted(calibration.frames.dropped.items())
+    if not dropped:
+        return []
+    lines = ["", "Frames left out:", *(f"  {number}: {reason}" for number, reason in dropped[:_MOST_NAMED])]
+    more = len(dropped) - _MOST_NAMED
+    return [*lines, f"  and {more} more, which the calibration file names"] if more > 0 else lines
 
 
 def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
@@ -120,32 +132,15 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
-    size = calibration.pixel_mm
+    # Of an orientation sensor's pixels the ratio is known, which is what counts here.
+    aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
-        _draw_shot(axes, shot, 1.0 if size is None else float(size[1] / size[0]))
+        _draw_shot(axes, shot, aspect)
     _draw_residuals(panels[1, 0], solution)
     _draw_against_tilt(panels[1, 1], solution)
     _draw_motion(panels[1, 2], solution)
     figure.suptitle(calibration.verdict, fontsize=10)
     return figure
-
-
-def _row(parameter: Parameter) -> tuple[str, str, str]:
-    angular = parameter.unit == "rad"
-    value, error = (
-        np.rad2deg(number) if angular else number for number in (parameter.value, parameter.standard_error)
-    )
-    digits = 5 if parameter.unit == "mm/pixel" else 3
-    return parameter.name, f"{value:.{digits}f} +- {error:.{digits}f}", "deg" if angular else parameter.unit
-
-
-def _reasons(calibration: Calibration) -> list[tuple[str, int]]:
-    """Reasons without the numbers that differ from frame to frame."""
-    counted: dict[str, int] = {}
-    for reason in calibration.frames.dropped.values():
-        plain = reason.split(" by ")[0].split(":")[0]
-        counted[plain] = counted.get(plain, 0) + 1
-    return sorted(counted.items(), key=lambda item: -item[1])[:_LONGEST_REASONS]
 
 
 def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:

@@ -53,6 +53,10 @@ Validation = Annotated[
 ]
 
 
+_BESIDE = (".txt", ".png", ".csv")
+"""What lies beside a calibration file: its table, its pictures, and the dots it was made from."""
+
+
 class Stages(StrEnum):
     """How a plane calibration is solved."""
 
@@ -109,19 +113,19 @@ def calibrate_plane(
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
-    from calibration.job import plane_job, require_poses
+    from calibration.job import plane_job
 
+    _require_free(out, images, poses, validation)
     lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
     recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
-    require_poses(recording)
-    seen = _seen_lines(recording, lines, region, images)
+    seen = find_lines(recording, region, images, lines)
     widths = () if reflector is Reflector.bar else tuple(beam_mm or (1.0, 2.0, 3.0))
     with naming(str(images)):
         outcome = plane_job(recording, seen, job, not fixed_pixels, stages.value, widths)
     notes = []
     if validation is not None:
         other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
-        notes = _validated(outcome, other, _seen_lines(other, lines, region, validation), validation)
+        notes = _validated(outcome, other, find_lines(other, region, validation, lines), validation)
     _finish(images, out, outcome, seen, as_json, notes)
 
 
@@ -143,6 +147,7 @@ def calibrate_orientation(
     region: Region = None,
     time_offset: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
+    validation: Validation = None,
     columns: Columns = None,
     smoothing_mm: SmoothingMm = None,
     threshold: Threshold = None,
@@ -154,12 +159,17 @@ def calibrate_orientation(
     """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
     from calibration.job import orientation_job
 
+    _require_free(out, images, poses, validation)
     lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
     recording, job = _prepared(images, poses, pixel_mm, sensor, time_offset, outlier_sigma)
-    seen = _seen_lines(recording, lines, region, images)
+    seen = find_lines(recording, region, images, lines)
     with naming(str(images)):
         outcome = orientation_job(recording, seen, job, level, viewed_from.value)
-    _finish(images, out, outcome, seen, as_json)
+    notes = []
+    if validation is not None:
+        other, _ = _prepared(validation, None, pixel_mm, sensor, time_offset, outlier_sigma)
+        notes = _validated(outcome, other, find_lines(other, region, validation, lines), validation)
+    _finish(images, out, outcome, seen, as_json, notes)
 
 
 @calibrate.command("wires")
@@ -181,19 +191,24 @@ def calibrate_wires(
     time_offset: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
     validation: Validation = None,
+    validation_points: Annotated[
+        Path | None, typer.Option(help="CSV of points picked by hand in that other recording.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
-    from calibration.job import crossing_job, require_poses, wires_job
+    from calibration.job import crossing_job, wires_job
     from speckle3d.io.plus_config import WireConfig, read_wire_phantom
 
+    if validation is None and validation_points is not None:
+        raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
+    _require_free(out, images, points, poses, validation, validation_points, Path(phantom))
     config: WireConfig | None = None
     if phantom not in ("cross", "three"):
         config = read_wire_phantom(phantom)
         if pixel_mm is None and config.pixel_mm is not None:
             pixel_mm = (config.pixel_mm, config.pixel_mm)
     recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
-    require_poses(recording)
     seen = _seen_wires(recording, phantom, config, points, region, images)
     with naming(str(images)):
         if phantom == "cross":
@@ -204,9 +219,24 @@ def calibrate_wires(
     notes = _nwire_notes(outcome, outcome.solution.points)
     if validation is not None:
         other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
-        other_seen = _seen_wires(other, phantom, config, None, region, validation)
+        other_seen = _seen_wires(other, phantom, config, validation_points, region, validation)
         notes += _validated(outcome, other, other_seen, validation)
     _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
+
+
+def _require_free(out: Path, *inputs: Path | None) -> None:
+    """Refuse an output that cannot be written, or that would take the place of its report or of an input."""
+    from speckle3d.io.hdf5 import require_target
+
+    target = require_target(out)
+    if target.suffix in _BESIDE:
+        raise InvalidInputError(
+            f"{out}: expected a calibration file, not {', '.join(_BESIDE)}, which are written beside it"
+        )
+    written = {target, *(target.with_suffix(suffix) for suffix in _BESIDE)}
+    for path in inputs:
+        if path is not None and path.resolve() in written:
+            raise InvalidInputError(f"{path}: would be overwritten by the results: give -o another name")
 
 
 def _three_wires() -> Any:
@@ -256,12 +286,17 @@ def _prepared(
         return recording, Job(False, outlier_sigma)
     if time_offset == "estimate":
         return recording, Job(True, outlier_sigma)
+    return replace(recording, time_offset_s=_seconds(time_offset)), Job(False, outlier_sigma, True)
+
+
+def _seconds(text: str) -> float:
+    from speckle3d.io.headers import numbers
+
     try:
-        return replace(recording, time_offset_s=float(time_offset)), Job(False, outlier_sigma)
-    except ValueError:
-        raise InvalidInputError(
-            f"--time-offset: expected seconds or `estimate`, got {time_offset!r}"
-        ) from None
+        (seconds,) = numbers(text, 1, "--time-offset")
+    except InvalidInputError:
+        raise InvalidInputError(f"--time-offset: expected seconds or `estimate`, got {text!r}") from None
+    return seconds
 
 
 def _region(text: str | None) -> FloatArray | None:
@@ -279,7 +314,10 @@ def _region(text: str | None) -> FloatArray | None:
     return corners
 
 
-def _seen_lines(recording: Recording, settings: LineSettings, region: str | None, images: Path) -> Seen:
+def find_lines(
+    recording: Recording, region: str | None, images: Path, settings: LineSettings | None = None
+) -> Seen:
+    """Find the plane's line in every image, with a bar."""
     from calibration.job import Seen
 
     corners = _region(region)
@@ -297,10 +335,13 @@ def _seen_wires(
     names = ("x", "y", "z") if phantom == "three" else () if config is None else config.phantom.names
     if points is not None:
         picked = read_points(points, names)
+        with naming(str(points)):
+            picked.require_inside(recording.images.shape)
         return Seen(picked.frame, picked.pixels, picked.wire)
     if phantom == "three":
         raise InvalidInputError(
-            "--phantom three: expected --points, a CSV that says on which wire each dot lies, got none"
+            "--phantom three: expected --points (of --validation: --validation-points), a CSV that says on "
+            "which wire each dot lies, got none"
         )
     corners = _region(region)
     with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
@@ -313,12 +354,15 @@ def _seen_wires(
 def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
     from calibration.job import paired
     from calibration.repeatability import validate
+    from speckle3d.core.calibration import readable
 
+    found = outcome.calibration.time_offset_s
     with naming(str(path)):
-        points, _ = paired(other, seen, outcome.calibration.time_offset_s or other.time_offset_s)
+        points, _ = paired(other, seen, other.time_offset_s if found is None else found)
         checked = validate(outcome.solution, points)
     frames = len(set(points.frame.tolist()))
-    notes = [f"on {path.name}, not used: RMS residual {checked.rms:.3f} mm, {frames} frames, none left out"]
+    rms, unit = readable(checked.rms, outcome.calibration.rms_unit)
+    notes = [f"on {path.name}, not used: RMS residual {rms} {unit}, {frames} frames, none left out"]
     return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, points)]
 
 

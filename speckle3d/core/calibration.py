@@ -15,6 +15,13 @@ from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
 SENSORS = ("tracker", "orientation")
 
 
+def readable(value: float, unit: str) -> tuple[str, str]:
+    """A number and its unit for people: angles in degrees, pixel sizes to a hundredth of a micrometre."""
+    if unit == "rad":
+        return f"{np.rad2deg(value):.3f}", "deg"
+    return f"{value:.{5 if unit == 'mm/pixel' else 3}f}", unit
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One estimated number with its standard error; zero where it was given and not estimated."""
@@ -23,6 +30,11 @@ class Parameter:
     value: float
     standard_error: float
     unit: str
+
+    def row(self) -> tuple[str, str, str]:
+        """Name, value with its standard error, and unit, for people."""
+        value, unit = readable(self.value, self.unit)
+        return self.name, f"{value} +- {readable(self.standard_error, self.unit)[0]}", unit
 
 
 @dataclass(frozen=True)
@@ -77,7 +89,7 @@ class Calibration:
     translation_mm : ndarray, shape (3,), optional
         The image's origin in the sensor's frame; None for an orientation sensor.
     pixel_mm : ndarray, shape (2,), optional
-        Distance between columns and between rows, mm, where it was measured or needed.
+        Distance between columns and between rows, mm, estimated or held; None for an orientation sensor.
     covariance : ndarray, shape (6, 6) or (3, 3)
         Of the image's pose in its own frame: rotations about the image's x, y, z (tilt, yaw, roll) in rad,
         then displacements along them in mm.
@@ -166,6 +178,22 @@ def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
         return 0.0
     size_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
     return float(np.abs(calibration.pixel_mm / size_mm - 1.0).max())
+
+
+def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:
+    """How far a calibration's mounting is from the sweep's own: degrees, and mm; zero if one is unknown."""
+    if calibration.sensor == "orientation":
+        turn = None if sweep.orientation is None else sweep.orientation.sensor_from_image
+        return (0.0 if turn is None else _apart_deg(turn, calibration.rotation)), 0.0
+    held = None if sweep.tracker is None else sweep.tracker.sensor_from_image
+    if held is None:
+        return 0.0, 0.0
+    step = held.inv() * calibration.sensor_from_image
+    return _apart_deg(held.rotation, calibration.rotation), float(np.linalg.norm(step.translation))
+
+
+def _apart_deg(one: Rotation, other: Rotation) -> float:
+    return float(np.rad2deg((one.inv() * other).magnitude()))
 
 
 def _tracker(sweep: Sweep, calibration: Calibration) -> Tracker:

@@ -39,11 +39,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     FileError
         If the folder does not exist, `path` is not an ordinary file, or the system refuses to write.
     """
-    target = Path(path).resolve()
-    if target.exists() and not target.is_file():
-        raise FileError(f"{path}: expected an ordinary file to write, got a folder or device")
-    if not target.parent.is_dir():
-        raise FileError(f"{path}: expected an existing folder, got {target.parent}")
+    target = require_target(path)
     part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
     try:
         yield part
@@ -54,6 +50,22 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         raise FileError(f"{path}: cannot be written: {one_line(error)}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def require_target(path: PathLike) -> Path:
+    """Path of a file that may be written, resolved; to be asked before long work, too.
+
+    Raises
+    ------
+    FileError
+        If the folder does not exist, or `path` is not an ordinary file.
+    """
+    target = Path(path).resolve()
+    if target.exists() and not target.is_file():
+        raise FileError(f"{path}: expected an ordinary file to write, got a folder or device")
+    if not target.parent.is_dir():
+        raise FileError(f"{path}: expected an existing folder, got {target.parent}")
+    return target
 
 
 def make_folder(path: PathLike) -> None:

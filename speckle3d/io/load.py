@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from speckle3d.core.calibration import Calibration, Parameter
+from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
 from speckle3d.core.reconstruction import Reconstruction
@@ -181,7 +181,7 @@ def _describe_calibration(path: PathLike) -> list[Row]:
         ("sensor", held.sensor, ""),
         *_mounting_rows(held),
         *(_parameter_row(one) for one in held.parameters),
-        ("RMS residual", *_readable(held.rms, held.rms_unit)),
+        ("RMS residual", *readable(held.rms, held.rms_unit)),
         ("condition number", f"{held.condition_number:.1f}", ""),
         ("time offset", offset, "" if held.time_offset_s is None else "s"),
         ("frames used", f"{len(held.frames.used)} of {held.frames.given}", ""),
@@ -209,14 +209,8 @@ def _mounting_rows(held: Calibration) -> list[Row]:
 
 
 def _parameter_row(one: Parameter) -> Row:
-    value, unit = _readable(one.value, one.unit)
-    return (f"parameter {one.name}", f"{value} +- {_readable(one.standard_error, one.unit)[0]}", unit)
-
-
-def _readable(value: float, unit: str) -> tuple[str, str]:
-    if unit == "rad":
-        return f"{np.rad2deg(value):.3f}", "deg"
-    return f"{value:.{5 if unit == 'mm/pixel' else 3}f}", unit
+    name, value, unit = one.row()
+    return (f"parameter {name}", value, unit)
 
 
 def _listed(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:

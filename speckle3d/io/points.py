@@ -7,9 +7,9 @@
     0,605.7,191.9,G1
     0,436.2,181.1,L1
 
-Frames count from 0, as in the sweep; columns and rows are vectors and samples of its frames, fractional and
-from 0 at the centre of the first. The column ``wire`` may be missing. A wire goes by its name or by its
-number in the phantom, from 0.
+Frames count from 0, as in the sweep; columns and rows are those of its images, fractional and from 0 at the
+centre of the first; images made from RF have fewer rows than it has samples. The column ``wire`` may be
+missing. A wire goes by its name or by its number in the phantom, from 0.
 """
 
 from __future__ import annotations
@@ -65,6 +65,21 @@ class PickedPoints:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def require_inside(self, shape: tuple[int, ...]) -> None:
+        """Raise `MismatchError` unless all points lie in the frames of images of `shape` (n, column, row)."""
+        count, *size = shape
+        if len(self) and int(self.frame.max()) >= count:
+            raise MismatchError(f"expected frames from 0 to {count - 1}, got frame {int(self.frame.max())}")
+        half = 0.5
+        outside = ((self.pixels < -half) | (self.pixels > np.array(size) - half)).any(axis=1)
+        if outside.any():
+            first = int(np.flatnonzero(outside)[0])
+            column, row = self.pixels[first]
+            raise MismatchError(
+                f"expected points within images of {size[0]} columns and {size[1]} rows, got column "
+                f"{column:g}, row {row:g} in frame {int(self.frame[first])}"
+            )
 
 
 def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:

@@ -10,7 +10,7 @@ from commands import run_command
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
 from speckle3d.core.wires import three_wires
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.points import PickedPoints, write_points
@@ -120,6 +120,68 @@ def test_a_clock_that_is_off_is_found(run, scans, tmp_path):
     assert error_of(out, scans / "bar.h5")[1] < 0.3
 
 
+def test_a_clock_offset_that_is_given_is_kept_even_if_zero(run, scans, tmp_path):
+    exact, out = tmp_path / "exact.h5", tmp_path / "c.h5"
+    exact.write_bytes((scans / "bar.h5").read_bytes())
+    with h5py.File(exact, "r+") as file:
+        # The same readings, by the images' clock.
+        file["tracker/time_s"][...] += float(file["tracker"].attrs["time_offset_s"])
+        file["tracker"].attrs["time_offset_s"] = 0.0
+    for options, expected in (((), None), (("--time-offset", "0"), 0.0)):
+        assert run("calibrate", "plane", exact, "-o", out, *options)[0] == 0
+        assert read_calibration(out).time_offset_s == expected
+
+
+@pytest.mark.parametrize("level", [(), ("--level",)])
+def test_an_orientation_sensor_is_validated_on_another_recording(run, scans, tmp_path, level):
+    options = ("--validation", scans / "noisy.h5", *level)
+    code, table, err = run("calibrate", "orientation", scans / "bar.h5", "-o", tmp_path / "c.h5", *options)
+    assert code == 0, err
+    value, unit = table.split("on noisy.h5, not used: RMS residual ")[1].split()[:2]
+    assert unit == "deg,"
+    # The sensor wanders by 0.15 degrees in inclination; the mounting is another one in neither.
+    assert 0.01 < float(value) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("in.h5", "in.h5: would be overwritten by the results"),
+        ("probe.txt", "expected a calibration file, not .txt, .png, .csv"),
+        ("none/probe.h5", "expected an existing folder"),
+        (".", "got a folder or device"),
+    ],
+)
+def test_results_take_the_place_of_nothing(refused, scans, tmp_path, name, told):
+    images = tmp_path / "in.h5"
+    images.write_bytes((scans / "bar.h5").read_bytes())
+    before = images.read_bytes()
+    for kind in ("plane", "orientation"):
+        assert told in refused("calibrate", kind, images, "-o", tmp_path / name)
+    assert told in refused("calibrate", "wires", images, "-o", tmp_path / name, "--phantom", "cross")
+    assert images.read_bytes() == before
+
+
+def test_points_picked_by_hand_are_not_overwritten(refused, scans, tmp_path):
+    picked = tmp_path / "c.csv"
+    picked.write_text("frame,column_px,row_px\n")
+    options = ("--phantom", "cross", "--points", picked)
+    assert "c.csv: would be overwritten" in refused(
+        "calibrate", "wires", scans / "bar.h5", "-o", tmp_path / "c.h5", *options
+    )
+
+
+def test_frames_left_out_are_named_in_the_report(run, scans, tmp_path):
+    worse = tmp_path / "worse.h5"
+    worse.write_bytes((scans / "bar.h5").read_bytes())
+    with h5py.File(worse, "r+") as file:
+        file["rf"][7] = 0
+    code, table, err = run("calibrate", "plane", worse, "-o", tmp_path / "c.h5", "--reflector", "bar")
+    assert code == 0, err
+    assert "dropped: no line" in table
+    assert "\nFrames left out:\n  7: no line: " in table
+
+
 def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_path):
     line = refused("calibrate", "plane", scans / "untilted.h5", "-o", tmp_path / "c.h5")
     assert "untilted.h5" in line
@@ -136,6 +198,8 @@ def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_pat
         (("--columns", "2"), "--columns: "),
         (("--place", "middle"), "--place: "),
         (("--time-offset", "soon"), "--time-offset: expected seconds or `estimate`"),
+        (("--time-offset", "nan"), "--time-offset: expected seconds or `estimate`"),
+        (("--beam-mm", "nan"), "width_mm: expected zero or more, got nan"),
         (("--time-offset", "100"), "expected sensor readings at the times of the frames"),
         (("--pixel-mm", "0", "1"), "--pixel-mm: expected two values above zero"),
     ],
@@ -158,36 +222,29 @@ def test_recordings_without_the_sensor_or_the_phantom_are_refused(refused, shipp
     assert "--points" in line
 
 
-@pytest.mark.parametrize("kind", ["cross", "three"])
-def test_picked_points_calibrate_with_wires(run, tmp_path, kind):
-    rng = np.random.default_rng(5)
-    count = 90
-    wire = np.repeat([0, 1, 2], 30) if kind == "three" else None
+def scan_of_wires(folder, kind, seed, count=90):
+    """Blank images, the sensor's readings, and picks of a phantom that is where it was: sweep and CSV."""
+    rng = np.random.default_rng(seed)
+    wire = np.repeat([0, 1, 2], count // 3) if kind == "three" else None
     places = np.zeros((count, 3)) if wire is None else rng.uniform(-30, 30, (count, 1)) * np.eye(3)[wire]
     stand = RigidTransform.from_components([200.0, -50.0, 120.0], Rotation.from_rotvec([0.4, -0.3, 1.1]))
     pixels, readings = scan_wires(rng, places, world_from_phantom=stand, noise_mm=0.1)
     times = np.arange(count) / 10.0
-    grid = ImageGrid(8, 64, 1.0, 1.0)
-    signal = RFSettings(20e6, 1540.0, 5e6, (2e6, 8e6))
     tracker = Tracker(TimedPoses(times, readings))
-    write_sweep(
-        tmp_path / "wires.h5",
-        Sweep(np.zeros((count, 8, 64), np.int16) + 1, grid, signal, times, tracker=tracker),
-    )
-    names = three_wires().names
-    write_points(tmp_path / "picked.csv", PickedPoints(np.arange(count), pixels, wire), names)
+    images = np.zeros((count, 290, 290), np.uint8)
+    sweep = Sweep(images, ImageGrid(290, 290, 1.0, 1.0), BModeSettings(60.0), times, tracker=tracker)
+    files = folder / f"wires-{seed}.h5", folder / f"picked-{seed}.csv"
+    write_sweep(files[0], sweep)
+    write_points(files[1], PickedPoints(np.arange(count), pixels, wire), three_wires().names)
+    return files
+
+
+@pytest.mark.parametrize("kind", ["cross", "three"])
+def test_picked_points_calibrate_with_wires(run, tmp_path, kind):
+    (sweep, picked), (other, others) = (scan_of_wires(tmp_path, kind, seed) for seed in (5, 6))
     out = tmp_path / "c.h5"
-    code, table, err = run(
-        "calibrate",
-        "wires",
-        tmp_path / "wires.h5",
-        "-o",
-        out,
-        "--phantom",
-        kind,
-        "--points",
-        tmp_path / "picked.csv",
-    )
+    options = ("--phantom", kind, "--points", picked, "--validation", other, "--validation-points", others)
+    code, table, err = run("calibrate", "wires", sweep, "-o", out, *options)
     assert code == 0, err
     found = read_calibration(out)
     assert found.method == {"cross": "cross-wire", "three": "three-wire"}[kind]
@@ -198,6 +255,19 @@ def test_picked_points_calibrate_with_wires(run, tmp_path, kind):
     assert out.with_suffix(".csv").read_text().startswith("frame,column_px,row_px")
     assert len(found.parameters) == {"cross": 11, "three": 14}[kind]
     assert "condition number" in table
+    # The noise of the picks, in the two directions of each equation's three that it has.
+    validated = float(table.split("wires-6.h5, not used: RMS residual ")[1].split()[0])
+    assert 0.05 < validated < 0.15
+
+
+def test_points_of_another_recording_are_refused(refused, tmp_path):
+    sweep, picked = scan_of_wires(tmp_path, "cross", 5)
+    command = ("calibrate", "wires", sweep, "-o", tmp_path / "c.h5", "--phantom", "cross", "--points")
+    picked.write_text(picked.read_text() + "90,10,10\n")
+    assert "picked-5.csv: expected frames from 0 to 89, got frame 90" in refused(*command, picked)
+    picked.write_text("frame,column_px,row_px\n0,10,400\n")
+    assert "got column 10, row 400 in frame 0" in refused(*command, picked)
+    assert "--validation" in refused(*command, picked, "--validation-points", picked)
 
 
 @pytest.mark.realdata
@@ -238,3 +308,4 @@ def test_repeated_calibrations_are_compared(run, refused, scans, tmp_path):
     # Two trials: the scatter about their mean is the shift over the square root of two.
     assert found["centre_sd_mm"] == pytest.approx(found["centre_shift_mm"][0] / np.sqrt(2))
     assert "at least two" in refused("calibrate", "repeatability", files[0])
+    assert "above zero" in refused("calibrate", "repeatability", *files, "--size-px", "40", "0")

@@ -120,3 +120,18 @@ def test_arrays_that_do_not_match_are_refused():
         PickedPoints(np.array([-1]), np.ones((1, 2)))
     with pytest.raises(InvalidInputError, match="finite"):
         PickedPoints(np.array([0]), np.array([[np.nan, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("frame", "pixels", "message"),
+    [
+        (5, (1.0, 2.0), "expected frames from 0 to 4, got frame 5"),
+        (4, (9.6, 2.0), "within images of 10 columns and 20 rows, got column 9.6, row 2 in frame 4"),
+        (4, (1.0, -0.6), "got column 1, row -0.6 in frame 4"),
+    ],
+)
+def test_points_of_other_images_are_refused(frame, pixels, message):
+    points = PickedPoints(np.array([0, frame]), np.array([(-0.5, 19.5), pixels]))
+    with pytest.raises(MismatchError, match=re.escape(message)):
+        points.require_inside((5, 10, 20))
+    PickedPoints(points.frame[:1], points.pixels[:1]).require_inside((5, 10, 20))
