@@ -27,6 +27,9 @@ NOTED_SIZE = 0.01
 
 NOTED_OFFSET_S = 0.001
 
+NOTED_DEG, NOTED_MM = 5.0, 10.0
+"""Difference of mountings from which it is told: no calibration of the same mounting is so far off."""
+
 
 def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
     """Put calibration files on a sweep's sensors, and say on stderr where they contradict the sweep."""
@@ -80,6 +83,20 @@ def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> Non
     held_s, found_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
     if held_s and found_s is not None and abs(found_s - held_s) > NOTED_OFFSET_S:
         note(f"{path}: time offset {found_s:+.4f} s is used, not the sweep's {held_s:+.4f} s")
+    _note_mounting(sweep, path, calibration)
+
+
+def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
+    """Say where a calibration puts the image quite elsewhere than the sweep does."""
+    from speckle3d.core.calibration import mounting_difference
+
+    turned_deg, moved_mm = mounting_difference(sweep, calibration)
+    if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
+        moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""
+        note(
+            f"{path}: puts the image {turned_deg:.0f} degrees{moved} from where the sweep has it on the "
+            f"{calibration.sensor} sensor, and is used: is it of this mounting?"
+        )
 
 
 def _image_grid(sweep: Sweep) -> ImageGrid:

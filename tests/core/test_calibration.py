@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import sweep_examples
 from calibration_files import ROTATION, made
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.calibration import FramesUsed, calibrated, pixel_difference
+from speckle3d.core.calibration import FramesUsed, calibrated, mounting_difference, pixel_difference
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
 
@@ -70,6 +70,22 @@ def test_pixels_are_compared_by_the_worse_axis(pixel_mm, expected):
     grid = ImageGrid(10, 20, 0.1, 0.2)
     assert pixel_difference(grid, made(pixel_mm=np.array(pixel_mm))) == pytest.approx(expected, abs=1e-12)
     assert pixel_difference(grid, made("orientation")) == 0.0
+
+
+@pytest.mark.parametrize("sensor", ["tracker", "orientation"])
+def test_mountings_are_compared_where_both_are_known(sensor):
+    sweep = calibrated(sweep_examples.rf_sweep(), made(sensor))
+    assert mounting_difference(sweep, made(sensor)) == pytest.approx((0.0, 0.0), abs=1e-6)
+    turned = made(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
+    assert mounting_difference(sweep, turned) == pytest.approx((7.0, 0.0), abs=1e-6)
+    unknown = replace(sweep, **{sensor: replace(getattr(sweep, sensor), sensor_from_image=None)})
+    assert mounting_difference(unknown, turned) == (0.0, 0.0)
+
+
+def test_a_moved_mounting_is_told_in_mm():
+    sweep, moved = calibrated(sweep_examples.rf_sweep(), made()), made()
+    moved = replace(moved, translation_mm=moved.translation_mm + np.array([3.0, 0.0, -4.0]))
+    assert mounting_difference(sweep, moved) == pytest.approx((0.0, 5.0), abs=1e-6)
 
 
 def test_reasons_are_counted_without_their_details_most_frequent_first():
