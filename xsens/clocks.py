@@ -147,9 +147,9 @@ def _seconds(
 ) -> FloatArray:
     """By the clock, else by the counter."""
     if ticks is not None:
-        return ticks * tick_s
+        return np.asarray(ticks * tick_s)
     assert samples is not None  # one of the two is there
-    return samples * period_s
+    return np.asarray(samples * period_s)
 
 
 def _rise(values: IntArray | None, span: int) -> IntArray | None:
