@@ -10,11 +10,21 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from speckle3d.cli import curves, files, phantoms, reconstruction, repeatability
+from speckle3d.cli import clock, curves, files, phantoms, reconstruction, repeatability
 from speckle3d.cli.common import app, calibrate
 from speckle3d.core.errors import Speckle3DError
 
-__all__ = ["app", "calibrate", "curves", "files", "main", "phantoms", "reconstruction", "repeatability"]
+__all__ = [
+    "app",
+    "calibrate",
+    "clock",
+    "curves",
+    "files",
+    "main",
+    "phantoms",
+    "reconstruction",
+    "repeatability",
+]
 
 _STOPPED = 130
 """Exit code after Ctrl-C, as shells have it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -105,7 +106,11 @@ class TimedRotations(_Timed):
         t = self._clock.require(times_s)
         if len(self) == 1:
             return self.world_from_sensor[np.zeros(t.shape, dtype=int)]
-        return Slerp(self.time_s, self.world_from_sensor)(t)
+        return self._slerp(t)
+
+    @cached_property
+    def _slerp(self) -> Slerp:
+        return Slerp(self.time_s, self.world_from_sensor)
 
 
 @dataclass(frozen=True)
@@ -141,6 +146,11 @@ class TimedPoses(_Timed):
         t = self._clock.require(times_s)
         if len(self) == 1:
             return self.world_from_sensor[np.zeros(t.shape, dtype=int)]
-        translation, rotation = self.world_from_sensor.as_components()
+        translation, slerp = self._paths
         moved = np.stack([np.interp(t, self.time_s, column) for column in translation.T], axis=-1)
-        return RigidTransform.from_components(moved, Slerp(self.time_s, rotation)(t))
+        return RigidTransform.from_components(moved, slerp(t))
+
+    @cached_property
+    def _paths(self) -> tuple[FloatArray, Slerp]:
+        translation, rotation = self.world_from_sensor.as_components()
+        return np.asarray(translation), Slerp(self.time_s, rotation)
