@@ -65,7 +65,7 @@ class SimulatedDevice:
         A symbolic link to the terminal, as ``/dev/serial/by-id`` has; it disappears with the plug.
     """
 
-    def __init__(self, path, kind="mt9", rate_hz=200.0, device_id=DEVICE_ID, wake_s=0.15):
+    def __init__(self, path, kind="mt9", rate_hz=200.0, device_id=DEVICE_ID, wake_s=0.5):
         self.path, self.kind, self.device_id, self.wake_s = path, kind, device_id, wake_s
         self.rate_hz = rate_hz
         self.mode = {"mt9": 0x8000, "legacy": 0x0004}.get(kind, 0)
@@ -92,6 +92,11 @@ class SimulatedDevice:
         self._stop.set()
         self._thread.join(5)
         self._pull()
+
+    @property
+    def run(self):
+        """Counters of the samples sent since it last began to measure."""
+        return self.runs[-1] if self.runs else []
 
     # what a person can do
 

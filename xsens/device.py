@@ -29,6 +29,7 @@ from xsens.messages import (
     set_output_configuration,
 )
 from xsens.mtdata import OutputMode, OutputSettings
+from xsens.rawcounts import RawCalibration
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -168,6 +169,10 @@ class Device:
         with self._there():
             self._port.write(encode(message))
 
+    def _waiting(self) -> bool:
+        with self._there():
+            return bool(self._port.in_waiting)
+
     @contextmanager
     def _there(self) -> Iterator[None]:
         try:
@@ -184,6 +189,8 @@ class Device:
         DeviceError
             If there is no answer after `tries`, or the answer is an error.
         """
+        while self._waiting():  # an answer that came too late to an earlier request is none to this
+            self.receive()
         for _ in range(tries):
             self.send(request)
             deadline = time.monotonic() + within_s
@@ -203,7 +210,7 @@ class Device:
             raise DeviceError(
                 f"{self._port.name}: message {request.mid:#04x} was answered by {error_of(message)}"
             )
-        if message.mid == MessageId.WAKE_UP:
+        if message.mid == MessageId.WAKE_UP and request.mid != MessageId.GO_TO_CONFIG:
             self.send(Message(MessageId.WAKE_UP_ACK))
 
     def ask(self, mid: int) -> Message | None:
@@ -295,10 +302,17 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
 def _describe(device: Device, number: int, kind: str) -> DeviceInfo:
     asked = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS))
     header = tuple(message for message in asked if message is not None)
-    rate = float("nan")
-    if header and header[0].mid == MessageId.CONFIGURATION:
-        rate = Configuration.from_message(header[0]).rate_hz
-    return DeviceInfo(number, kind, rate, header)
+    return DeviceInfo(number, kind, _rate_hz(header), header)
+
+
+def _rate_hz(header: tuple[Message, ...]) -> float:
+    """By the configuration, or failing that by the calibration block; NaN if neither says."""
+    for message in header:
+        if message.mid == MessageId.CONFIGURATION:
+            return Configuration.from_message(message).rate_hz
+        with suppress(InvalidInputError):  # later sensors' blocks have another layout
+            return RawCalibration.from_message(message).rate_hz
+    return float("nan")
 
 
 def _configure_legacy(device: Device, settings: DeviceSettings, mt9: bool) -> None:

@@ -32,7 +32,9 @@ def of_kind(*kinds, **more):
 class TestDevice:
     @of_kind(*KINDS)
     def test_is_found_and_described_whatever_it_is_doing(self, sensor):
-        time.sleep(0.3)  # by now it measures of its own accord
+        sensor.wake_s = 0.0
+        time.sleep(0.1)
+        assert sensor.state == "measurement"  # of its own accord
         with connect(str(sensor.path)) as device:
             assert device.baud == BAUD
             info = prepare(device, DeviceSettings())
@@ -96,6 +98,16 @@ class TestDevice:
             pytest.raises(DeviceError, match=r"message 0xa4 was answered by error 4"),
         ):
             device.request(Message(MessageId.RESET_ORIENTATION, b"\0\1"))
+
+    def test_an_answer_that_came_too_late_is_none_to_the_next_request(self, sensor):
+        with connect(str(sensor.path), BAUD) as device:
+            device.send(Message(MessageId.REQ_CONFIGURATION))
+            wait = time.monotonic() + 2.0
+            while MessageId.REQ_CONFIGURATION not in sensor.requests and time.monotonic() < wait:
+                time.sleep(0.01)
+            sensor.rate_hz = 50.0
+            told = Configuration.from_message(device.request(Message(MessageId.REQ_CONFIGURATION)))
+        assert told.rate_hz == 50.0
 
     def test_an_unplugged_port_is_a_device_error(self, sensor):
         with connect(str(sensor.path), BAUD) as device:
