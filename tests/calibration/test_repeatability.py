@@ -1,0 +1,178 @@
+"""Scatter of repeated calibrations, computed by hand; errors on recordings not calibrated with."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane, scan_wires
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.chain import ImagePoints
+from calibration.plane import calibrate_plane
+from calibration.repeatability import repeatability, rotation_errors, validate
+from calibration.wires import calibrate_crossing
+from speckle3d.core.calibration import Calibration, FramesUsed
+from speckle3d.core.errors import InsufficientDataError, MismatchError
+
+SIZE_PX = (101, 201)
+PITCH_MM = np.array([0.4, 0.2])
+"""So that the image is 40 mm square."""
+
+
+def calibration(turn=None, shift_mm=(0.0, 0.0, 0.0), pixel_mm=PITCH_MM, sensor="tracker"):
+    known = sensor == "tracker"
+    return Calibration(
+        method="plane" if known else "orientation",
+        sensor=sensor,
+        rotation=Rotation.identity() if turn is None else turn,
+        translation_mm=np.array(shift_mm) if known else None,
+        pixel_mm=pixel_mm,
+        covariance=np.eye(6 if known else 3),
+        parameters=(),
+        rms=0.1,
+        rms_unit="mm" if known else "rad",
+        condition_number=10.0,
+        frames=FramesUsed(1, (0,)),
+    )
+
+
+def about(axis, degrees):
+    return Rotation.from_rotvec(np.deg2rad(degrees) * np.eye(3)[axis])
+
+
+def test_two_that_differ_by_a_shift():
+    found = repeatability([calibration(), calibration(shift_mm=(3.0, 0.0, 4.0))], SIZE_PX)
+    assert found.trials == 2
+    np.testing.assert_allclose(found.roll_yaw_tilt_sd_rad, 0.0, atol=1e-12)
+    # 5 mm apart, 2.5 mm from their mean each: sqrt(2 * 2.5**2 / 1).
+    assert found.centre_sd_mm == pytest.approx(2.5 * np.sqrt(2))
+    assert found.corner_sd_mm == pytest.approx(2.5 * np.sqrt(2))
+    np.testing.assert_allclose(found.centre_shift_mm, [5.0])
+
+
+def test_shifts_are_counted_from_the_first_trial():
+    places = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 0.0)]
+    found = repeatability([calibration(shift_mm=place) for place in places], SIZE_PX)
+    np.testing.assert_allclose(found.centre_shift_mm, [1.0, 2.0, 0.0])
+    # Along x .25 * 3 and .75, along y .5 * 3 and 1.5 from the mean: squares sum to 0.75 and 3.
+    assert found.centre_sd_mm == pytest.approx(np.sqrt(3.75 / 3))
+
+
+@pytest.mark.parametrize(("axis", "named"), [(2, 0), (1, 1), (0, 2)])
+def test_roll_yaw_and_tilt_are_about_the_images_z_y_and_x(axis, named):
+    mounting = Rotation.from_rotvec([0.4, -1.1, 2.0])
+    found = repeatability([calibration(mounting * about(axis, degrees)) for degrees in (-1.0, 0.0, 1.0)])
+    expected = np.zeros(3)
+    # -1, 0 and 1: the standard deviation is one, over n - 1.
+    expected[named] = np.deg2rad(1.0)
+    np.testing.assert_allclose(found.roll_yaw_tilt_sd_rad, expected, atol=1e-9)
+
+
+def test_the_mean_of_rotations_is_that_of_their_neighbourhood():
+    # Half a turn from the identity, where angles jump. Means of rotations are of chords: third order.
+    mounting = about(2, 180.0)
+    errors = rotation_errors([mounting * about(2, degrees) for degrees in (-2.0, 0.5, 1.5)])
+    np.testing.assert_allclose(np.rad2deg(errors), [[-2, 0, 0], [0.5, 0, 0], [1.5, 0, 0]], atol=2e-4)
+
+
+def test_corners_scatter_more_than_the_centre_where_the_mounting_turns():
+    # A turn by +-0.01 rad about the image's origin moves a point at r by 0.01 r either way.
+    found = repeatability([calibration(about(2, sign * np.rad2deg(0.01))) for sign in (-1, 1)], SIZE_PX)
+    corners = np.array([[0, 0], [40, 0], [40, 40], [0, 40]])
+    at = np.sqrt(2) * np.sin(0.01)
+    assert found.centre_sd_mm == pytest.approx(at * np.hypot(20, 20))
+    assert found.corner_sd_mm == pytest.approx(at * np.sqrt(np.mean(np.sum(corners**2, axis=1))))
+
+
+def test_pixel_sizes_that_differ_move_the_centre():
+    found = repeatability([calibration(), calibration(pixel_mm=PITCH_MM * 1.1)], SIZE_PX)
+    assert found.centre_shift_mm[0] == pytest.approx(0.1 * np.hypot(20, 20))
+
+
+def test_places_are_told_only_where_they_are_known():
+    sensors = [calibration(about(0, degrees), sensor="orientation") for degrees in (-1.0, 1.0)]
+    for found in (repeatability(sensors, SIZE_PX), repeatability([calibration(), calibration()])):
+        assert found.centre_sd_mm is None
+        assert found.corner_sd_mm is None
+        assert found.centre_shift_mm is None
+    np.testing.assert_allclose(
+        np.rad2deg(repeatability(sensors).roll_yaw_tilt_sd_rad), [0, 0, np.sqrt(2)], atol=1e-9
+    )
+
+
+def test_one_alone_and_different_sensors_are_refused():
+    with pytest.raises(InsufficientDataError, match="at least two"):
+        repeatability([calibration()])
+    with pytest.raises(MismatchError, match="orientation and tracker"):
+        repeatability([calibration(), calibration(sensor="orientation")])
+
+
+def test_repeated_calibrations_scatter_as_much_as_is_claimed():
+    solutions = [
+        calibrate_plane(scan_plane(np.random.default_rng([seed, 3]), 150, line_noise_mm=0.2).lines)
+        for seed in range(20)
+    ]
+    made = [
+        replace(calibration(), rotation=chain.sensor_from_image.rotation, pixel_mm=chain.pixel_mm)
+        for chain in (solution.chain for solution in solutions)
+    ]
+    claimed = np.sqrt(
+        np.mean([np.diag(one.image_covariance(("alpha", "beta", "gamma"))) for one in solutions], axis=0)
+    )
+    # The standard deviation of 20 is known to 16 %; three times that.
+    np.testing.assert_allclose(repeatability(made).roll_yaw_tilt_sd_rad / claimed, 1.0, atol=0.5)
+
+
+def test_another_recording_of_a_plane_may_be_of_another_plane():
+    solution = calibrate_plane(scan_plane(np.random.default_rng(0), 300, line_noise_mm=0.2).lines)
+    wall = RigidTransform.from_components([50.0, -300.0, 80.0], Rotation.from_euler("x", 70, degrees=True))
+    other = scan_plane(np.random.default_rng(1), 200, line_noise_mm=0.2, floor=wall).lines
+    found = validate(solution, other)
+    # Noise of 0.2 mm along the beam, times its cosine with the wall's normal: 0.97 for such tilts and rolls.
+    assert found.rms == pytest.approx(0.2 * 0.96, rel=0.10)
+    np.testing.assert_array_equal(found.chain.pixel_mm, solution.chain.pixel_mm)
+    np.testing.assert_allclose(
+        found.chain.sensor_from_image.as_matrix(), solution.chain.sensor_from_image.as_matrix(), atol=1e-12
+    )
+
+
+def test_a_wrong_calibration_fails_on_another_recording():
+    lines = scan_plane(np.random.default_rng(0), 300, line_noise_mm=0.2).lines
+    solution = calibrate_plane(lines)
+    tilted = solution.chain.sensor_from_image * RigidTransform.from_rotation(about(0, 6.0))
+    wrong = replace(solution, chain=replace(solution.chain, sensor_from_image=tilted))
+    other = scan_plane(np.random.default_rng(1), 200, line_noise_mm=0.2).lines
+    assert validate(wrong, other).rms > 2 * validate(solution, other).rms
+
+
+def test_no_frame_of_another_recording_is_left_out():
+    solution = calibrate_plane(scan_plane(np.random.default_rng(0), 300, line_noise_mm=0.2).lines)
+    lines = scan_plane(np.random.default_rng(1), 200).lines
+    pixels = lines.pixels.copy()
+    pixels[:2, 1] += 20.0 / PIXEL_MM[1]
+    spoilt = validate(solution, replace(lines, pixels=pixels))
+    assert len(spoilt.residuals) == len(lines)
+    # 20 mm in two of 400 points.
+    assert spoilt.rms == pytest.approx(20 * np.sqrt(2 / 400), rel=0.15)
+
+
+def test_a_crossing_stays_where_it_was():
+    crossing = np.tile([10.0, -20.0, 30.0], (60, 1))
+
+    def scan(seed, offset_mm=0.0):
+        places = crossing + np.array([offset_mm, 0.0, 0.0])
+        pixels, readings = scan_wires(np.random.default_rng(seed), places, noise_mm=0.3)
+        return ImagePoints(pixels, np.arange(60), readings)
+
+    solution = calibrate_crossing(scan(0))
+    # 0.3 mm in two of three components; the solution's own error comes in a tenth of that.
+    assert validate(solution, scan(1)).rms == pytest.approx(0.3 * np.sqrt(2 / 3), rel=0.2)
+    # Somebody moved the phantom by 3 mm, along one of three components: that is an error, and is shown.
+    assert validate(solution, scan(1, 3.0)).rms == pytest.approx(3.0 / np.sqrt(3), rel=0.1)
+
+
+def test_trial_one_of_the_report_repeats_to_itself():
+    same = replace(calibration(TRIAL_1.rotation, TRIAL_1.translation))
+    found = repeatability([same, same, same], (290, 290))
+    assert found.centre_sd_mm == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(found.roll_yaw_tilt_sd_rad, 0.0, atol=1e-9)
