@@ -71,7 +71,7 @@ class SimulatedDevice:
         self.mode = {"mt9": 0x8000, "legacy": 0x0004}.get(kind, 0)
         self.settings, self.skip, self.outputs = 0, 0, ((0x2010, 50),)
         self.iron, self.drop, self.corrupt, self.mute = 0.0, set(), set(), False
-        self.sent: list[int] = []
+        self.deaf_to: set[int] = set()
         self.runs: list[list[int]] = []
         self.requests: list[int] = []
         self.counter_start = 0
@@ -194,7 +194,6 @@ class SimulatedDevice:
         if index in self.corrupt:
             message[len(message) // 2] ^= 0x10
         if index not in self.drop and self._write(bytes(message)) and index not in self.corrupt:
-            self.sent.append(counter)
             self.runs[-1].append(counter)
 
     def _data(self, index, counter):
@@ -252,7 +251,7 @@ class SimulatedDevice:
 
     def _heed(self, mid, payload):
         self.requests.append(mid)
-        if self.mute:
+        if self.mute or mid in self.deaf_to:
             return
         if mid == 0x30 or (mid == 0x3F and self.state == ASLEEP):
             self.state = CONFIGURATION

@@ -181,7 +181,7 @@ class Device:
             reason = str(error).splitlines()[0]
             raise DeviceError(f"{self._port.name}: the port is gone: {reason}") from error
 
-    def request(self, request: Message, tries: int = _TRIES, within_s: float = ANSWER_S) -> Message:
+    def request(self, request: Message, tries: int = _TRIES) -> Message:
         """Send and wait for the answer; data and what else arrives meanwhile are passed over.
 
         Raises
@@ -193,7 +193,7 @@ class Device:
             self.receive()
         for _ in range(tries):
             self.send(request)
-            deadline = time.monotonic() + within_s
+            deadline = time.monotonic() + ANSWER_S
             while time.monotonic() < deadline:
                 for message in self.receive():
                     if message.mid == reply_to(request.mid):
@@ -201,7 +201,7 @@ class Device:
                     self._refuse(message, request)
         raise DeviceError(
             f"{self._port.name}: expected an answer to message {request.mid:#04x}, got none in {tries} "
-            f"tries of {within_s:g} s at {self._port.baudrate} baud"
+            f"tries of {ANSWER_S:g} s at {self._port.baudrate} baud"
         )
 
     def _refuse(self, message: Message, request: Message) -> None:

@@ -50,6 +50,14 @@ class TestDevice:
         assert info.rate_hz == sensor.rate_hz == 256.0
         assert Configuration.from_message(info.header[0]).period == 450
 
+    def test_one_that_knows_no_configuration_is_described_by_its_calibration(self, sensor, monkeypatch):
+        monkeypatch.setattr("xsens.device.ANSWER_S", 0.1)
+        sensor.deaf_to = {0x0C, 0xC0}
+        with connect(str(sensor.path), BAUD) as device:
+            info = prepare(device, DeviceSettings(rate_hz=100.0))
+        assert (info.kind, info.rate_hz) == ("MT9-B", 100.0)
+        assert [message.mid for message in info.header] == [MessageId.EMTS]
+
     @of_kind("legacy")
     @pytest.mark.parametrize(("content", "mode"), [("raw", 0x4000), ("calibrated", 2), ("orientation", 6)])
     def test_a_legacy_sensor_sends_what_it_is_told_with_its_counter(self, sensor, content, mode):
