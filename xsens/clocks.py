@@ -21,8 +21,8 @@ BoolArray = npt.NDArray[np.bool_]
 UNKNOWN_PAUSE_S = 1.0
 """Taken as the pause before a new start that no clock tells of; longer than interpolation bridges."""
 
-_COUNTER_SPAN = 1 << 16
 _TICK_SPAN = 1 << 32
+_RARE = 0.01
 _LONGER = 1.5
 """A step of the clock longer than this many periods is a gap."""
 
@@ -34,7 +34,9 @@ class Stamps:
     Attributes
     ----------
     counter, ticks : ndarray of int, shape (m,), optional
-        As sent, of 16 and 32 bits.
+        As sent, wrapping round.
+    counter_span : int
+        Where the counter wraps round to 0.
     tick_s : float
     period_s : float
         Of sampling, as configured; NaN if not known.
@@ -48,6 +50,7 @@ class Stamps:
 
     counter: IntArray | None = None
     ticks: IntArray | None = None
+    counter_span: int = 1 << 16
     tick_s: float = 1e-4
     period_s: float = float("nan")
     others: IntArray | None = None
@@ -95,6 +98,25 @@ def timeline(stamps: Stamps) -> Timeline:
     return Timeline(kept, time_s, _risen(stamps, steps), _gaps(steps), notes)
 
 
+def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Timeline:
+    """Clock of samples that come with their times, and perhaps with a counter that does not wrap round.
+
+    Samples whose time does not rise beyond all before are left out.
+    """
+    before = np.concatenate(([-np.inf], np.maximum.accumulate(time_s)[:-1]))
+    kept = time_s > before
+    time_s, counter = time_s[kept], None if counter is None else counter[kept]
+    seconds = np.diff(time_s)
+    period_s = float(np.median(seconds)) if seconds.size else float("nan")
+    samples = None if counter is None else _samples(np.diff(counter), None, np.zeros(seconds.size, bool))
+    missing = _missing(seconds, samples, period_s, 1 << 62)
+    never = np.zeros(seconds.size, dtype=bool)
+    gaps = _gaps(_Steps(seconds, missing, never, never, period_s, None))
+    late = int((~kept).sum())
+    notes = (f"{late} samples whose time did not rise were left out",) if late else ()
+    return Timeline(kept, time_s, counter, gaps, notes)
+
+
 def _first_of_repeats(stamps: Stamps) -> BoolArray:
     """False for a sample whose stamps are those of the one before."""
     same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
@@ -126,16 +148,17 @@ class _Steps:
 
 
 def _steps(stamps: Stamps) -> _Steps:
-    counts, ticks = _rise(stamps.counter, _COUNTER_SPAN), _rise(stamps.ticks, _TICK_SPAN)
+    span = stamps.counter_span
+    counts, ticks = _rise(stamps.counter, span), _rise(stamps.ticks, _TICK_SPAN)
     anew = _starts_anew(stamps, counts, ticks)
     samples = _samples(counts, stamps.others, anew)
     period_s = stamps.period_s
-    if ticks is not None and not anew.all():
+    if ticks is not None and not (period_s > 0.0 or anew.all()):
         period_s = float(np.median(ticks[~anew])) * stamps.tick_s
     seconds = _seconds(ticks, stamps.tick_s, samples, period_s)
-    missing = _missing(seconds, samples, period_s)
+    missing = _missing(seconds, samples, period_s, span)
     if counts is not None and samples is not None:
-        counts = counts + np.round((missing + 1 - samples) / _COUNTER_SPAN).astype(np.int64) * _COUNTER_SPAN
+        counts = counts + np.round((missing + 1 - samples) / span).astype(np.int64) * span
     pauses = _pauses(stamps, anew, seconds)
     unknown = anew & np.isnan(pauses)
     seconds = np.where(anew, np.where(unknown, UNKNOWN_PAUSE_S, pauses), seconds)
@@ -164,7 +187,7 @@ def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None
         known = None if stamps.computer_s is None else np.isfinite(stamps.computer_s)
     else:
         assert counts is not None
-        anew, known = counts > _COUNTER_SPAN // 2, stamps.starts
+        anew, known = counts > stamps.counter_span // 2, stamps.starts
     return anew if known is None else np.asarray(anew | known[1:])
 
 
@@ -173,18 +196,22 @@ def _samples(counts: IntArray | None, others: IntArray | None, anew: BoolArray) 
     if counts is None:
         return None
     own = np.maximum(counts - (0 if others is None else np.diff(others)), 1)
-    usual = own[~anew]
-    stride = int(np.bincount(usual).argmax()) if usual.size else 1
-    return np.maximum(own / stride, 1.0)
+    return np.maximum(own / _stride(own[~anew]), 1.0)
 
 
-def _missing(seconds: FloatArray, samples: FloatArray | None, period_s: float) -> IntArray:
+def _stride(steps: IntArray) -> int:
+    """What all steps are multiples of, but for rare ones, as where the counter wraps round."""
+    values, often = np.unique(steps, return_counts=True)
+    return int(np.gcd.reduce(values[often >= _RARE * steps.size])) or 1
+
+
+def _missing(seconds: FloatArray, samples: FloatArray | None, period_s: float, span: int) -> IntArray:
     """Samples taken between two, by the counter; by the clock where the counter wrapped or is not there."""
     by_clock = seconds / period_s if period_s > 0.0 else np.ones(seconds.size)
     if samples is None:
         taken = np.where(by_clock > _LONGER, by_clock, 1.0)
     else:
-        taken = samples + np.maximum(np.round((by_clock - samples) / _COUNTER_SPAN), 0) * _COUNTER_SPAN
+        taken = samples + np.maximum(np.round((by_clock - samples) / span), 0) * span
     return np.round(taken).astype(np.int64) - 1
 
 

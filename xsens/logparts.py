@@ -9,7 +9,7 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import BoolArray
-from xsens.clocks import Stamps, timeline
+from xsens.clocks import Stamps, Timeline, timeline
 from xsens.mtdata import DataLayout
 from xsens.rawcounts import RawCalibration
 from xsens.samples import ImuLog
@@ -82,23 +82,16 @@ def on_clock(stamps: Stamps, samples: int, parts: Parts, hints: Hints) -> ImuLog
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
     if stamps.counter is not None or stamps.ticks is not None:
-        return assembled(stamps, parts)
+        return assembled(timeline(stamps), parts)
     if hints.rate_hz is None:
         raise InvalidInputError("expected samples with a clock or a counter, or a sampling rate, got neither")
     uncounted = replace(stamps, counter=np.arange(samples))
     note = "samples have no counter: losses cannot be found"
-    return replace(assembled(uncounted, parts.noting(note)), counter=None)
+    return replace(assembled(timeline(uncounted), parts.noting(note)), counter=None)
 
 
-def assembled(stamps: Stamps, parts: Parts) -> ImuLog:
-    """The log, on the clock that the stamps tell.
-
-    Raises
-    ------
-    InvalidInputError
-        If they tell none.
-    """
-    line = timeline(stamps)
+def assembled(line: Timeline, parts: Parts) -> ImuLog:
+    """The log of the samples that the timeline keeps."""
     turned = parts.orientations
     missing = 0 if turned is None else int((~turned.there).sum())
     lacking = (f"{missing} samples lack the sensor's own orientation",) if missing else ()

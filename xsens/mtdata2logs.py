@@ -99,7 +99,7 @@ def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
             if after < at.size:
                 starts[after], computer_s[after] = True, stamps.computer_s[i]
     others = np.cumsum(~rows, dtype=np.int64)[rows]
-    return Stamps(counter, ticks, _TICK_S, others=others, starts=starts, computer_s=computer_s)
+    return Stamps(counter, ticks, tick_s=_TICK_S, others=others, starts=starts, computer_s=computer_s)
 
 
 def _whole(values: FloatArray | None, rows: BoolArray) -> IntArray | None:
