@@ -9,17 +9,37 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from xsens.bytelogs import parse_stream
+    from xsens.framing import Framer, Message, decode, encode
+    from xsens.logparts import Hints
+    from xsens.logs import read_log, write_csv
     from xsens.samples import Gap, ImuLog
 
 _HOME = {
+    "Framer": "framing",
     "Gap": "samples",
+    "Hints": "logparts",
     "ImuLog": "samples",
+    "Message": "framing",
+    "decode": "framing",
+    "encode": "framing",
+    "parse_stream": "bytelogs",
+    "read_log": "logs",
+    "write_csv": "logs",
 }
 """Where each public name lives."""
 
 __all__ = [
+    "Framer",
     "Gap",
+    "Hints",
     "ImuLog",
+    "Message",
+    "decode",
+    "encode",
+    "parse_stream",
+    "read_log",
+    "write_csv",
 ]
 
 

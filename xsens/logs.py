@@ -26,7 +26,10 @@ MOST_BYTES = 1 << 28
 """Of a log: nine hours of raw counts at 256 Hz. Reading takes some ten times as much memory."""
 
 _SNIFFED = 1 << 16
-_TEXT_CONTROLS = frozenset(b"\t\n\r\f")
+_DAMAGED = 0.01
+_TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
+"""Which bytes text has none of, but for damage."""
+
 _COLUMNS = {
     "accelerometer_m_s2": "accelerometer_{}_m_s2",
     "gyroscope_rad_s": "gyroscope_{}_rad_s",
@@ -72,7 +75,7 @@ def _content(path: PathLike) -> bytes:
                 raise FileError(f"{path}: expected a file, got something else")
             if found.st_size > MOST_BYTES:
                 raise FileError(f"{path}: expected at most {MOST_BYTES} bytes, got {found.st_size}")
-            return file.read(MOST_BYTES)
+            return file.read(found.st_size)
     except FileError:
         raise
     except (OSError, ValueError) as error:
@@ -85,15 +88,18 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def _is_text(data: bytes) -> bool:
-    head = data[:_SNIFFED]
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")) and not len(find_frames(head)):
-        return True
-    return all(byte >= 32 or byte in _TEXT_CONTROLS for byte in set(head)) and not len(find_frames(head))
+    """Whether hardly any byte is a control character, and no message of the sensor is there."""
+    head = np.frombuffer(data[:_SNIFFED], dtype=np.uint8)
+    controls = int((_TEXT_CONTROLS[head]).sum())
+    return (_is_wide(data) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
+
+
+def _is_wide(data: bytes) -> bool:
+    return data.startswith((b"\xff\xfe", b"\xfe\xff"))
 
 
 def _text(data: bytes) -> str:
-    wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
-    return data.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    return data.decode("utf-16" if _is_wide(data) else "utf-8-sig", errors="replace")
 
 
 def write_csv(path: PathLike, log: ImuLog) -> None:

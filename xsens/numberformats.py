@@ -34,10 +34,9 @@ class NumberFormat(IntEnum):
 def numbers_from_bytes(rows: ByteArray, form: NumberFormat) -> FloatArray:
     """Decode rows of bytes, shape (n, k * size), as float64, shape (n, k)."""
     packed = np.ascontiguousarray(rows)
-    if form is NumberFormat.FLOAT32:
-        return packed.view(">f4").astype(np.float64)
-    if form is NumberFormat.FLOAT64:
-        return packed.view(">f8").astype(np.float64)
+    if form in (NumberFormat.FLOAT32, NumberFormat.FLOAT64):
+        with np.errstate(invalid="ignore"):  # signalling NaNs, which damage can make
+            return packed.view(f">f{form.size}").astype(np.float64)
     if form is NumberFormat.FP12_20:
         return packed.view(">i4") / 2.0**20
     parts = packed.reshape(len(rows), -1, 6)
@@ -57,7 +56,7 @@ def bytes_from_numbers(values: npt.ArrayLike, form: NumberFormat) -> ByteArray:
     array = np.asarray(values, dtype=np.float64)
     if form in (NumberFormat.FLOAT32, NumberFormat.FLOAT64):
         with np.errstate(over="ignore", invalid="ignore"):  # to infinity, as the sensor's own would
-            packed = np.ascontiguousarray(array.astype(">f4" if form is NumberFormat.FLOAT32 else ">f8"))
+            packed = np.ascontiguousarray(array.astype(f">f{form.size}"))
         return packed.view(np.uint8)
     if form is NumberFormat.FP12_20:
         return np.ascontiguousarray(_scaled(array, 20, 31).astype(">i4")).view(np.uint8)
