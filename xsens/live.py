@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.geometry import FloatArray, rotation_from_axes
 from xsens.bytelogs import parse_stream
 from xsens.device import DeviceInfo
+from xsens.logparts import Hints
 from xsens.messages import Framer, MessageId, encode
 from xsens.samples import ImuLog
 
@@ -49,7 +50,7 @@ class LiveState:
         Received over the last two seconds.
     bytes_written : int
     world_from_sensor : Rotation, optional
-        The sensor's own orientation, or one filtered here from calibrated data.
+        The sensor's own orientation, or one by gravity and field that is good while the sensor is still.
     field : float
         Norm of the magnetic field over that at the start; NaN without a magnetometer.
     dip_change_rad : float
@@ -86,10 +87,12 @@ class LiveState:
             parts.append(f"{self.interruptions} interruptions")
         if self.world_from_sensor is not None:
             yaw, pitch, roll = self.world_from_sensor.as_euler("ZYX", degrees=True)
-            parts.append(f"roll {roll:+.1f} pitch {pitch:+.1f} heading {yaw:+.1f}")
+            parts.append(f"roll {roll:+.1f} pitch {pitch:+.1f} yaw {yaw:+.1f}")
         if self.disturbed is not None:
             verdict = "DISTURBED" if self.disturbed else "clear"
             parts.append(f"field {self.field:.2f} dip {np.rad2deg(self.dip_change_rad):+.0f} {verdict}")
+        if self.note and not self.connected:
+            parts.append(self.note)
         return " | ".join(parts)
 
 
@@ -104,7 +107,7 @@ class Monitor:
         self._note = ""
         self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_ARRIVALS)
         self._framer = Framer()
-        self._header, self._pending = b"", bytearray()
+        self._header, self._hints, self._pending = b"", Hints(), bytearray()
         self._counter: int | None = None
         self._attitude = _Attitude()
         self._field = _Field()
@@ -114,6 +117,7 @@ class Monitor:
         with self._lock:
             self._digest()
             self._header = b"".join(encode(message) for message in info.header)
+            self._hints = Hints(rate_hz=info.rate_hz if info.rate_hz > 0 else None)
             self._connected, self._counter = True, None
             self._framer = Framer()
             self._arrivals.clear()
@@ -169,7 +173,7 @@ class Monitor:
         if not data:
             return
         try:
-            log = parse_stream(self._header + data)
+            log = parse_stream(self._header + data, self._hints)
         except Speckle3DError as error:
             self._note = str(error)
             return
@@ -187,7 +191,7 @@ class Monitor:
 
 
 class _Attitude:
-    """The sensor's own orientation if it has one, else one filtered here."""
+    """The sensor's own orientation if it has one, else that of gravity and field since it was last asked."""
 
     def __init__(self) -> None:
         self.latest: Rotation | None = None
@@ -195,9 +199,29 @@ class _Attitude:
     def follow(self, log: ImuLog) -> Rotation | None:
         """Orientation of each sample, if there is any."""
         if log.world_from_sensor is None or not log.oriented.any():
+            self.latest = _levelled(log)
             return None
         self.latest = log.world_from_sensor[log.oriented][-1]
         return log.world_from_sensor if log.oriented.all() else None
+
+
+def _levelled(log: ImuLog) -> Rotation | None:
+    """Mean orientation by gravity and field, as if the sensor were not accelerated; None if it lacks either.
+
+    Enough to be looked at while recording; the orientation that counts is made from the recording.
+    """
+    if log.accelerometer_m_s2 is None or log.magnetometer_au is None:
+        return None
+    up, field = (
+        values[np.isfinite(values).all(axis=1)] for values in (log.accelerometer_m_s2, log.magnetometer_au)
+    )
+    if not (len(up) and len(field)):
+        return None
+    west = np.cross(up.mean(axis=0), field.mean(axis=0))
+    north = np.cross(west, up.mean(axis=0))
+    if not np.linalg.norm(north) > 0:
+        return None
+    return rotation_from_axes(north, west).inv()
 
 
 class _Field:

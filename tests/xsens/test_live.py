@@ -123,6 +123,9 @@ class TestMonitor:
                 raw.arrived(encode(Message(MessageId.MT_DATA, payload)))
             field = raw.state(0).field
             assert field == pytest.approx(np.hypot(0.44 + first / 1000, 0.9) / np.hypot(0.44, 0.9), rel=1e-3)
+            turned = raw.state(0).world_from_sensor.as_euler("ZYX", degrees=True)
+            # The mean of samples 0 to 99, or 100 to 199, of a tenth of a degree each; counts are 1/7366.
+            np.testing.assert_allclose(turned, [(first + 49.5) / 10, 0.0, 0.0], atol=0.03)
 
 
 class TestLine:
@@ -139,7 +142,7 @@ class TestLine:
 
     def test_says_that_the_sensor_is_away(self):
         line = self.state(connected=False, interruptions=1, note="the port is gone").line()
-        assert line.endswith("NOT CONNECTED | 1 interruptions")
+        assert line.endswith("NOT CONNECTED | 1 interruptions | the port is gone")
 
     @pytest.mark.parametrize(
         ("field", "dip_deg", "verdict"), [(1.05, 3, "clear"), (1.2, 0, "DISTURBED"), (1, -12, "DISTURBED")]
