@@ -150,13 +150,17 @@ def clustered_covariance(
     index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
     bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-15, hermitian=True)
     order = np.argsort(index, kind="stable")
-    scores = np.zeros((index.max() + 1, jacobian.shape[1]))
-    for members in np.split(order, np.flatnonzero(np.diff(index[order])) + 1):
+    counts = np.bincount(index)
+    starts = np.cumsum(counts) - counts
+    scores = np.zeros((len(counts), jacobian.shape[1]))
+    for size in np.unique(counts):
+        alike = np.flatnonzero(counts == size)
+        members = order[starts[alike][:, None] + np.arange(size)]
         rows = jacobian[members]
         # What the residuals would be, had the cluster not pulled the solution towards itself.
-        left = np.eye(len(rows)) - rows @ bread @ rows.T
-        unpulled = np.linalg.lstsq(left, residuals[members], rcond=1e-9)[0]
-        scores[index[members[0]]] = rows.T @ unpulled
+        left = np.eye(size) - rows @ bread @ np.swapaxes(rows, 1, 2)
+        unpulled = np.linalg.pinv(left, rcond=1e-9, hermitian=True) @ residuals[members][:, :, None]
+        scores[alike] = (np.swapaxes(rows, 1, 2) @ unpulled)[:, :, 0]
     spread = scores.T @ scores
     for lag in range(1, min(lags, len(scores) - 1) + 1):
         together = scores[lag:].T @ scores[:-lag]
