@@ -22,8 +22,8 @@ __all__ = ["Hints", "parse_stream", "parse_text", "read_log", "write_csv"]
 
 PathLike = str | os.PathLike[str]
 
-MOST_BYTES = 1 << 28
-"""Of a log: nine hours of raw counts at 256 Hz. Reading takes some ten times as much memory."""
+MOST_BYTES = 1 << 27
+"""Of a log: five hours of raw counts at 256 Hz. Reading takes ten times as much memory, damage 35 times."""
 
 _SNIFFED = 1 << 16
 _DAMAGED = 0.01
