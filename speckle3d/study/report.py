@@ -1,0 +1,290 @@
+"""A study as one page to read, print and pass on: every figure and number, no network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from speckle3d.core.errors import Speckle3DError
+from speckle3d.io.hdf5 import atomic_path
+from speckle3d.study import report_figures as draw
+from speckle3d.study import report_plots as interactive
+from speckle3d.study.report_data import SweepView, load_view, read_study
+from speckle3d.study.report_images import Cuts, cut_modes
+from speckle3d.study.report_page import (
+    Figure,
+    modes_table,
+    page,
+    paragraphs,
+    parts_table,
+    records_table,
+)
+
+_ERRORS = {
+    "length_error_mm": "length_mm",
+    "length_error_percent": "length_percent",
+    "tilt_error_deg": "tilt_deg",
+    "yaw_error_deg": "yaw_deg",
+    "roll_error_deg": "roll_deg",
+}
+
+_TABLES = {
+    "drift": (
+        "Drift",
+        "FDR and ADR are shares of the true path; MD, SD, HD and the point errors GPE, GLE, LPE, LLE are in "
+        "millimetres, EA in degrees.",
+    ),
+    "intervals": ("Confidence intervals", "95 % intervals over sweeps, by bootstrap."),
+    "paired": ("Modes compared in pairs", "Differences on the same parts of the same sweeps."),
+}
+
+
+def write_report(directory: Path, progress: Callable[[int, int], None] | None = None) -> Path:
+    """Write ``report.html`` and the folder ``figures`` from a study's ``study.json`` and its sweeps' folders.
+
+    The page is one file that needs no network: with scripts its curves, outlines and maps can be turned and
+    read off; without, and in print, it shows the same figures as pictures. A sweep that cannot be shown is
+    told with its reason, and does not stop the others.
+
+    Parameters
+    ----------
+    directory : path
+        The study's folder.
+    progress : callable, optional
+        Called with the number of sweeps done and of all.
+
+    Returns
+    -------
+    Path
+        Of the page, which appears whole or not at all.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no study in the folder.
+    FileError
+        If the page cannot be written.
+    """
+    study = read_study(directory)
+    rows = [row for row in study.get("rows", []) if isinstance(row, dict)]
+    modes = list(dict.fromkeys([*study.get("modes", []), *(row["mode"] for row in rows)]))
+    done = [entry for entry in study["sweeps"] if entry.get("status") == "done"]
+    broken = [entry for entry in study["sweeps"] if entry.get("status") != "done"]
+    anchors = {entry["name"]: f"sweep-{i + 1}" for i, entry in enumerate(done)}
+    scored = [row for row in rows if row.get("length_error_mm") is not None]
+    means = _means(scored, modes)
+    figures: list[Figure] = []
+    overview = _overview(directory, scored, modes, figures)
+    sections = []
+    for i, entry in enumerate(done):
+        sections.append(_section(directory, entry, f"sweep-{i + 1}", figures))
+        if progress:
+            progress(i + 1, len(done))
+    parts = {
+        "title": f"Drift-correction modes compared on {_counted(len(done), 'sweep')}",
+        "lead": paragraphs(summary_lines(means, scored, len(done), len(broken))),
+        "broken": _broken(broken),
+        "modes": modes_table(means, _best(means, "length_percent")) + overview,
+        "parts": parts_table(rows, anchors),
+        "tables": _tables(study, anchors),
+        "buttons": _buttons(done),
+        "sweeps": "\n".join(sections),
+        "configuration": escape(str(study.get("settings_toml", ""))),
+        "provenance": _provenance(study),
+    }
+    target = directory / "report.html"
+    with atomic_path(target) as part:
+        part.write_text(page(parts, figures), encoding="utf-8")
+    return target
+
+
+def summary_lines(
+    means: Sequence[Mapping[str, Any]], scored: Sequence[Mapping[str, Any]], done: int, broken: int
+) -> list[str]:
+    """Say in plain sentences which mode is right, and by how much."""
+    lines = []
+    best, straightest = _best(means, "length_percent"), _best(means, "tilt_deg")
+    if best is None:
+        lines.append(
+            "No sweep has a reference, so no mode can be called right: the lengths below are estimates alone."
+        )
+    else:
+        by_mode = {row["mode"]: row for row in means}
+        parts = len({(row.get("sweep"), row.get("part")) for row in scored})
+        sweeps = len({row.get("sweep") for row in scored})
+        others = [
+            f"{row['length_percent']:.1f} % with {draw.label_of(row['mode'])}"
+            for row in means
+            if row["mode"] != best
+        ]
+        against = f", against {' and '.join(others)}" if others else ""
+        lines.append(
+            f"Over {_counted(parts, 'part')} of {_counted(sweeps, 'sweep')}, {draw.label_of(best)} has the "
+            f"smallest error of length: {by_mode[best]['length_percent']:.1f} % on average "
+            f"({by_mode[best]['length_mm']:.2f} mm){against}."
+        )
+        if straightest is not None:
+            tilts = ", ".join(f"{draw.label_of(row['mode'])} {row['tilt_deg']:.2f}°" for row in means)
+            lines.append(f"In tilt {draw.label_of(straightest)} is closest. Mean tilt error: {tilts}.")
+    if broken:
+        lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below.")
+    return lines
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def _means(scored: Sequence[Mapping[str, Any]], modes: Sequence[str]) -> list[dict[str, Any]]:
+    """Mean magnitude of each error by mode, over all parts of all sweeps."""
+    found = []
+    for mode in modes:
+        mine = [row for row in scored if row["mode"] == mode]
+        if mine:
+            sizes = {short: _mean_size(mine, key) for key, short in _ERRORS.items()}
+            found.append({"mode": mode, "parts": len(mine), **sizes})
+    return found
+
+
+def _mean_size(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    values = [abs(row[key]) for row in rows if row.get(key) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _best(means: Sequence[Mapping[str, Any]], key: str) -> str | None:
+    valued = [row for row in means if row[key] is not None]
+    return str(min(valued, key=lambda row: row[key])["mode"]) if valued else None
+
+
+def _overview(
+    directory: Path, scored: Sequence[Mapping[str, Any]], modes: Sequence[str], figures: list[Figure]
+) -> str:
+    if not scored:
+        return ""
+    shown = [mode for mode in modes if any(row["mode"] == mode for row in scored)]
+    caption = (
+        "Errors of length and tilt: a point for every part of every sweep, a bar from minus to plus the mean "
+        "magnitude."
+    )
+    plot = interactive.plot_overview(scored, shown)
+    return _vector(directory, "overview", draw.figure_overview(scored, shown), caption, figures, plot)
+
+
+def _section(directory: Path, entry: Mapping[str, Any], anchor: str, figures: list[Figure]) -> str:
+    title = f"<h3>{escape(str(entry['name']))}</h3>"
+    try:
+        view = load_view(directory, entry)
+        content = _sweep(directory, view, anchor, figures)
+    except Speckle3DError as error:
+        content = paragraphs([f"This sweep's results cannot be shown: {error}"], "note")
+    return f'<section class="sweep" id="{anchor}" role="tabpanel">{title}{content}</section>'
+
+
+def _sweep(directory: Path, view: SweepView, anchor: str, figures: list[Figure]) -> str:
+    cuts = cut_modes(view)
+    stem = view.folder.name
+    grid = view.reconstruction.grid
+    pieces = [paragraphs(view.notes, "note")]
+    pieces.append(
+        _vector(directory, f"{stem}-curves", draw.figure_curves(view.curves), _curves_caption(view), figures,
+                interactive.plot_curves(view.curves))
+    )  # fmt: skip
+    caption = (
+        f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other"
+        f"{'; in print the reference is grey' if view.curves.reference_name in view.poses else ''}."
+    )
+    outlines = draw.figure_outlines(view.poses, grid, view.curves.reference_name)
+    plot = interactive.plot_outlines(view.poses, grid)
+    pieces.append(_vector(directory, f"{stem}-outlines", outlines, caption, figures, plot))
+    if cuts is not None:
+        pieces.append(_reslices(directory, f"{stem}-reslices", cuts, figures))
+    pieces.append(_patches(directory, f"{stem}-patches", view, cuts, figures))
+    return "".join(pieces)
+
+
+def _curves_caption(view: SweepView) -> str:
+    caption = "Accumulated length of travel, tilt, yaw and roll."
+    if view.curves.half_width is not None:
+        caption += " The band is the 95 % interval of the uncorrected trajectory, from its covariance."
+    return caption
+
+
+def _reslices(directory: Path, name: str, cuts: Cuts, figures: list[Figure]) -> str:
+    drawn = draw.figure_cuts(cuts)
+    draw.save_both(drawn, directory / "figures" / name)
+    width_in = drawn.get_size_inches()[0]
+    caption = (
+        "The sweep cut along its travel at the middle vector, at the poses of every mode, and the same place "
+        f"of the same frame enlarged ({cuts.depth_mm:.0f} mm deep). Blue: no frame reached."
+    )
+    figure = Figure(
+        f"plot-{name}", draw.rendered(drawn, "jpg", 125), "image/jpeg", caption, width_in=width_in
+    )
+    figures.append(figure)
+    return figure.html()
+
+
+def _patches(directory: Path, name: str, view: SweepView, cuts: Cuts | None, figures: list[Figure]) -> str:
+    if view.rejected is None or not np.isfinite(view.rejected.share).any():
+        return paragraphs(["The file of this sweep holds no patches."], "quiet")
+    sensed = view.details.get("details", {}).get("rejected_patch_share") is not None
+    caption = (
+        "Patches left out because the sensed orientation contradicts their distances"
+        if sensed
+        else "Patches that took no part in the plane of their pair of frames"
+    )
+    caption += ": where in the image, in how many of the pairs, and how many over the sweep."
+    drawn = draw.figure_rejected(view.rejected, cuts, view.reconstruction.grid)
+    draw.save_both(drawn, directory / "figures" / name)
+    # The image beneath would make a vector picture large.
+    picture = draw.rendered(drawn, "jpg", 110)
+    plot = interactive.plot_rejected(view.rejected)
+    figures.append(Figure(f"plot-{name}", picture, "image/jpeg", caption, plot, drawn.get_size_inches()[0]))
+    return figures[-1].html()
+
+
+def _vector(
+    directory: Path, name: str, drawn: Any, caption: str, figures: list[Figure], plot: dict[str, Any]
+) -> str:
+    """File a figure and put it on the page as a vector picture, with its interactive twin."""
+    _, vector = draw.save_both(drawn, directory / "figures" / name)
+    figures.append(Figure(f"plot-{name}", vector.read_bytes(), "image/svg+xml", caption, plot))
+    return figures[-1].html()
+
+
+def _broken(entries: Sequence[Mapping[str, Any]]) -> str:
+    if not entries:
+        return ""
+    records = [{key: entry.get(key) for key in ("name", "status", "reason")} for entry in entries]
+    return f'<h2 id="broken">Sweeps without a result</h2><div class="broken">{records_table(records)}</div>'
+
+
+def _tables(study: Mapping[str, Any], anchors: Mapping[str, str]) -> str:
+    shown = []
+    for key, (title, words) in _TABLES.items():
+        records = study.get(key) or []
+        if records:
+            table = records_table(records, anchors)
+            shown.append(f'<h2 id="{key}">{title}</h2><p class="quiet">{words}</p>{table}')
+    return "".join(shown)
+
+
+def _buttons(done: Sequence[Mapping[str, Any]]) -> str:
+    return "".join(
+        f'<button role="tab" type="button" data-sweep="sweep-{i + 1}" aria-controls="sweep-{i + 1}" '
+        f'aria-selected="false">{escape(str(entry["name"]))}</button>'
+        for i, entry in enumerate(done)
+    )
+
+
+def _provenance(study: Mapping[str, Any]) -> str:
+    from importlib.metadata import version
+
+    keys = ("name", "path", "sha256", "key", "seconds")
+    records = [{key: entry.get(key) for key in keys} for entry in study["sweeps"]]
+    made = f"Report made by speckle3d {version('speckle3d')}."
+    return paragraphs([made], "quiet") + records_table(records)
