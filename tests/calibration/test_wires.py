@@ -80,12 +80,12 @@ def test_claimed_standard_errors_of_a_crossing_are_those_of_repetition():
     # Noise of the image alone would not do: it moves tilt and yaw in second order only, which no covariance
     # tells (they are claimed to be twice as uncertain as they are).
     scores = []
-    for seed in range(120):
+    for seed in range(80):
         solution = calibrate_crossing(shaken(scan_crossing(seed, noise_mm=0.3), seed, 0.5))
         shift, turn = (TRIAL_1.inv() * solution.chain.sensor_from_image).as_components()
         claims = np.sqrt(np.diag(solution.image_covariance(IMAGE)))
         scores.append(np.array([*turn.as_rotvec(), *shift]) / claims)
-    # The standard deviation of 120 is known to 6.5 %; three times that, and a tenth for the linearisation.
+    # The standard deviation of 80 is known to 8 %; three times that, and a little for the linearisation.
     np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.3)
 
 
@@ -110,7 +110,7 @@ def test_wrong_points_in_a_tenth_of_the_frames_hardly_move_a_crossing(seed):
 def test_few_right_points_are_lost():
     # Noise lies in the image only, and so is not of one size in the phantom's frame: more than one in 16,000
     # exceeds four robust standard deviations.
-    lost = [(~calibrate_crossing(scan_crossing(seed, noise_mm=0.3)).used).sum() for seed in range(60)]
+    lost = [(~calibrate_crossing(scan_crossing(seed, noise_mm=0.3)).used).sum() for seed in range(40)]
     assert np.mean(lost) / 60 < 0.02
     assert OUTLIER_SIGMA == 4.0
 
@@ -212,7 +212,7 @@ def test_three_points_in_a_row_that_were_picked_elsewhere_are_noticed(picked):
     assert (np.abs(moved_in_errors(solution, calibrate_crossing(points, outlier_sigma=np.inf))) < 1.0).all()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_any_mounting_and_any_place_of_three_wires_is_found(seed):
     rng = np.random.default_rng([seed, 9])
     mounting, place = (
@@ -287,8 +287,10 @@ def test_labels_swapped_in_some_frames_are_found_out(share):
     assert centre_error_mm(solution) < 0.25
 
 
-@pytest.mark.parametrize("labels", [[1, 0, 2, 3], [0, 1, 3, 2], [1, 0, 3, 2], [3, 2, 0, 1]])
-@pytest.mark.parametrize("registered", [True, False])
+@pytest.mark.parametrize(
+    ("labels", "registered"),
+    [([0, 1, 3, 2], False), ([1, 0, 3, 2], False), ([0, 1, 3, 2], True), ([1, 0, 2, 3], True)],
+)
 def test_labels_swapped_throughout_are_refused(labels, registered):
     points = scan_phantom(0, SKEW, 200, noise_mm=0.2, world_from_phantom=PLACE)
     geometry = replace(SKEW, world_from_phantom=PLACE if registered else None)
