@@ -1,0 +1,83 @@
+"""What the orientation filter believes about sensors, hands and rooms, in one place, each with its reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from speckle3d.core.errors import InvalidInputError
+
+_DEG = math.pi / 180.0
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Parameters of the orientation filter, all of them properties of things that can be measured.
+
+    Attributes
+    ----------
+    block_s : float
+        Length of the increments the filter runs on: short against hand movement (tremor is below 12 Hz).
+    gravity_m_s2 : float
+        Standard gravity; local gravity differs by 0.3 % at most and an accelerometer by more.
+    gyro_noise_rad_sqrt_s : float
+        Angle random walk. 0.05 deg/sqrt(s) is an MT9-B's Allan deviation at 1 s; newer sensors have a tenth.
+    gyro_scale_noise_sqrt_s : float
+        Error of the gyroscope's scale and axes, a fraction of the turn: 0.3 % persisting for a swing of
+        about 0.25 s, ``0.003 sqrt(2 * 0.25)``.
+    bias_walk_rad_s_sqrt_s : float
+        Random walk of the bias, 0.002 deg/s/sqrt(s): 0.05 deg/s in ten minutes.
+    bias_sd_rad_s : float
+        Bias at switching on, 1 deg/s.
+    speed_m_s, speed_time_s : float
+        A hand's speed about its mean, zero, and how long it persists.
+    force_noise_m_s_sqrt_s : float
+        Velocity random walk of the accelerometer, misalignment in quick movement included.
+    field_sd_rad : float
+        How far the magnetic field's heading in a room strays from place to place, 4 deg.
+    field_time_s, field_rest_time_s : float
+        For how long a stray heading persists while the sensor moves, and while it rests.
+    norm_tolerance, dip_tolerance_rad : float
+        A field that differs by more from the reference's norm (a fraction) or dip is disturbed.
+    field_memory_s : float
+        Over how long the reference follows an undisturbed field, and a changed field must persist.
+    rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
+        The sensor rests if neither reading moves by more from its mean of the last half second, for so long.
+    rest_bias_rad_s : float
+        A resting sensor's rate differs from the bias by no more (beyond 3 sd of the bias): slower, steady
+        turning is taken for bias.
+    use_magnetometer : bool
+        Without, the heading starts at zero and only the gyroscope carries it.
+
+    Raises
+    ------
+    InvalidInputError
+        If a number is not positive and finite.
+    """
+
+    block_s: float = 1.0 / 32.0
+    gravity_m_s2: float = 9.80665
+    gyro_noise_rad_sqrt_s: float = 0.05 * _DEG
+    gyro_scale_noise_sqrt_s: float = 0.002
+    bias_walk_rad_s_sqrt_s: float = 0.002 * _DEG
+    bias_sd_rad_s: float = 1.0 * _DEG
+    speed_m_s: float = 0.5
+    speed_time_s: float = 0.5
+    force_noise_m_s_sqrt_s: float = 0.01
+    field_sd_rad: float = 4.0 * _DEG
+    field_time_s: float = 5.0
+    field_rest_time_s: float = 60.0
+    norm_tolerance: float = 0.1
+    dip_tolerance_rad: float = 10.0 * _DEG
+    field_memory_s: float = 20.0
+    rest_rate_rad_s: float = 1.0 * _DEG
+    rest_force_m_s2: float = 0.3
+    rest_after_s: float = 1.5
+    rest_bias_rad_s: float = 0.2 * _DEG
+    use_magnetometer: bool = True
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not isinstance(value, bool) and not (math.isfinite(value) and value > 0.0):
+                raise InvalidInputError(f"{entry.name}: expected a positive number, got {value!r}")
