@@ -53,6 +53,8 @@ one size one in 16,000; of dots, which are known less well out of the image than
 
 MAD_TO_SIGMA = 1.4826
 _REWEIGHTINGS = 8
+_SAME = 0.02
+"""Two starts that settle at residuals so nearly the same have found the same; no more are tried."""
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
 _FREE_ROUNDS = 5
@@ -372,14 +374,22 @@ def settled_angles(
     size = np.array([ratio, 1.0])
     phantom = LineDirections(size, level)
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
-    settled = []
+    best, least = None, np.inf
     for start in angle_starts(points.pixels, turns, ratio, normals):
         upright = (
             Rotation.identity() if level else Rotation.align_vectors([[0.0, 0.0, 1.0]], [start.normal])[0]
         )
         chain = Chain(size, *(RigidTransform.from_rotation(r) for r in (start.sensor_from_image, upright)))
-        settled.append(_first_guess(points, phantom, chain, free))
-    return min(settled, key=lambda one: robust_sigma(_residuals(points, phantom, one)))
+        chain = _first_guess(points, phantom, chain, free)
+        sigma = robust_sigma(_residuals(points, phantom, chain))
+        agreed = abs(sigma - least) < _SAME * least
+        if sigma < least:
+            best, least = chain, sigma
+        if agreed:
+            break
+    if best is None:
+        raise InsufficientDataError("expected line directions that are finite, got others")
+    return best
 
 
 def facing_up(solution: Solution) -> Solution:
