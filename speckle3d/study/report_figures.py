@@ -202,6 +202,9 @@ def patch_size(centre_mm: FloatArray) -> tuple[float, float]:
 def save_both(figure: Figure, stem: Path) -> list[Path]:
     """Write ``stem.png`` and ``stem.svg``; each appears whole or not at all."""
     make_folder(stem.parent)
+    figure.draw_without_rendering()
+    # The layout is settled once, not for every format.
+    figure.set_layout_engine("none")
     paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
     for path in paths:
         with atomic_path(path) as part:

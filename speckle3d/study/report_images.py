@@ -112,7 +112,7 @@ def _plane(poses: RigidTransform, grid: ImageGrid) -> ReslicePlane:
 
 def _window(plane: ReslicePlane, corner_mm: FloatArray, size_mm: FloatArray) -> ReslicePlane:
     shift = RigidTransform.from_translation([*corner_mm, 0.0])
-    return ReslicePlane(plane.world_from_plane * shift, *size_mm, DETAIL_PIXEL_MM)
+    return ReslicePlane(plane.world_from_plane * shift, float(size_mm[0]), float(size_mm[1]), DETAIL_PIXEL_MM)
 
 
 def _reslice(strip: _Strip, poses: RigidTransform, plane: ReslicePlane) -> GreyArray:
@@ -125,17 +125,21 @@ def _detail_place(
     poses: RigidTransform, plane: ReslicePlane, image: GreyArray, grid: ImageGrid, size_mm: FloatArray
 ) -> tuple[int, float]:
     """Frame and depth of the place with most contrast between its parts, speckle smoothed away."""
-    smooth = gaussian_filter(np.nan_to_num(image, nan=0.0), 0.4 / PIXEL_MM)
+    seen = np.isfinite(image)
+    if not seen.any():
+        return len(poses) // 2, float(grid.centre_mm[1])
+    # The mean where nothing was seen, or the rim would be the greatest contrast.
+    smooth = gaussian_filter(np.where(seen, image, image[seen].mean()), 0.4 / PIXEL_MM)
     size = [max(1, round(side / PIXEL_MM)) for side in size_mm[::-1]]
     spread = uniform_filter(smooth**2, size) - uniform_filter(smooth, size) ** 2
     # Only windows that lie wholly on images: the rim of the reslice is all contrast and no content.
-    inside = uniform_filter(np.isfinite(image).astype(float), size, mode="constant") > 0.999
+    inside = uniform_filter(seen.astype(float), size, mode="constant") > 0.999
     # Nor the near field, whose contrast is the probe's own.
     inside[: int((NEAR_FIELD_MM + size_mm[1] / 2) / PIXEL_MM)] = False
     if not inside.any():
         return len(poses) // 2, float(grid.centre_mm[1])
     row, column = np.unravel_index(int(np.argmax(np.where(inside, spread, -1.0))), image.shape)
     point = plane.world_from_plane.apply([column * PIXEL_MM, row * PIXEL_MM, 0.0])
-    seen = poses.inv().apply(point)
-    frame = int(np.argmin(np.abs(seen[:, 2])))
-    return frame, float(np.clip(seen[frame, 1], grid.first_sample_depth_mm, grid.depth_mm))
+    in_image = poses.inv().apply(point)
+    frame = int(np.argmin(np.abs(in_image[:, 2])))
+    return frame, float(np.clip(in_image[frame, 1], grid.first_sample_depth_mm, grid.depth_mm))
