@@ -56,6 +56,13 @@ def values(index, rate_hz, iron=0.0):
     )
 
 
+def wait_until(condition, seconds=8.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
 class SimulatedDevice:
     """A sensor with power, and a cable to a path that can be opened as a serial port.
 
@@ -182,8 +189,9 @@ class SimulatedDevice:
         self._quiet.clear()
         while self.state == MEASUREMENT and not self.mute:
             due = self._started + (self._next - self._first) / self.rate_hz
-            if time.monotonic() < due:
-                return min(due - time.monotonic(), 0.005)
+            early_s = due - time.monotonic()
+            if early_s > 0:
+                return min(early_s, 0.005)
             self._send(self._next)
             self._next += 1
         return 0.002

@@ -1,5 +1,4 @@
 import os
-import time
 
 import pytest
 
@@ -11,7 +10,7 @@ pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
-from simulated_device import DEVICE_ID, KINDS, SimulatedDevice
+from simulated_device import DEVICE_ID, KINDS, SimulatedDevice, wait_until
 
 BAUD = 115200
 
@@ -33,8 +32,7 @@ class TestDevice:
     @of_kind(*KINDS)
     def test_is_found_and_described_whatever_it_is_doing(self, sensor):
         sensor.wake_s = 0.0
-        time.sleep(0.1)
-        assert sensor.state == "measurement"  # of its own accord
+        wait_until(lambda: sensor.state == "measurement")  # of its own accord
         with connect(str(sensor.path)) as device:
             assert device.baud == BAUD
             info = prepare(device, DeviceSettings())
@@ -110,9 +108,8 @@ class TestDevice:
     def test_an_answer_that_came_too_late_is_none_to_the_next_request(self, sensor):
         with connect(str(sensor.path), BAUD) as device:
             device.send(Message(MessageId.REQ_CONFIGURATION))
-            wait = time.monotonic() + 2.0
-            while MessageId.REQ_CONFIGURATION not in sensor.requests and time.monotonic() < wait:
-                time.sleep(0.01)
+            wait_until(lambda: MessageId.REQ_CONFIGURATION in sensor.requests)
+            sensor.settle()
             sensor.rate_hz = 50.0
             told = Configuration.from_message(device.request(Message(MessageId.REQ_CONFIGURATION)))
         assert told.rate_hz == 50.0

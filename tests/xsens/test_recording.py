@@ -7,10 +7,10 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from xsens.logs import read_log
 
 from speckle3d.core.errors import FileError
 from xsens.device import DeviceError, DeviceSettings
+from xsens.logs import read_log
 from xsens.messages import Message, MessageId, decode
 from xsens.recording import UTC_TIME, RawFile, Recorder, record, utc_message
 
@@ -18,7 +18,7 @@ pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
-from simulated_device import KINDS, SimulatedDevice, values
+from simulated_device import KINDS, SimulatedDevice, values, wait_until
 
 FAST = DeviceSettings(baud=115200)
 
@@ -51,13 +51,6 @@ def counters(path) -> list[int]:
         elif message.mid == MessageId.MT_DATA2:
             found.append(int.from_bytes(message.payload[3:5], "big"))
     return found
-
-
-def wait_until(condition, seconds=8.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 class TestRecording:
