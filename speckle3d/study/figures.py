@@ -23,6 +23,7 @@ DOTS_PER_INCH = 150
 
 MODE_COLOURS = {
     "image": "#D55E00",
+    "image+subset": "#E69F00",
     "orientation": "#0072B2",
     "pose": "#009E73",
     "crossed": "#CC79A7",
@@ -31,6 +32,7 @@ MODE_COLOURS = {
 
 MODE_LABELS = {
     "image": "image-based",
+    "image+subset": "image-based, consistent subset",
     "orientation": "orientation correction",
     "pose": "six DOF correction",
     "crossed": "crossed-sweep correction",

@@ -35,8 +35,10 @@ _ERRORS = {
 _TABLES = {
     "drift": (
         "Drift",
-        "FDR and ADR are shares of the true path; MD, SD, HD and the point errors GPE, GLE, LPE, LLE are in "
-        "millimetres, EA in degrees.",
+        "The final (FDR) and average drift rate (ADR) are shares of the true path's length. Maximum (MD) and "
+        "sum of drift (SD), Hausdorff distance (HD), and the mean displacement of the image's points against "
+        "the first frame (global: GPE, GLE) and the frame before (local: LPE, LLE) are in millimetres, the mean "
+        "error of angle (EA) in degrees.",
     ),
     "intervals": ("Confidence intervals", "95 % intervals over sweeps, by bootstrap."),
     "paired": ("Modes compared in pairs", "Differences on the same parts of the same sweeps."),
