@@ -9,36 +9,70 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from xsens.accuracy import AccuracyTable, PairErrors, common_readings, mounting_from_motion, pair_errors
+    from xsens.accuracy_figures import figure_turns
     from xsens.bytelogs import parse_stream
+    from xsens.device import DeviceError, DeviceSettings
     from xsens.framing import Framer, Message, decode, encode
+    from xsens.live import LiveState
     from xsens.logparts import Hints
     from xsens.logs import read_log, write_csv
+    from xsens.mechanism import MechanismSettings, read_mechanism_csv, readings_at
+    from xsens.recording import Recorder, record
     from xsens.samples import Gap, ImuLog
 
 _HOME = {
+    "AccuracyTable": "accuracy",
+    "DeviceError": "device",
+    "DeviceSettings": "device",
     "Framer": "framing",
     "Gap": "samples",
     "Hints": "logparts",
     "ImuLog": "samples",
+    "LiveState": "live",
+    "MechanismSettings": "mechanism",
     "Message": "framing",
+    "PairErrors": "accuracy",
+    "Recorder": "recording",
+    "common_readings": "accuracy",
     "decode": "framing",
     "encode": "framing",
+    "figure_turns": "accuracy_figures",
+    "mounting_from_motion": "accuracy",
+    "pair_errors": "accuracy",
     "parse_stream": "bytelogs",
     "read_log": "logs",
+    "read_mechanism_csv": "mechanism",
+    "readings_at": "mechanism",
+    "record": "recording",
     "write_csv": "logs",
 }
 """Where each public name lives."""
 
 __all__ = [
+    "AccuracyTable",
+    "DeviceError",
+    "DeviceSettings",
     "Framer",
     "Gap",
     "Hints",
     "ImuLog",
+    "LiveState",
+    "MechanismSettings",
     "Message",
+    "PairErrors",
+    "Recorder",
+    "common_readings",
     "decode",
     "encode",
+    "figure_turns",
+    "mounting_from_motion",
+    "pair_errors",
     "parse_stream",
     "read_log",
+    "read_mechanism_csv",
+    "readings_at",
+    "record",
     "write_csv",
 ]
 
