@@ -32,12 +32,14 @@ _ERRORS = {
     "roll_error_deg": "roll_deg",
 }
 
+_NOTHING = '<p class="quiet">There is nothing to compare.</p>'
+
 _TABLES = {
     "drift": (
         "Drift",
         "The final (FDR) and average drift rate (ADR) are shares of the true path's length. Maximum (MD) and "
-        "sum of drift (SD), Hausdorff distance (HD), and the mean displacement of the image's points against "
-        "the first frame (global: GPE, GLE) and the frame before (local: LPE, LLE) are in millimetres, the mean "
+        "sum of drift (SD), Hausdorff distance (HD), and the mean shift of the image's points against the "
+        "first frame (global: GPE, GLE) and the frame before (local: LPE, LLE) are in millimetres, the mean "
         "error of angle (EA) in degrees.",
     ),
     "intervals": ("Confidence intervals", "95 % intervals over sweeps, by bootstrap."),
@@ -87,14 +89,14 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
         if progress:
             progress(i + 1, len(done))
     parts = {
-        "title": f"Drift-correction modes compared on {_counted(len(done), 'sweep')}",
+        "title": f"Drift-correction modes compared on {_counted(len(done) or len(broken), 'sweep')}",
         "lead": paragraphs(summary_lines(means, scored, len(done), len(broken))),
         "broken": _broken(broken),
-        "modes": modes_table(means, _best(means, "length_percent")) + overview,
+        "modes": modes_table(means, _best(means, "length_percent")) + overview or _NOTHING,
         "parts": parts_table(rows, anchors),
         "tables": _tables(study, anchors),
         "buttons": _buttons(done),
-        "sweeps": "\n".join(sections),
+        "sweeps": "\n".join(sections) or _NOTHING,
         "configuration": escape(str(study.get("settings_toml", ""))),
         "provenance": _provenance(study),
     }
@@ -108,6 +110,8 @@ def summary_lines(
     means: Sequence[Mapping[str, Any]], scored: Sequence[Mapping[str, Any]], done: int, broken: int
 ) -> list[str]:
     """Say in plain sentences which mode is right, and by how much."""
+    if not done:
+        return [f"Nothing could be reconstructed from {_counted(broken, 'sweep')}; the reasons are below."]
     lines = []
     best, straightest = _best(means, "length_percent"), _best(means, "tilt_deg")
     if best is None:
@@ -224,7 +228,7 @@ def _reslices(directory: Path, name: str, cuts: Cuts, figures: list[Figure]) -> 
         f"of the same frame enlarged ({cuts.depth_mm:.0f} mm deep). Blue: no frame reached."
     )
     figure = Figure(
-        f"plot-{name}", draw.rendered(drawn, "jpg", 125), "image/jpeg", caption, width_in=width_in
+        f"plot-{name}", draw.rendered(drawn, "jpg", 110), "image/jpeg", caption, width_in=width_in
     )
     figures.append(figure)
     return figure.html()
@@ -243,7 +247,7 @@ def _patches(directory: Path, name: str, view: SweepView, cuts: Cuts | None, fig
     drawn = draw.figure_rejected(view.rejected, cuts, view.reconstruction.grid)
     draw.save_both(drawn, directory / "figures" / name)
     # The image beneath would make a vector picture large.
-    picture = draw.rendered(drawn, "jpg", 110)
+    picture = draw.rendered(drawn, "jpg", 90)
     plot = interactive.plot_rejected(view.rejected)
     figures.append(Figure(f"plot-{name}", picture, "image/jpeg", caption, plot, drawn.get_size_inches()[0]))
     return figures[-1].html()

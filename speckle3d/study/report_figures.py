@@ -26,7 +26,7 @@ from speckle3d.study.job import REFERENCES
 from speckle3d.study.report_data import RejectedPatches, SweepCurves
 from speckle3d.study.report_images import Cut, Cuts
 
-MOST_POINTS = 300
+MOST_POINTS = 240
 """Points of a curve: more than print or screen resolve, and each costs bytes."""
 
 OUTLINES = 20
@@ -215,7 +215,7 @@ def save_both(figure: Figure, stem: Path) -> list[Path]:
 def rendered(figure: Figure, kind: str, dots_per_inch: float = DOTS_PER_INCH) -> bytes:
     """Bytes of a figure as png, jpg or svg; the same for the same figure."""
     data = io.BytesIO()
-    options: dict[str, Any] = {"pil_kwargs": {"quality": 80}} if kind == "jpg" else {}
+    options: dict[str, Any] = {"pil_kwargs": {"quality": 72}} if kind == "jpg" else {}
     # No date and no random names: a report made again from the same study is the same file.
     metadata = {"Date": None} if kind == "svg" else None
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "speckle3d", "font.family": "sans-serif"}):

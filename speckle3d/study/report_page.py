@@ -33,7 +33,7 @@ _WORDS = (
     "package",
     "reference",
 )
-_LONG = ("reason", "path", "sha256", "file")
+_LONG = ("reason", "path", "sha256", "key", "file")
 _ERRORS = ("length_error_mm", "length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
 
 _PART_COLUMNS = ("sweep", "part", "mode", "frames", "reference_mm", "estimate_mm", *_ERRORS)

@@ -240,5 +240,5 @@ def _plot(traces: list[Plot], layout: Plot, height: int) -> Plot:
 
 
 def _numbers(values: npt.NDArray[Any]) -> list[float | None]:
-    """Turn values to what JSON holds: four decimals (0.1 micrometres), null where there is none."""
-    return [round(float(v), 4) if np.isfinite(v) else None for v in values]
+    """Turn values to what JSON holds: three decimals (micrometres), null where there is none."""
+    return [round(float(v), 3) if np.isfinite(v) else None for v in values]

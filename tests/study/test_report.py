@@ -75,8 +75,8 @@ def test_the_page_stands_alone(page, text):
     assert policy.startswith("default-src 'none'")
     assert "'unsafe-inline'" not in policy.split("script-src")[1].split(";")[0]
     assert "@media print" in text
-    # The library is 4.9 MB; 0.6 MB for each sweep keep a study of eleven under 12 MB.
-    assert len(text.encode()) < 5.0e6 + 2 * 0.6e6
+    # The library is 4.9 MB; 0.6 MB for each sweep keep a study of eleven under 12 MB. These two are small.
+    assert len(text.encode()) < 5.0e6 + 2 * 0.4e6
 
 
 def test_the_summary_comes_first_and_says_what_the_rows_say(page, study):
@@ -120,8 +120,8 @@ def test_the_interactive_plots_hold_the_curves(text, study):
     view = load_view(study, read_study(study)["sweeps"][0])
     (pose,) = [t for t in plot["data"] if t["name"] == "six DOF correction" and t["visible"] and
                t["xaxis"] == "x1"]  # fmt: skip
-    # Rounded to four decimals.
-    np.testing.assert_allclose(pose["y"], view.curves.modes["pose"][0], atol=6e-5)
+    # Rounded to three decimals.
+    np.testing.assert_allclose(pose["y"], view.curves.modes["pose"][0], atol=6e-4)
 
 
 def test_pictures_of_the_page_are_pictures(text):
@@ -159,6 +159,12 @@ def test_a_changed_sweep_is_not_taken_for_the_one_reconstructed(study, tmp_path)
 def test_without_a_reference_no_mode_is_called_right():
     (line,) = summary_lines([], [], 2, 0)
     assert "no mode can be called right" in line
+
+
+def test_without_any_result_the_summary_says_so():
+    assert summary_lines([], [], 0, 2) == [
+        "Nothing could be reconstructed from 2 sweeps; the reasons are below."
+    ]
 
 
 def test_the_best_in_length_and_the_best_in_tilt_may_differ():
@@ -209,7 +215,7 @@ def test_rejected_patches_count_only_those_with_a_distance():
     np.testing.assert_allclose(found.share, [1 / 4, 2 / 3, np.nan])
     np.testing.assert_allclose(found.frame_share, [2 / 4, np.nan, 1, 0, np.nan])
     heat = plot_rejected(found)["data"][0]
-    assert heat["z"] == [[25.0, 66.6667, None]]
+    assert heat["z"] == [[25.0, 66.667, None]]
     assert (heat["x"], heat["y"]) == ([1.0, 3.0, 5.0], [2.0])
     assert patch_size(found.centre_mm) == (2.0, 3.0)
 
@@ -220,9 +226,9 @@ def test_differences_from_the_reference_are_a_button_away():
     absolute, minus = plot["layout"]["updatemenus"][0]["buttons"]
     shown = [t for t, v in zip(plot["data"], minus["args"][0]["visible"], strict=True) if v]
     (image,) = [t for t in shown if t["name"] == "image-based" and t["xaxis"] == "x1"]
-    np.testing.assert_allclose(image["y"], 0.1 * ramp[0], atol=6e-5)
+    np.testing.assert_allclose(image["y"], 0.1 * ramp[0], atol=6e-4)
     low, high = [t for t in shown if t["name"].startswith("95 %") and t["xaxis"] == "x1"]
-    np.testing.assert_allclose(np.subtract(high["y"], low["y"]), 1.0, atol=2e-4)
+    np.testing.assert_allclose(np.subtract(high["y"], low["y"]), 1.0, atol=2e-3)
     assert absolute["args"][0]["visible"] == [not v for v in minus["args"][0]["visible"]]
     assert "updatemenus" not in plot_curves(SweepCurves({"image": ramp}, None, "none", None))["layout"]
 
