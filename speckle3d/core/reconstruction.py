@@ -15,7 +15,7 @@ from speckle3d.core.sweep import ImageGrid
 
 IntArray = npt.NDArray[np.int64]
 
-MODES = ("image", "orientation", "pose", "crossed")
+MODES = ("image", "image+subset", "orientation", "pose", "crossed")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
 
 

@@ -21,6 +21,7 @@ from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.correction.drift import DriftCorrection
+from speckle3d.direction import sensed_orientation
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
@@ -34,6 +35,8 @@ from speckle3d.study.metrics import END_FRAMES, ModeError, accumulated, compare_
 from speckle3d.study.summary import Summary, table_text, write_summary
 
 REFERENCES = ("tracker", "truth")
+SUBSET = "image+subset"
+"""Mode of the images alone with the patches that contradict the sensed orientation left out."""
 STRIP_MM = 2.4
 STRIP_SPACING_MM = 0.1
 
@@ -77,7 +80,7 @@ def run_job(
     Parameters
     ----------
     drift : sequence of str
-        Correction modes beside `image`: "orientation", "pose".
+        Modes beside `image`: "image+subset", "orientation", "pose".
     reference : {"tracker", "truth"}, optional
         What to compare with; by default the truth if stored, else the tracker, else nothing.
     calibrations : sequence of path
@@ -86,21 +89,47 @@ def run_job(
     settings = config or Config()
     began = time.perf_counter()
     sweep, mounted = apply_calibrations(sweep, calibrations)
-    require_modes(sweep, drift)
+    fitted = [mode for mode in drift if mode != SUBSET]
+    require_modes(sweep, fitted)
+    if SUBSET in drift:
+        _require_subset(sweep, settings)
     compared = find_reference(sweep, reference)
     make_folder(directory)
     strip = _Strip(sweep, settings)
     path = directory / "reconstruction.h5"
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
         tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep)
-        corrections = correct(tracked, sweep, drift, settings)
-        poses = {"image": tracked.image} | {mode: c.poses for mode, c in corrections.items()}
+        corrections = correct(tracked, sweep, fitted, settings)
+        poses = {"image": tracked.image}
+        if SUBSET in drift and tracked.subset is not None:
+            poses[SUBSET] = tracked.subset
+        poses |= {mode: c.poses for mode, c in corrections.items()}
         provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     summary = _summarise(sweep, tracked, corrections, poses, compared, provenance)
     files = [path, *write_summary(directory, [summary])]
     files += _draw(directory, sweep, poses, compared, strip, tracked.covariance)
     return JobResult(directory, summary, table_text([summary]), tuple(files), time.perf_counter() - began)
+
+
+def available_modes(sweep: Sweep, config: Config) -> list[str]:
+    """Modes beside `image` for which the sweep has sensors, calibrated to the image."""
+    found = [SUBSET] if sensed_orientation(sweep, config) is not None else []
+    for mode in ("orientation", "pose"):
+        try:
+            require_modes(sweep, [mode])
+        except InsufficientDataError:
+            continue
+        found.append(mode)
+    return found
+
+
+def _require_subset(sweep: Sweep, config: Config) -> None:
+    if sensed_orientation(sweep, config) is None:
+        raise InsufficientDataError(
+            f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
+            "sensors.consistent_subset, got none"
+        )
 
 
 def find_reference(sweep: Sweep, wanted: str | None) -> Reference | None:

@@ -1,0 +1,91 @@
+"""Comparing drift-correction modes over many sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from speckle3d.cli.common import ConfigFile, Json, app, emit, note
+from speckle3d.cli.mounting import CalibrationFiles
+from speckle3d.core.errors import InsufficientDataError
+
+if TYPE_CHECKING:
+    from speckle3d.study.compare import StudyProgress
+
+
+@app.command()
+def compare(
+    sweeps: Annotated[list[Path], typer.Argument(metavar="SWEEP...", help="Sweeps to compare modes on.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the study.")],
+    drift: Annotated[
+        list[str] | None,
+        typer.Option(help="image+subset, orientation or pose; may be repeated. By default all possible."),
+    ] = None,
+    reference: Annotated[str | None, typer.Option(help="tracker or truth: what to compare with.")] = None,
+    curves_file: Annotated[
+        Path | None,
+        typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside each sweep."),
+    ] = None,
+    calibration: CalibrationFiles = None,
+    config_file: ConfigFile = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://host:8786, to run on.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Run in so many processes on this machine, instead of in one.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare drift-correction modes over sweeps with a reference: tables, curves, a report."""
+    from speckle3d.config import Config, load_config
+    from speckle3d.study.compare import compare_sweeps
+    from speckle3d.study.report import write_report
+    from speckle3d.study.schedulers import scheduler_for
+
+    settings = load_config(config_file) if config_file else Config()
+    with scheduler_for(scheduler, workers) as where, _shown() as progress:
+        study = compare_sweeps(
+            sweeps, out, drift, reference, curves_file, settings, calibration or (), where, progress
+        )
+    write_report(out)
+    emit((out / "study.json").read_text(encoding="utf-8") if as_json else study.table)
+    failed = [each for each in study.outcomes if each.status == "failed"]
+    skipped = sum(each.skipped for each in study.outcomes)
+    if skipped:
+        note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
+    for each in failed:
+        note(f"{each.name}: failed: {each.reason}")
+    note(f"results in {out}; the report is {out / 'report.html'}")
+    if len(failed) == len(study.outcomes):
+        raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")
+
+
+@contextmanager
+def _shown() -> Iterator[Callable[[StudyProgress], None]]:
+    """Sweeps done and the time that is left, on stderr; nothing in a log."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (TextColumn("comparing"), BarColumn(), TextColumn("{task.description}"))
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(at: StudyProgress) -> None:
+            bar.update(task, completed=at.done_frames, total=at.frames, description=_line(at))
+
+        yield show
+
+
+def _line(at: StudyProgress) -> str:
+    failed = f", {at.failed} failed" if at.failed else ""
+    if at.remaining_s is None:
+        left = "time left is known after the first"
+    else:
+        minutes, seconds = divmod(round(at.remaining_s), 60)
+        left = f"about {minutes} min {seconds:02d} s left"
+    return f"{at.done} of {at.sweeps} sweeps{failed}; {left}"

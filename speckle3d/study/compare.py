@@ -1,0 +1,203 @@
+"""Sweeps in, a study's folder out: what ``speckle3d compare`` does.
+
+Every sweep is one job with a folder of its own, which appears whole or not at all under a name that holds a
+hash of everything that determines its content. A study started again finds those folders and skips their
+sweeps; a worker that is killed leaves nothing behind but the work it was at.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from speckle3d.config import Config
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.hdf5 import atomic_path, make_folder
+from speckle3d.study.metrics import ModeError
+from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
+from speckle3d.study.summary import Summary, csv_text, plain, table_text
+from speckle3d.study.sweepjob import SweepJob, SweepOutcome, finished, lost, plan_sweep, run_sweep
+
+FORMAT = "speckle3d.study"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a study found, and where it is."""
+
+    directory: Path
+    outcomes: Sequence[SweepOutcome]
+    summaries: Sequence[Summary]
+    drift: Sequence[Mapping[str, Any]]
+    table: str
+
+
+@dataclass
+class StudyProgress:
+    """How far a study is, and how long the rest will take by what is finished."""
+
+    sweeps: int
+    frames: int
+    done: int = 0
+    failed: int = 0
+    done_frames: int = 0
+    remaining_s: float | None = None
+    _timed: list[tuple[int, float]] = field(default_factory=list)
+
+    def add(self, outcome: SweepOutcome, frames: int, workers: int) -> None:
+        """Count a finished sweep; only those that took time say how long others take."""
+        self.done += 1
+        self.done_frames += frames
+        self.failed += outcome.status == "failed"
+        if outcome.status == "done" and not outcome.skipped:
+            self._timed.append((frames, outcome.seconds))
+        left = self.frames - self.done_frames
+        running = min(workers, self.sweeps - self.done)
+        self.remaining_s = remaining_s(self._timed, left, running) if left else 0.0
+
+
+def compare_sweeps(
+    paths: Sequence[Path],
+    directory: Path,
+    modes: Sequence[str] | None = None,
+    reference: str | None = None,
+    curves: Path | None = None,
+    config: Config | None = None,
+    calibrations: Sequence[Path] = (),
+    scheduler: Scheduler | None = None,
+    progress: Callable[[StudyProgress], None] | None = None,
+) -> Study:
+    """Reconstruct sweeps in every mode, compare the modes, and write it all into `directory`.
+
+    Written: ``study.json``, ``table.txt``, ``table.csv``, and a folder for each sweep with what `run_job`
+    writes. A sweep that cannot be done is one entry that says why. A sweep whose folder is there, from the
+    same input, settings and version, is not done again.
+
+    Parameters
+    ----------
+    modes : sequence of str, optional
+        Beside `image`; by default all that each sweep has sensors for.
+    curves : path, optional
+        Decorrelation curves; by default curves.h5 beside each sweep.
+    progress : callable, optional
+        Called at the beginning and after each sweep.
+    """
+    if not paths:
+        raise InvalidInputError("expected at least one sweep, got none")
+    make_folder(directory / "sweeps")
+    where, settings = scheduler or InProcess(), (config or Config()).to_toml()
+    chosen = None if modes is None else tuple(dict.fromkeys(modes))
+    plan = [
+        plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
+        for name, path in _named(paths)
+    ]
+    jobs = [each for each in plan if isinstance(each, SweepJob)]
+    outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
+    so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs))
+    if progress:
+        progress(so_far)
+    for number, outcome in where.run(run_sweep, jobs, lost):
+        outcomes[outcome.name] = _require_here(outcome, jobs[number])
+        so_far.add(outcome, jobs[number].frames, where.workers)
+        if progress:
+            progress(so_far)
+    _clear(jobs)
+    return _write_study(directory, [outcomes[each.name] for each in plan], settings)
+
+
+def _require_here(outcome: SweepOutcome, job: SweepJob) -> SweepOutcome:
+    """Fail a sweep whose results a worker wrote to a disk that is not seen from here."""
+    if outcome.status == "done" and finished(job) is None:
+        return lost(job, f"{job.folder}: expected a folder that workers and the study share, got none here")
+    return outcome
+
+
+def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Each path once, by its stem, or with its folder or a number where that is taken."""
+    named: dict[str, Path] = {}
+    for path in dict.fromkeys(each.resolve() for each in paths):
+        names = [path.stem, f"{path.parent.name}-{path.stem}"]
+        names += [f"{path.stem}-{number}" for number in range(2, len(paths) + 2)]
+        named[next(name for name in names if name not in named)] = path
+    return list(named.items())
+
+
+def _clear(jobs: Sequence[SweepJob]) -> None:
+    """Remove what killed workers left of this study's own sweeps."""
+    for job in jobs:
+        for part in job.folder.parent.glob(f".part-*-{job.folder.name}"):
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
+    summaries: list[Summary] = []
+    drift: list[dict[str, Any]] = []
+    for outcome in outcomes:
+        if outcome.status == "done":
+            folder = directory / outcome.folder
+            summaries.append(_read_summary(folder, outcome.name))
+            rows = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
+            drift += [{"sweep": outcome.name} | row for row in rows]
+    rows = [{"sweep": each.sweep} | asdict(row) for each in summaries for row in each.rows]
+    table = table_text(summaries) + "".join(
+        f"{each.name}  failed: {each.reason}\n" for each in outcomes if each.status == "failed"
+    )
+    contents = {
+        "format": FORMAT,
+        "version": VERSION,
+        "settings_toml": settings_toml,
+        "modes": list(dict.fromkeys(row["mode"] for row in rows)),
+        "sweeps": [_entry(outcome) for outcome in outcomes],
+        "rows": rows,
+        "drift": drift,
+        "intervals": [],
+        "paired": [],
+    }
+    texts = {
+        "study.json": json.dumps(plain(contents), indent=2, allow_nan=False) + "\n",
+        "table.txt": table,
+        "table.csv": _csv(summaries, outcomes),
+    }
+    for name, text in texts.items():
+        with atomic_path(directory / name) as part:
+            part.write_text(text, encoding="utf-8")
+    return Study(directory, outcomes, summaries, drift, table)
+
+
+def _entry(outcome: SweepOutcome) -> dict[str, Any]:
+    shown = asdict(outcome) | {"path": str(outcome.path)}
+    return {name: value for name, value in shown.items() if name != "skipped"}
+
+
+def _read_summary(folder: Path, name: str) -> Summary:
+    """Read a sweep's rows back; a number that was not finite is NaN again."""
+    held: dict[str, Any]
+    (held,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+    names = [f.name for f in fields(ModeError)]
+    rows: list[dict[str, Any]] = [
+        {name: float("nan") if row[name] is None else row[name] for name in names} for row in held["rows"]
+    ]
+    return Summary(
+        name, held["reference"], held["frames"], held["coverage"], [ModeError(**row) for row in rows]
+    )
+
+
+def _csv(summaries: Sequence[Summary], outcomes: Sequence[SweepOutcome]) -> str:
+    """All rows, and one for each sweep that failed, with the reason in a column of its own."""
+    lines = list(csv.reader(io.StringIO(csv_text(summaries))))
+    width = len(lines[0])
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*lines[0], "reason"])
+    writer.writerows([*line, ""] for line in lines[1:])
+    for each in outcomes:
+        if each.status == "failed":
+            writer.writerow([each.name, *[""] * (width - 1), each.reason])
+    return text.getvalue()

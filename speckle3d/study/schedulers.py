@@ -1,0 +1,187 @@
+"""Where a study's jobs run: in this process one after another, or on the workers of a Dask cluster.
+
+A job is a function of one argument that returns a result and does not raise; both ways call the same function
+with the same argument, so the results are the same. A job that its worker does not survive, tried again on
+others, becomes a result by `lost`, so that it cannot stop a study.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.hdf5 import one_line
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+CONNECT_S = 20
+"""How long a cluster may take to answer; one on the same network takes far below a second."""
+
+
+class Scheduler(Protocol):
+    """Runs jobs somewhere and hands over each result as it comes, in any order."""
+
+    def run(
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the number of each job and its result."""
+
+    @property
+    def workers(self) -> int:
+        """How many jobs run at a time."""
+
+
+@dataclass(frozen=True)
+class InProcess:
+    """One job after another, here."""
+
+    def run(
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the number of each job and its result, in order."""
+        for number, job in enumerate(jobs):
+            yield number, function(job)
+
+    @property
+    def workers(self) -> int:
+        """One."""
+        return 1
+
+
+@dataclass(frozen=True)
+class OnCluster:
+    """On the workers that a Dask client reaches.
+
+    Each job is one task, given to a worker when it is free. The task of a worker that dies is given to
+    another; a task that has taken several workers with it is given up.
+    """
+
+    client: Any
+
+    def run(
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the number of each job and its result as they come."""
+        # Not pure: a job's key must not be taken for that of an earlier study that is still held.
+        futures = [self.client.submit(function, job, pure=False) for job in jobs]
+        numbers = {future.key: number for number, future in enumerate(futures)}
+        try:
+            for future in _dask().as_completed(futures):
+                number = numbers[future.key]
+                reason = _failure(future)
+                yield number, future.result() if reason is None else lost(jobs[number], reason)
+        finally:
+            self.client.cancel(futures)
+
+    @property
+    def workers(self) -> int:
+        """Threads of all workers, as they are now."""
+        return max(1, int(sum(self.client.nthreads().values())))
+
+
+@contextmanager
+def scheduler_for(address: str | None, workers: int | None) -> Iterator[Scheduler]:
+    """Open where to run: the cluster at `address`, that many processes here, or this process.
+
+    Raises
+    ------
+    InvalidInputError
+        If both are asked for, or Dask is not installed.
+    FileError
+        If no cluster answers at the address.
+    """
+    if address is not None and workers is not None:
+        raise InvalidInputError("expected --scheduler or --workers, got both")
+    if workers is not None and workers < 1:
+        raise InvalidInputError(f"--workers: expected at least 1, got {workers}")
+    if address is None and workers in (None, 1):
+        yield InProcess()
+        return
+    if address is not None:
+        with _connected(address) as client:
+            yield OnCluster(client)
+        return
+    with local_cluster(workers or 1) as client:
+        yield OnCluster(client)
+
+
+@contextmanager
+def local_cluster(workers: int) -> Iterator[Any]:
+    """Client of so many worker processes of one thread each on this machine, ended with the block."""
+    dask = _dask()
+    # One job already reads and extracts on a second thread: more in the kernels would only get in the way.
+    env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    with (
+        dask.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            memory_limit=0,
+            silence_logs=50,
+            env=env | {"MPLBACKEND": os.environ.get("MPLBACKEND", "agg")},
+        ) as cluster,
+        dask.Client(cluster) as client,
+    ):
+        yield client
+
+
+def remaining_s(finished: Sequence[tuple[int, float]], left_frames: int, workers: int) -> float | None:
+    """Time that is left, from the median time per frame of what is finished; None before anything is.
+
+    Parameters
+    ----------
+    finished : sequence of (frames, seconds)
+        Of each finished sweep, on its worker.
+    left_frames : int
+        In the sweeps that are not finished.
+    workers : int
+        How many sweeps run at a time.
+    """
+    rates = [seconds / frames for frames, seconds in finished if frames > 0]
+    if not rates:
+        return None
+    return float(np.median(rates)) * left_frames / max(1, workers)
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Any]:
+    dask = _dask()
+    try:
+        client = dask.Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{address}: expected a Dask scheduler, got none: {one_line(error)}") from error
+    with client:
+        if not client.nthreads():
+            raise FileError(f"{address}: expected workers on the cluster, got none")
+        yield client
+
+
+def _failure(future: Any) -> str | None:
+    """Why a task that has ended has no result; None if it has one."""
+    if future.status == "finished":
+        return None
+    if future.status == "cancelled":
+        return "cancelled by the cluster"
+    error = future.exception()
+    if type(error).__name__ == "KilledWorker":
+        return "every worker that tried it died: killed, crashed or out of memory"
+    return f"{type(error).__name__}: {one_line(error)}"
+
+
+def _dask() -> Any:
+    """Dask's distributed part, an extra."""
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise InvalidInputError(
+            "a cluster needs dask[distributed]: pip install 'speckle3d[cluster]', got none installed"
+        ) from error

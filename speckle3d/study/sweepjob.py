@@ -1,0 +1,228 @@
+"""One sweep of a study as a job: it travels to a worker, works in a folder of its own, never raises."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import directed_hausdorff
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.config import config_from_toml
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import Sweep
+from speckle3d.io.calibrations import apply_calibrations
+from speckle3d.io.curves import read_curves
+from speckle3d.io.hdf5 import one_line, sha256_of
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.study.job import Reference, available_modes, find_reference, run_job
+from speckle3d.study.points import drift_rates, point_errors
+from speckle3d.study.summary import plain
+
+DONE = "job.json"
+"""Written last into a sweep's folder."""
+
+POINTS = 16
+"""Points per axis at which displacement is averaged over the image, its corners among them."""
+
+
+@dataclass(frozen=True)
+class SweepJob:
+    """One sweep to reconstruct, with everything that determines the result; it travels to workers.
+
+    Attributes
+    ----------
+    modes : tuple of str, or None
+        Beside `image`; None for all that the sweep has sensors for.
+    key : str
+        SHA-256 of the input's bytes, configuration, version, modes, reference, curves and calibrations.
+    """
+
+    name: str
+    path: Path
+    folder: Path
+    curves: Path
+    settings_toml: str
+    modes: tuple[str, ...] | None
+    reference: str | None
+    calibrations: tuple[Path, ...]
+    sha256: str
+    key: str
+    frames: int
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """What became of one sweep; `status` is "done" or "failed", and `reason` says why if it failed."""
+
+    name: str
+    path: Path
+    status: str
+    reason: str = ""
+    sha256: str = ""
+    key: str = ""
+    folder: str = ""
+    seconds: float = 0.0
+    frames: int = 0
+    skipped: bool = False
+
+
+def plan_sweep(
+    name: str,
+    path: Path,
+    directory: Path,
+    curves: Path | None,
+    settings_toml: str,
+    modes: tuple[str, ...] | None,
+    reference: str | None,
+    calibrations: tuple[Path, ...],
+) -> SweepJob | SweepOutcome:
+    """Find out what determines a sweep's results; an outcome at once if it cannot be opened."""
+    path = path.resolve()
+    found = (curves or path.parent / "curves.h5").resolve()
+    try:
+        frames, sha256 = len(load_sweep(path)), sha256_of(path)
+        used = [sha256_of(each) for each in (found, *calibrations)]
+    except Exception as error:  # noqa: BLE001 - one row that says why
+        return SweepOutcome(name, path, "failed", _reason(error))
+    parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
+    key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
+    mounted = tuple(each.resolve() for each in calibrations)
+    return SweepJob(name, path, folder, found, settings_toml, modes, reference, mounted, sha256, key, frames)
+
+
+def run_sweep(job: SweepJob) -> SweepOutcome:
+    """Do a job unless it is done; whatever is wrong with the sweep becomes the outcome's reason."""
+    held = finished(job)
+    if held is not None:
+        return held
+    # A folder of its own: another worker may be at the same sweep, if this one was thought dead.
+    part = job.folder.with_name(f".part-{secrets.token_hex(4)}-{job.folder.name}")
+    began = time.perf_counter()
+    try:
+        _reconstruct(job, part)
+        seconds = time.perf_counter() - began
+        (part / DONE).write_text(json.dumps({"key": job.key, "seconds": seconds}), encoding="utf-8")
+        _move(part, job)
+    except Exception as error:  # noqa: BLE001
+        # One broken sweep, or one bug that it brings to light, must not cost the others.
+        return lost(job, _reason(error).replace(str(part), str(job.folder)))
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return _done(job, seconds)
+
+
+def drift_rows(
+    sweep: Sweep, poses: Mapping[str, RigidTransform], reference: Reference
+) -> list[dict[str, Any]]:
+    """Drift rates and displacement errors of every mode over the frames that have a reference.
+
+    The rates are shares of the path; GLE and LLE need landmarks, which sweeps do not carry.
+    """
+    covered, true = reference.covered, reference.world_from_image
+    return [{"mode": mode} | _drift_row(sweep, each[covered], true) for mode, each in poses.items()]
+
+
+def _drift_row(sweep: Sweep, poses: RigidTransform, true: RigidTransform) -> dict[str, Any]:
+    centre = sweep.grid.centre_mm
+    rates = drift_rates(poses, true, centre)
+    moved = point_errors(poses, true, image_points(sweep))
+    return {
+        "FDR": rates.final_drift_rate,
+        "ADR": rates.average_drift_rate,
+        "MD_mm": rates.maximum_drift_mm,
+        "SD_mm": rates.sum_of_drift_mm,
+        "HD_mm": _hausdorff_mm(poses, true, centre),
+        "EA_deg": rates.mean_angle_deg,
+        "GPE_mm": moved.global_mm,
+        "GLE_mm": None,
+        "LPE_mm": moved.local_mm,
+        "LLE_mm": None,
+    }
+
+
+def _hausdorff_mm(poses: RigidTransform, true: RigidTransform, centre_mm: FloatArray) -> float:
+    """Farthest that a centre of either path is from the other path's nearest; first frames aligned."""
+    one, other = ((each[0].inv() * each).apply(centre_mm) for each in (poses, true))
+    return max(directed_hausdorff(one, other)[0], directed_hausdorff(other, one)[0])
+
+
+def image_points(sweep: Sweep) -> FloatArray:
+    """Evenly spread points of the image, shape (POINTS**2, 3), mm."""
+    low, high = np.min(sweep.grid.corners_mm, axis=0), np.max(sweep.grid.corners_mm, axis=0)
+    across, down = (np.linspace(low[i], high[i], POINTS) for i in (0, 1))
+    x, y = np.meshgrid(across, down)
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+def _reconstruct(job: SweepJob, part: Path) -> None:
+    if sha256_of(job.path) != job.sha256:
+        raise InvalidInputError(f"{job.path}: expected the file that the study began with, got another")
+    settings = config_from_toml(job.settings_toml)
+    sweep = load_sweep(job.path)
+    mounted, _ = apply_calibrations(sweep, job.calibrations)
+    modes = available_modes(mounted, settings) if job.modes is None else job.modes
+    # `image` is there in any case.
+    modes = [mode for mode in modes if mode != "image"]
+    run_job(
+        sweep, job.path, read_curves(job.curves), part, modes, job.reference, settings, None, job.calibrations
+    )
+    reference = find_reference(mounted, job.reference)
+    rows = []
+    if reference is not None:
+        poses = read_reconstruction(part / "reconstruction.h5", with_pairs=False).poses
+        rows = drift_rows(mounted, poses, reference)
+    (part / "drift.json").write_text(json.dumps(plain(rows), allow_nan=False), encoding="utf-8")
+
+
+def finished(job: SweepJob) -> SweepOutcome | None:
+    """Outcome of a job whose folder is there already, whole; None otherwise."""
+    try:
+        held = json.loads((job.folder / DONE).read_text(encoding="utf-8"))
+        if held["key"] == job.key:
+            return _done(job, float(held["seconds"]), skipped=True)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return None
+
+
+def _move(part: Path, job: SweepJob) -> None:
+    """Put a finished folder in its place, unless another worker's is there already."""
+    if finished(job) is not None:
+        return
+    shutil.rmtree(job.folder, ignore_errors=True)
+    try:
+        os.rename(part, job.folder)
+    except OSError:
+        if finished(job) is None:
+            raise
+
+
+def _done(job: SweepJob, seconds: float, skipped: bool = False) -> SweepOutcome:
+    folder = f"sweeps/{job.folder.name}"
+    return SweepOutcome(
+        job.name, job.path, "done", "", job.sha256, job.key, folder, seconds, job.frames, skipped
+    )
+
+
+def lost(job: SweepJob, reason: str) -> SweepOutcome:
+    """Outcome of a job that has none of its own."""
+    return SweepOutcome(job.name, job.path, "failed", reason, job.sha256, job.key, frames=job.frames)
+
+
+def _reason(error: Exception) -> str:
+    words = " ".join(one_line(error).split())
+    return words if isinstance(error, Speckle3DError) else f"{type(error).__name__}: {words}"
