@@ -127,7 +127,7 @@ def summary_lines(
             for row in means
             if row["mode"] != best
         ]
-        against = f", against {' and '.join(others)}" if others else ""
+        against = f", against {', '.join(others)}" if others else ""
         lines.append(
             f"Over {_counted(parts, 'part')} of {_counted(sweeps, 'sweep')}, {draw.label_of(best)} has the "
             f"smallest error of length: {by_mode[best]['length_percent']:.1f} % on average "

@@ -132,7 +132,7 @@ def figure_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid, refere
             _outline(axes, lines[reference], color="0.55", linewidth=0.8)
         _outline(axes, lines[mode], color=colour_of(mode, shown), linewidth=0.9)
         axes.set(xlabel="elevational / mm", ylabel="lateral / mm", zlabel="depth / mm")
-        axes.set_title(label_of(mode), fontsize="medium", color=colour_of(mode, shown))
+        axes.set_title(label_of(mode).replace(", ", ",\n"), fontsize="medium", color=colour_of(mode, shown))
         axes.set_box_aspect(np.maximum(high - low, 0.15 * (high - low).max())[[2, 0, 1]], zoom=0.72)
         axes.tick_params(labelsize=6)
         axes.invert_zaxis()
@@ -152,7 +152,9 @@ def figure_cuts(cuts: Cuts) -> Figure:
                              height_ratios=[scale * tall, below])  # fmt: skip
     for i, (mode, cut) in enumerate(cuts.by_mode.items()):
         _draw_cut(panels[0, i], panels[1, i], cut)
-        panels[0, i].set_title(label_of(mode), fontsize="medium", color=colour_of(mode, modes))
+        panels[0, i].set_title(
+            label_of(mode).replace(", ", ",\n"), fontsize="medium", color=colour_of(mode, modes)
+        )
         panels[0, i].set_anchor("N")
     panels[0, 0].set_ylabel("depth from the top / mm")
     panels[1, 0].set_ylabel("enlarged")
