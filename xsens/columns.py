@@ -57,8 +57,9 @@ def columns(frames: Frames, wanted: frozenset[str]) -> tuple[dict[int, Column], 
             if arrangement is None:
                 damaged += same.size
                 continue
+            some = payloads if same.size == len(payloads) else payloads[same]
             for identifier, at in arrangement:
-                found[identifier].append(Column(rows[same], _numbers(identifier, payloads[same], at)))
+                found[identifier].append(Column(rows[same], _numbers(identifier, some, at)))
     return {identifier: _joined(pieces) for identifier, pieces in found.items()}, damaged
 
 
@@ -130,6 +131,8 @@ def _whole_type(kind: Kind) -> np.dtype[np.void]:
 
 
 def _joined(pieces: list[Column]) -> Column:
+    if len(pieces) == 1:
+        return pieces[0]
     rows = np.concatenate([piece.rows for piece in pieces])
     order = np.argsort(rows, kind="stable")
     return Column(rows[order], np.concatenate([piece.values for piece in pieces])[order])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
@@ -100,13 +101,17 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
         _sane(parts.accelerometer_m_s2, line.kept),
         _sane(parts.gyroscope_rad_s, line.kept),
         _sane(parts.magnetometer_au, line.kept),
-        None if turned is None or not turned.there.any() else turned.world_from_sensor[line.kept],
+        None if turned is None or not turned.there.any() else _kept(turned.world_from_sensor, line.kept),
         line.counter,
         line.gaps,
         (*parts.notes, *lacking, *line.notes),
         parts.source,
         np.zeros(0, dtype=bool) if turned is None or not turned.there.any() else turned.there[line.kept],
     )
+
+
+def _kept(rotations: Rotation, kept: BoolArray) -> Rotation:
+    return rotations if kept.all() else rotations[kept]
 
 
 def _sane(vectors: FloatArray | None, kept: BoolArray) -> FloatArray | None:

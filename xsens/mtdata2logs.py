@@ -82,10 +82,16 @@ def _filled(table: Table, name: str, size: int, count: int) -> FloatArray | None
     found = [column for identifier, column in table.items() if _name(identifier) == name]
     if not found:
         return None
+    if len(found) == 1 and found[0].rows.size == size and (np.diff(found[0].rows) == 1).all():
+        return found[0].values
     values = np.full((size, count), np.nan)
     for column in found:
         values[column.rows] = column.values
     return values
+
+
+def _of(values: FloatArray, rows: BoolArray) -> FloatArray:
+    return values if rows.all() else values[rows]
 
 
 def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
@@ -109,7 +115,7 @@ def _whole(values: FloatArray | None, rows: BoolArray) -> IntArray | None:
 def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
     def vectors(name: str, count: int = 3) -> FloatArray | None:
         values = _filled(table, name, rows.size, count)
-        return None if values is None else values[rows]
+        return None if values is None else _of(values, rows)
 
     acceleration, rate = vectors("acceleration_m_s2"), vectors("rate_of_turn_rad_s")
     orientations, notes = _orientations(table, rows, acceleration, hints)
@@ -149,7 +155,7 @@ def _orientations(
             world = hints.world or world_of(most)
             values = _filled({most: found[most]}, name, rows.size, found[most].values.shape[1])
             assert values is not None
-            return _turned(name, values[rows], world, acceleration)
+            return _turned(name, _of(values, rows), world, acceleration)
     return None, ()
 
 

@@ -51,6 +51,9 @@ _KNOWN = frozenset(name for names in _ALL for name in names)
 
 _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.]+)\s*hz", re.IGNORECASE)
 _GAP = re.compile(r"# gap: after sample (\d+), (\d+) lost, (\S+) s$")
+_ENOUGH = 1000
+"""Lines that show whether nine numbers are a matrix."""
+
 _MT9_COLUMNS = {4: "angles", 10: "matrix or vectors", 11: "vectors"}
 
 
@@ -237,7 +240,7 @@ def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
 def _mt9(values: FloatArray, parts: Parts, world: str) -> Parts:
     if values.shape[1] == 3:
         return replace(parts, orientations=from_angles(values, world))
-    if values.shape[1] == 9 and np.mean(are_rotations(values.reshape(-1, 3, 3))) > 0.5:
+    if values.shape[1] == 9 and np.mean(are_rotations(values[:_ENOUGH].reshape(-1, 3, 3))) > 0.5:
         orientations, _ = _of_matrices(values, None, world)
         note = "matrices are taken row by row: nothing in this file can tell"
         return replace(parts, orientations=orientations).noting(note)

@@ -10,6 +10,7 @@ import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import FloatArray
+from xsens.decimals import read_decimals
 
 SEPARATORS = ("\t", ";", ",", " ")
 """In order of trust: a tab is nothing else, a comma may be a decimal point, a space may be anything."""
@@ -128,7 +129,11 @@ def _table(
     body = body.replace("\r", "").strip("\n")
     if separator != "," and "," in body:
         body = body.replace(",", ".")
-    values, left_out = _quickly(body, separator, count), 0
+    values, left_out = None, 0
+    if separator != " ":
+        values = read_decimals(body.encode("ascii", "replace"), separator, count)
+    if values is None:
+        values = _quickly(body, separator, count)
     if values is None:
         values, left_out = _line_by_line(body, separator, count)
     if not len(values):

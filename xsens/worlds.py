@@ -63,22 +63,23 @@ def nwu_from(world: str) -> Rotation:
 def from_quaternions(wxyz: FloatArray, world: str) -> Orientations:
     """Of quaternions, shape (m, 4); those that are not of unit length count as missing."""
     there = np.asarray(np.abs(_length(wxyz) - 1.0) < _WORST_NORM)
-    usable = np.where(there[:, None], wxyz, [1.0, 0.0, 0.0, 0.0])
-    return _seen_from_north(Rotation.from_quat(usable, scalar_first=True), there, world)
+    usable = wxyz if there.all() else np.where(there[:, None], wxyz, [1.0, 0.0, 0.0, 0.0])
+    return _seen_from_north(usable, there, world)
 
 
 def from_angles(roll_pitch_yaw_deg: FloatArray, world: str) -> Orientations:
     """Of angles in degrees, shape (m, 3)."""
     there = np.asarray((np.abs(roll_pitch_yaw_deg) <= _WORST_ANGLE_DEG).all(axis=1))
     usable = np.where(there[:, None], roll_pitch_yaw_deg, 0.0)
-    return _seen_from_north(Rotation.from_euler("xyz", usable, degrees=True), there, world)
+    quaternions = Rotation.from_euler("xyz", usable, degrees=True).as_quat(scalar_first=True)
+    return _seen_from_north(quaternions, there, world)
 
 
 def from_matrices(matrices: FloatArray, world: str) -> Orientations:
     """Of matrices, shape (m, 3, 3); those that are not rotations count as missing."""
     there = are_rotations(matrices)
     usable = np.where(there[:, None, None], matrices, np.eye(3))
-    return _seen_from_north(Rotation.from_matrix(usable), there, world)
+    return _seen_from_north(Rotation.from_matrix(usable).as_quat(scalar_first=True), there, world)
 
 
 def are_rotations(matrices: FloatArray) -> BoolArray:
@@ -117,10 +118,11 @@ def _length(vectors: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))
 
 
-def _seen_from_north(rotation: Rotation, there: BoolArray, world: str) -> Orientations:
-    turned = nwu_from(world) * rotation
+def _seen_from_north(wxyz: FloatArray, there: BoolArray, world: str) -> Orientations:
+    """The rotations after that from `world`; as one product of matrices, many times faster than SciPy's."""
+    w, x, y, z = nwu_from(world).as_quat(scalar_first=True)
+    product = np.array([[x, w, -z, y], [y, z, w, -x], [z, -y, x, w], [w, -x, -y, -z]])
+    xyzw = np.einsum("ij,mj->mi", product, wxyz)
     if not there.all():
-        quaternions = turned.as_quat()
-        quaternions[~there] = [0.0, 0.0, 0.0, 1.0]
-        turned = Rotation.from_quat(quaternions)
-    return Orientations(turned, there)
+        xyzw[~there] = [0.0, 0.0, 0.0, 1.0]
+    return Orientations(Rotation.from_quat(xyzw), there)

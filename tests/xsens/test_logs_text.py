@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from imu_logs import WORLDS, samples
 
 from speckle3d.core.errors import InvalidInputError
+from xsens.decimals import read_decimals
 from xsens.logs import Hints, parse_text, read_log
 from xsens.texttables import read_table
 
@@ -229,3 +230,51 @@ def test_tables_are_read_quickly_as_they_are_read_cell_by_cell(rows, separator, 
     table = read_table(text, frozenset({"ab", "cd", "ef"}))
     np.testing.assert_array_equal(table.values, expected)
     assert (table.names, table.left_out) == (("ab", "cd", "ef"), 0)
+
+
+@st.composite
+def decimals(draw):
+    """Columns of numbers with a few decimals, some blank, as text."""
+    places = draw(st.lists(st.integers(0, 9), min_size=2, max_size=4))
+    rows = draw(st.integers(1, 20))
+    blank = st.booleans() if draw(st.booleans()) else st.just(False)
+    return [
+        ["" if draw(blank) else f"{draw(st.floats(-9999, 9999)):.{n}f}" for n in places] for _ in range(rows)
+    ]
+
+
+@settings(deadline=None, max_examples=100)
+@given(decimals())
+def test_plain_decimals_are_to_the_bit_what_they_are_one_by_one(rows):
+    body = "\n".join(";".join(row) for row in rows).encode()
+    found = read_decimals(body, ";", len(rows[0]))
+    if found is not None:
+        np.testing.assert_array_equal(found, [[float(cell or "nan") for cell in row] for row in rows])
+    if all(cell for row in rows for cell in row):
+        assert found is not None
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        "-",
+        ".",
+        "-.",
+        "1e3",
+        "nan",
+        "1-",
+        "--1",
+        "1.2.3",
+        "+1",
+        "0x1",
+        "1 2",
+        "é",
+        "12345678901234567.8",
+        "12.34",
+    ],
+)
+def test_cells_that_are_no_plain_decimals_are_left_to_others(cell):
+    """12.34 because its point lies elsewhere than its column's others."""
+    assert read_decimals(f"1.5,2.5\n{cell},3.5\n0.5,1.5".encode(), ",", 2) is None
+    assert read_decimals(b"12345678901234567,2", ",", 2) is None
+    assert read_decimals(b"1.5,2.5\n1.5\n1.5,2.5,1.0", ",", 2) is None

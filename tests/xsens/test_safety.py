@@ -1,7 +1,7 @@
 """Readers survive whatever a file holds: samples or one line of error, in bounded time and memory.
 
-``corpus/`` keeps inputs worth trying again: each reaches a part of the readers that no other does, or once broke
-one. ``corpus/make.py`` writes those that are made; add by hand what is found.
+``corpus/`` keeps inputs worth trying again: each reaches a part of the readers that no other does, or once
+broke one. ``corpus/make.py`` writes those that are made; add by hand what is found.
 """
 
 import os
