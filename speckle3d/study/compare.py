@@ -19,6 +19,7 @@ from typing import Any
 from speckle3d.config import Config
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.hdf5 import atomic_path, make_folder
+from speckle3d.study.job import REFERENCES, SUBSET
 from speckle3d.study.metrics import ModeError
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
 from speckle3d.study.summary import Summary, csv_text, plain, table_text
@@ -26,6 +27,7 @@ from speckle3d.study.sweepjob import SweepJob, SweepOutcome, finished, lost, pla
 
 FORMAT = "speckle3d.study"
 VERSION = 1
+KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
 
 
 @dataclass(frozen=True)
@@ -91,9 +93,10 @@ def compare_sweeps(
     """
     if not paths:
         raise InvalidInputError("expected at least one sweep, got none")
+    chosen = None if modes is None else tuple(dict.fromkeys(modes))
+    _require_known(chosen, reference)
     make_folder(directory / "sweeps")
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
-    chosen = None if modes is None else tuple(dict.fromkeys(modes))
     plan = [
         plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
         for name, path in _named(paths)
@@ -117,6 +120,15 @@ def _require_here(outcome: SweepOutcome, job: SweepJob) -> SweepOutcome:
     if outcome.status == "done" and finished(job) is None:
         return lost(job, f"{job.folder}: expected a folder that workers and the study share, got none here")
     return outcome
+
+
+def _require_known(modes: tuple[str, ...] | None, reference: str | None) -> None:
+    """Refuse what would be wrong for every sweep before any work is done."""
+    for mode in modes or ():
+        if mode not in KNOWN_MODES:
+            raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
+    if reference is not None and reference not in REFERENCES:
+        raise InvalidInputError(f"expected a reference among {', '.join(REFERENCES)}; got {reference!r}")
 
 
 def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:

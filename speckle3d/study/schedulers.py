@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -24,6 +24,8 @@ Result = TypeVar("Result")
 
 CONNECT_S = 20
 """How long a cluster may take to answer; one on the same network takes far below a second."""
+
+_KILLED = "every worker that tried it died: killed, crashed or out of memory"
 
 
 class Scheduler(Protocol):
@@ -70,16 +72,34 @@ class OnCluster:
         self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
     ) -> Iterator[tuple[int, Result]]:
         """Yield the number of each job and its result as they come."""
+        suspects = []
+        for number, reason, result in self._arriving(function, dict(enumerate(jobs))):
+            if reason == _KILLED:
+                suspects.append(number)
+                continue
+            yield number, result if reason is None else lost(jobs[number], reason)
+        # The cluster blames a death on all that waited at the worker; alone, each shows if it was the one.
+        for suspect in suspects:
+            for number, reason, result in self._arriving(function, {suspect: jobs[suspect]}):
+                yield number, result if reason is None else lost(jobs[number], reason)
+
+    def _arriving(
+        self, function: Callable[[Job], Result], jobs: Mapping[int, Job]
+    ) -> Iterator[tuple[int, str | None, Any]]:
+        """Submit jobs and yield why each failed, or None, and its result, as they end."""
         # Not pure: a job's key must not be taken for that of an earlier study that is still held.
-        futures = [self.client.submit(function, job, pure=False) for job in jobs]
-        numbers = {future.key: number for number, future in enumerate(futures)}
+        futures = {number: self.client.submit(function, job, pure=False) for number, job in jobs.items()}
+        numbers = {future.key: number for number, future in futures.items()}
         try:
-            for future in _dask().as_completed(futures):
-                number = numbers[future.key]
-                reason = _failure(future)
-                yield number, future.result() if reason is None else lost(jobs[number], reason)
+            for future in _dask().as_completed(list(futures.values())):
+                number, reason = numbers[future.key], _failure(future)
+                result = future.result() if reason is None else None
+                # A result that is still asked for would be made again if its worker died.
+                del futures[number]
+                future.release()
+                yield number, reason, result
         finally:
-            self.client.cancel(futures)
+            self.client.cancel(list(futures.values()))
 
     @property
     def workers(self) -> int:
@@ -173,7 +193,7 @@ def _failure(future: Any) -> str | None:
         return "cancelled by the cluster"
     error = future.exception()
     if type(error).__name__ == "KilledWorker":
-        return "every worker that tried it died: killed, crashed or out of memory"
+        return _KILLED
     return f"{type(error).__name__}: {one_line(error)}"
 
 

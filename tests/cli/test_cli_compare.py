@@ -1,0 +1,57 @@
+import json
+
+import pytest
+
+from speckle3d.cli.compare import _line
+from speckle3d.study.compare import StudyProgress
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory):
+    path = tmp_path_factory.mktemp("torn") / "torn.h5"
+    path.write_bytes(b"nothing")
+    return path
+
+
+# Figures are closed by the report itself.
+@pytest.mark.filterwarnings("default::ResourceWarning")
+def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, tmp_path):
+    code, out, err = run("compare", bench / "sweep.h5", torn, "-o", tmp_path / "study", "--drift", "pose")
+    assert code == 0, err
+    assert [line.split()[2] for line in out.splitlines()[2:4]] == ["image", "pose"]
+    assert "torn: failed: " in err
+    names = {path.name for path in (tmp_path / "study").iterdir()}
+    assert {"study.json", "table.txt", "table.csv", "report.html", "sweeps"} <= names
+    code, out, err = run(
+        "compare", bench / "sweep.h5", torn, "-o", tmp_path / "study", "--drift", "pose", "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["modes"] == ["image", "pose"]
+    assert "1 of 2 sweeps were finished before" in err
+
+
+def test_a_study_of_broken_sweeps_alone_fails_after_saying_why(run, torn, tmp_path):
+    code, out, err = run("compare", torn, "-o", tmp_path / "study")
+    assert code == 2
+    assert "torn  failed: " in out
+    assert "expected a sweep that can be compared, got none" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--scheduler", "tcp://a:1", "--workers", "2"), "got both"),
+        (("--workers", "0"), "expected at least 1, got 0"),
+        (("--drift", "sideways"), "sideways"),
+        (("--reference", "guess"), "expected a reference among"),
+    ],
+)
+def test_a_wrong_option_is_one_line(refused, bench, tmp_path, options, message):
+    assert message in refused("compare", bench / "sweep.h5", "-o", tmp_path / "study", *options)
+
+
+def test_the_line_of_progress_promises_nothing_before_the_first_sweep():
+    at = StudyProgress(sweeps=4, frames=400)
+    assert _line(at) == "0 of 4 sweeps; time left is known after the first"
+    at.done, at.failed, at.remaining_s = 2, 1, 83.0
+    assert _line(at) == "2 of 4 sweeps, 1 failed; about 1 min 23 s left"

@@ -1,0 +1,188 @@
+import csv
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.config import Config
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.study.compare import StudyProgress, compare_sweeps
+from speckle3d.study.job import Reference
+from speckle3d.study.schedulers import OnCluster, local_cluster
+from speckle3d.study.sweepjob import SweepOutcome, drift_rows, plan_sweep, run_sweep
+
+# Dask's processes leave sockets to the garbage collector when one is killed.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+MODES = ["image", "image+subset", "orientation", "pose"]
+
+
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory, shipped):
+    """Two small sweeps, and one whose file is broken."""
+    folder = tmp_path_factory.mktemp("sweeps")
+    shutil.copy(shipped / "curves.h5", folder)
+    for seed in (5, 6):
+        settings = SimulationSettings(
+            preset="tissue", vectors=26, samples=1000, seed=seed, length_mm=3.0, frames=24
+        )
+        write_sweep(folder / f"s{seed}.h5", simulate(settings)[0].sweep)
+    (folder / "broken.h5").write_bytes(b"nothing")
+    return [folder / name for name in ("s5.h5", "broken.h5", "s6.h5")]
+
+
+@pytest.fixture(scope="module")
+def study(sweeps, tmp_path_factory):
+    return compare_sweeps(sweeps, tmp_path_factory.mktemp("study"))
+
+
+def held(directory):
+    return json.loads((directory / "study.json").read_text())
+
+
+def numbers(directory):
+    """What a study measured, to the last bit."""
+    study = held(directory)
+    poses = {}
+    for entry in study["sweeps"]:
+        if entry["status"] == "done":
+            found = read_reconstruction(directory / entry["folder"] / "reconstruction.h5")
+            poses[entry["name"]] = {m: p.as_matrix().tobytes() for m, p in found.poses.items()}
+            poses[entry["name"]]["pairs"] = found.pairs.covariance.tobytes()
+    return study["rows"], study["drift"], poses
+
+
+def test_every_mode_that_has_sensors_and_the_broken_sweep_as_a_row(study):
+    found = held(study.directory)
+    assert found["modes"] == MODES
+    assert [entry["status"] for entry in found["sweeps"]] == ["done", "failed", "done"]
+    assert "expected a sweep file" in found["sweeps"][1]["reason"]
+    assert {(row["sweep"], row["mode"]) for row in found["drift"]} == {
+        (s, m) for s in ("s5", "s6") for m in MODES
+    }
+    assert "broken  failed: " in (study.directory / "table.txt").read_text()
+    rows = list(csv.DictReader((study.directory / "table.csv").open()))
+    assert [row["reason"] != "" for row in rows if row["sweep"] == "broken"] == [True]
+    assert {row["mode"] for row in rows if row["sweep"] == "s6"} == set(MODES)
+    assert [path for path in study.directory.rglob("*") if ".part-" in path.name] == []
+
+
+def test_a_second_start_does_nothing_again_but_what_changed(study, sweeps, tmp_path):
+    shutil.copytree(study.directory, tmp_path / "again")
+    before = numbers(study.directory)
+    again = compare_sweeps(sweeps, tmp_path / "again")
+    assert [each.skipped for each in again.outcomes] == [True, False, True]
+    assert numbers(again.directory) == before
+    other = Config().with_choices(consistent_subset=False, drift_curves=None)
+    changed = compare_sweeps(sweeps[:1], tmp_path / "again", config=other)
+    assert not changed.outcomes[0].skipped
+    assert held(tmp_path / "again")["modes"] == ["image", "orientation", "pose"]
+
+
+def test_a_folder_without_its_last_file_is_done_again(study, sweeps, tmp_path):
+    shutil.copytree(study.directory, tmp_path / "again")
+    (tmp_path / "again" / held(study.directory)["sweeps"][0]["folder"] / "job.json").unlink()
+    again = compare_sweeps(sweeps, tmp_path / "again")
+    assert [each.skipped for each in again.outcomes] == [False, False, True]
+    assert numbers(again.directory) == numbers(study.directory)
+
+
+def test_workers_give_the_same_bits_though_one_is_killed(study, sweeps, tmp_path):
+    killed = []
+    with local_cluster(2) as client:
+        workers = [each["pid"] for each in client.run(lambda: {"pid": os.getpid()}).values()]
+
+        def kill():
+            # As soon as a sweep is being worked at.
+            while not list((tmp_path / "out" / "sweeps").glob(".part-*")):
+                time.sleep(0.005)
+            os.kill(workers[0], signal.SIGKILL)
+            killed.append(workers[0])
+
+        thread = threading.Thread(target=kill)
+        thread.start()
+        found = compare_sweeps(sweeps, tmp_path / "out", scheduler=OnCluster(client))
+        thread.join(timeout=20)
+    assert len(killed) == 1
+    assert [each.status for each in found.outcomes] == ["done", "failed", "done"]
+    assert numbers(found.directory) == numbers(study.directory)
+    assert list((tmp_path / "out" / "sweeps").glob(".part-*")) == []
+
+
+def test_a_mode_that_a_sweep_has_no_sensor_for_is_its_reason(sweeps, tmp_path):
+    bare = tmp_path / "bare.h5"
+    sweep = load_sweep(sweeps[0])
+    write_sweep(bare, replace(sweep, orientation=None, tracker=None))
+    shutil.copy(sweeps[0].parent / "curves.h5", tmp_path)
+    asked = compare_sweeps([bare], tmp_path / "asked", ["pose"])
+    assert "expected a tracker" in asked.outcomes[0].reason
+    assert held(compare_sweeps([bare], tmp_path / "all").directory)["modes"] == ["image"]
+
+
+def test_a_file_that_changed_under_the_study_is_its_reason(sweeps, tmp_path):
+    for name in ("s5.h5", "curves.h5"):
+        shutil.copy(sweeps[0].parent / name, tmp_path)
+    job = plan_sweep("s5", tmp_path / "s5.h5", tmp_path, None, Config().to_toml(), None, None, ())
+    shutil.copy(sweeps[2], tmp_path / "s5.h5")
+    assert "expected the file that the study began with" in run_sweep(job).reason
+
+
+def test_a_bug_in_one_sweep_is_its_reason_and_leaves_nothing(sweeps, tmp_path, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("in the middle")
+
+    monkeypatch.setattr("speckle3d.study.sweepjob.run_job", broken)
+    found = compare_sweeps(sweeps[:1], tmp_path)
+    assert found.outcomes[0].reason == "ZeroDivisionError: in the middle"
+    assert list((tmp_path / "sweeps").iterdir()) == []
+
+
+def test_sweeps_of_one_name_are_told_apart_and_one_given_twice_is_one(sweeps, tmp_path):
+    (tmp_path / "other").mkdir()
+    twin = tmp_path / "other" / "broken.h5"
+    twin.write_bytes(b"nothing")
+    found = compare_sweeps([sweeps[1], twin, sweeps[1]], tmp_path)
+    assert [each.name for each in found.outcomes] == ["broken", "other-broken"]
+
+
+def test_no_sweeps_are_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match="at least one sweep"):
+        compare_sweeps([], tmp_path)
+
+
+def test_drift_of_a_uniform_stretch(sweeps):
+    """ALGORITHMS I: a straight sweep stretched by 5 % has FDR = ADR = 5 %, MD = 0.05 L, EA = 0."""
+    z = np.linspace(0.0, 20.0, 41)
+    true = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z]))
+    found = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, 1.05 * z]))
+    sweep = load_sweep(sweeps[0])
+    (row,) = drift_rows(sweep, {"image": found}, Reference("truth", true, np.ones(41, dtype=bool)))
+    # Mean of 0.05 z over frames 1 to 40 is 0.05 x 20 x 41 / 80; steps differ by 0.05 x 0.5 mm.
+    expected = {"FDR": 0.05, "ADR": 0.05, "MD_mm": 1.0, "SD_mm": 20.5, "HD_mm": 1.0, "EA_deg": 0.0}
+    expected |= {"GPE_mm": 0.5125, "LPE_mm": 0.025}
+    assert {name: row[name] for name in expected} == pytest.approx(expected, abs=1e-9)
+
+
+def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path):
+    at = StudyProgress(sweeps=3, frames=300)
+    assert at.remaining_s is None
+    at.add(SweepOutcome("a", tmp_path, "done", seconds=0.0, skipped=True), 100, 2)
+    assert at.remaining_s is None
+    at.add(SweepOutcome("b", tmp_path, "done", seconds=20.0), 100, 2)
+    # One sweep of 100 frames is left, on one of the two workers, at 0.2 s a frame.
+    assert at.remaining_s == pytest.approx(20.0)
+    at.add(SweepOutcome("c", tmp_path, "failed"), 100, 2)
+    assert (at.remaining_s, at.failed, at.done) == (0.0, 1, 3)
