@@ -10,7 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from speckle3d.cli import clock, curves, files, phantoms, reconstruction, repeatability
+from speckle3d.cli import clock, compare, curves, files, phantoms, reconstruction, repeatability
 from speckle3d.cli.common import app, calibrate
 from speckle3d.core.errors import Speckle3DError
 
@@ -18,6 +18,7 @@ __all__ = [
     "app",
     "calibrate",
     "clock",
+    "compare",
     "curves",
     "files",
     "main",
