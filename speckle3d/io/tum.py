@@ -1,0 +1,94 @@
+"""Trajectories as TUM text: a line per pose, ``time_s x y z qx qy qz qw``, quaternion scalar last.
+
+A line that starts with a hash is a comment. The format says metres, and so do files written here unless asked
+otherwise; poses in memory are in mm.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, naming
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import TimedPoses
+from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
+from speckle3d.io.headers import numbers
+
+LengthUnit = Literal["m", "mm"]
+
+_MM_PER_UNIT: dict[str, float] = {"m": 1000.0, "mm": 1.0}
+_COLUMNS = 8
+_UNIT_TOLERANCE = 1e-2
+"""Of a quaternion's norm: files in the wild round to four digits."""
+
+
+def write_tum(
+    path: PathLike, time_s: npt.ArrayLike, poses: RigidTransform, length_unit: LengthUnit = "m"
+) -> None:
+    """Write poses, in mm, as TUM text with all their digits; the file appears whole or not at all.
+
+    Raises
+    ------
+    MismatchError
+        If times and poses differ in number.
+    FileError
+        If the file cannot be written.
+    """
+    times = np.asarray(time_s, dtype=float)
+    if times.shape != (len(poses),):
+        raise MismatchError(f"{path}: expected {len(poses)} times, got shape {times.shape}")
+    rows = np.column_stack(
+        [times, poses.translation / _mm_per(length_unit), poses.rotation.as_quat(canonical=True)]
+    )
+    lines = [f"# time_s x_{length_unit} y_{length_unit} z_{length_unit} qx qy qz qw"]
+    lines += [" ".join(repr(value) for value in row) for row in rows.tolist()]
+    with atomic_path(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_tum(path: PathLike, length_unit: LengthUnit = "m") -> TimedPoses:
+    """Read TUM text into poses in mm.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If a line is not eight finite numbers, a quaternion is not of unit length, or times do not increase.
+    """
+    rows = _read_rows(path)
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    if (wrong := np.flatnonzero(np.abs(norms - 1.0) > _UNIT_TOLERANCE)).size:
+        where = f"{path}: pose {wrong[0]}"
+        raise InvalidInputError(f"{where}: expected a unit quaternion, got norm {norms[wrong[0]]:.4g}")
+    poses = RigidTransform.from_components(
+        rows[:, 1:4] * _mm_per(length_unit), Rotation.from_quat(rows[:, 4:])
+    )
+    with naming(str(path)):
+        return TimedPoses(rows[:, 0].copy(), poses)
+
+
+def _read_rows(path: PathLike) -> FloatArray:
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"{path}: cannot be read as text: {one_line(error)}") from error
+    rows = [
+        numbers(line, _COLUMNS, f"{path}: line {n}")
+        for n, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise InvalidInputError(f"{path}: expected lines of eight numbers, got none")
+    return np.array(rows)
+
+
+def _mm_per(length_unit: str) -> float:
+    if length_unit not in _MM_PER_UNIT:
+        raise InvalidInputError(f"length unit: expected m or mm, got {length_unit!r}")
+    return _MM_PER_UNIT[length_unit]

@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from drifting import hand_sweep
+
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.io.tum import read_tum, write_tum
+
+
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_what_is_written_is_read_back(tmp_path, unit):
+    poses = hand_sweep(np.random.default_rng(3), 30)
+    times = np.arange(30) / 30.0
+    write_tum(tmp_path / "a.tum", times, poses, unit)
+    back = read_tum(tmp_path / "a.tum", unit)
+    np.testing.assert_array_equal(back.time_s, times)
+    # Rounding of a product with 1000 and of a quaternion's norm.
+    np.testing.assert_allclose(back.world_from_sensor.as_matrix(), poses.as_matrix(), rtol=0, atol=1e-12)
+
+
+def test_columns_are_metres_and_a_quaternion_scalar_last(tmp_path):
+    (tmp_path / "a.tum").write_text("# hand\n0 0.001 0 0 0 0 0 1\n\n1 0 0.002 0 0 0 1 0\n")
+    matrices = read_tum(tmp_path / "a.tum").world_from_sensor.as_matrix()
+    np.testing.assert_allclose(matrices[0, :3, 3], [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(np.diag(matrices[1]), [-1.0, -1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "eight numbers"),
+        ("0 0 0 0 0 0 1\n", "line 1"),
+        ("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n", "line 2"),
+        ("0 0 0 0 0 0 0 2\n", "pose 0"),
+        ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "increas"),
+    ],
+)
+def test_a_wrong_file_is_named(tmp_path, text, words):
+    (tmp_path / "a.tum").write_text(text)
+    with pytest.raises(InvalidInputError, match=words) as caught:
+        read_tum(tmp_path / "a.tum")
+    assert "a.tum" in str(caught.value)
+
+
+def test_missing_files_units_and_times_that_do_not_fit(tmp_path):
+    with pytest.raises(FileError, match=r"none\.tum"):
+        read_tum(tmp_path / "none.tum")
+    poses = hand_sweep(np.random.default_rng(3), 5)
+    with pytest.raises(MismatchError, match="expected 5 times"):
+        write_tum(tmp_path / "a.tum", np.arange(4), poses)
+    with pytest.raises(InvalidInputError, match="m or mm"):
+        write_tum(tmp_path / "a.tum", np.arange(5), poses, "cm")
