@@ -1,0 +1,114 @@
+"""How sure a study can be: intervals of means over sweeps, and modes compared in pairs.
+
+A sweep is the unit: one number per sweep and mode. With fewer than `FEWEST` sweeps, or without any scatter,
+there is no interval to be had, and none is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.geometry import FloatArray
+
+FEWEST = 3
+"""Below, a bootstrap only repeats the values themselves."""
+
+_RESAMPLES = 9999
+_SEED = 20081
+
+
+@dataclass(frozen=True)
+class MeanInterval:
+    """Mean over sweeps and its bootstrap interval, in the unit of the values.
+
+    `low` and `high` are None where the sweeps are too few or all alike.
+    """
+
+    sweeps: int
+    mean: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """One mode against another on the same sweeps.
+
+    Attributes
+    ----------
+    difference : MeanInterval
+        Of the first mode's values less the second's.
+    wilcoxon_p : float or None
+        Two-sided signed-rank test; None where `difference` has no interval. With n sweeps it cannot be below
+        2 / 2**n, so that five sweeps never reach 0.05.
+    """
+
+    difference: MeanInterval
+    wilcoxon_p: float | None
+
+
+def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterval:
+    """Mean of one value per sweep, with its percentile bootstrap interval [1]_; seeded, so it repeats.
+
+    NaN stands for a sweep without a value and is left out.
+
+    Raises
+    ------
+    InsufficientDataError
+        If no sweep has a value.
+
+    References
+    ----------
+    .. [1] B. Efron and R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
+    """
+    held = _held(np.asarray(values, dtype=float))
+    mean = float(held.mean())
+    if not _tells(held):
+        return MeanInterval(held.size, mean, None, None)
+    interval = stats.bootstrap(
+        (held,),
+        np.mean,
+        n_resamples=_RESAMPLES,
+        confidence_level=confidence,
+        method="percentile",
+        rng=np.random.default_rng(_SEED),
+    ).confidence_interval
+    return MeanInterval(held.size, mean, float(interval.low), float(interval.high))
+
+
+def paired_comparison(
+    first: npt.ArrayLike, second: npt.ArrayLike, confidence: float = 0.95
+) -> PairedComparison:
+    """Compare two modes by their differences, sweep by sweep; sweeps that lack either are left out.
+
+    Raises
+    ------
+    MismatchError
+        If the two are not of the same sweeps.
+    InsufficientDataError
+        If no sweep has both values.
+    """
+    one, other = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    if one.shape != other.shape:
+        raise MismatchError(f"second mode: expected values of shape {one.shape}, got {other.shape}")
+    differences = _held(one - other)
+    found = mean_interval(differences, confidence)
+    if not _tells(differences):
+        return PairedComparison(found, None)
+    return PairedComparison(found, float(stats.wilcoxon(differences).pvalue))
+
+
+def _held(values: FloatArray) -> FloatArray:
+    held: FloatArray = values[np.isfinite(values)]
+    if not held.size:
+        raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
+    return held
+
+
+def _tells(values: FloatArray) -> bool:
+    return values.size >= FEWEST and bool(np.ptp(values) > 0)
