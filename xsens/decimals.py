@@ -15,8 +15,8 @@ _LONGEST_CELL = 17
 """Of a sign, a point and 15 digits."""
 
 _MOST_EXACT = 2.0**53
-"""Below it, digits without their point are exact in a double, and their quotient by a power of ten is the nearest
-double there is."""
+"""Below it, digits without their point are exact in a double, and their quotient by a power of ten is the
+nearest double there is."""
 
 _LINES = 8192
 """Taken up at a time: what is made of them stays in the cache."""
