@@ -1,8 +1,8 @@
-"""Whether the magnetic field can be trusted for heading: its norm and dip against a reference that can change.
+"""Whether the magnetic field can be trusted for heading: its norm and dip against a changing reference.
 
 Iron near the sensor shows in the two components of the field that do not depend on the heading, its
-horizontal strength and its vertical part. A magnet that moves with the sensor adds a vector that is constant in the
-sensor's axes; turning tells it from the room's field, which is constant in the world's.
+horizontal strength and its vertical part. A magnet that moves with the sensor adds a vector that is
+constant in the sensor's axes; turning tells it from the room's field, which is constant in the world's.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class _Candidate:
         iron = np.linalg.solve((1.0 + _IRON_PRIOR) * np.eye(3) - turn.T @ turn, body - turn.T @ world)
         room = world - turn @ iron
         left = self._square / self.weight_s - room @ room - iron @ iron - 2.0 * room @ turn @ iron
-        return room, iron, max(float(left), 0.0)
+        return room, np.asarray(iron, dtype=np.float64), max(float(left), 0.0)
 
     def room_with(self, iron: FloatArray) -> tuple[FloatArray, float]:
         """The room's field if the iron is as given, and the mean square that leaves."""
@@ -155,9 +155,11 @@ class FieldReading:
         Iron removed, in the axes given.
     disturbed : bool
     variance_rad2 : float
-        Of the heading it shows, by how far the two other components are off; without the room's own unevenness.
+        Of the heading it shows, by how far the two other components are off; without the room's own
+        unevenness.
     restart_au : ndarray, shape (3,), or None
-        The room's field, when it replaced a first reference that had not proved itself: the heading may be far off.
+        The room's field, when it replaced a first reference that had not proved itself: the heading may be
+        far off.
     """
 
     world_au: FloatArray
@@ -199,7 +201,8 @@ class FieldMonitor:
         self._smooth(clean, duration_s)
         fits = reference.fits(self._horizontal, self._vertical, self._settings)
         self._fitting_s = self._fitting_s + duration_s if fits else 0.0
-        off = (self._horizontal - reference.horizontal_au) ** 2 + (self._vertical - reference.vertical_au) ** 2
+        across, along = self._horizontal - reference.horizontal_au, self._vertical - reference.vertical_au
+        off = across**2 + along**2
         self.reference = self._followed(reference, duration_s)
         restart = None
         if rate_rad_s > _TURNING_RAD_S:
@@ -231,7 +234,7 @@ class FieldMonitor:
         return reference.towards(self._horizontal, self._vertical, share)
 
     def _learn(self) -> FloatArray | None:
-        """The room's field, if what was seen while turning fits another reference clearly better: it is replaced."""
+        """The room's field, if turning showed another reference to fit clearly better."""
         assert self.reference is not None
         better = self._candidate.better_than(self.reference)
         if better is None:
@@ -247,5 +250,7 @@ class FieldMonitor:
 
     def _refine(self) -> None:
         """Iron once learnt is known better the longer the sensor turns."""
+        if self._known is None:
+            return
         room, iron, _ = self._known.solve()
         self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)

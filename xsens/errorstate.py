@@ -1,13 +1,14 @@
 """The error-state Kalman filter of orientation, one short increment at a time.
 
-Error state, 12: attitude (world axes, z the heading), gyroscope bias as inclination knows it (sensor axes),
-velocity (world axes), gyroscope bias as heading knows it. Two copies of one bias keep magnetism out of
-inclination: the magnetometer corrects heading and the heading's copy alone (a Schmidt filter, whose covariance
-stays honest), everything else corrects both.
+Error state, 13: attitude (world axes, z the heading), gyroscope bias as inclination knows it (sensor axes),
+velocity (world axes), gyroscope bias as heading knows it, and how far the field's heading here is from
+north. Two copies of one bias keep magnetism out of inclination: the magnetometer corrects heading and the
+heading's copy alone (a Schmidt filter, whose covariance stays honest), everything else corrects both.
+Without a magnetometer there is one bias and the heading's copy is unused.
 
-The accelerometer is integrated to velocity, which a hand keeps near zero: over many swings that shows gravity through
-any movement, where the accelerometer itself shows it only at rest. The attitude error is the invariant one (velocity turns with it),
-so heading and velocity do not mix.
+The accelerometer is integrated to velocity, which a hand keeps near zero: over many swings that shows
+gravity through any movement, where the accelerometer itself shows it only at rest. The attitude error is
+the invariant one (velocity turns with it), so heading and velocity do not mix.
 
 References
 ----------
@@ -31,9 +32,9 @@ from xsens.fusion_settings import FusionSettings
 from xsens.increments import Increment
 from xsens.quaternions import turn_matrix
 
-SIZE = 12
+SIZE = 13
 ANGLE, BIAS, SPEED, HEADING_BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-HEADING = 2
+HEADING, STRAY = 2, 12
 
 _START_S = 1.0
 """Inclination at the start is the direction of the mean force of so long, and heading the field's."""
@@ -46,7 +47,7 @@ _REST_BIAS_RAD = math.radians(0.03)
 """How well one second of rest shows the bias: an MT9-B's Allan deviation at 1 s is 0.05 deg/s."""
 
 _REST_NOISE = 0.1
-"""A resting sensor's attitude wanders by so much of the angle random walk; it is not integrated, so this stands
+"""A resting sensor's attitude wanders by so much of the angle random walk; not integrated, so this stands
 for turning too slow to notice."""
 
 
@@ -130,25 +131,51 @@ class ErrorStateFilter:
     """Orientation from increments. The world is x magnetic north, y west, z up."""
 
     def __init__(self, settings: FusionSettings, first: Increment) -> None:
+        """Start at the beginning of `first`, which is still to be given to `advance`; its bias is taken."""
         self.settings = settings
         self._level = _upright(first.velocity_m_s)
         self._start: _Start | None = _Start()
         self._heading = 0.0
         self.velocity = np.zeros(3)
         self.bias = first.bias_rad_s.copy()
-        self.heading_bias = self.bias.copy()
+        self._heading_bias = self.bias.copy()
+        self._magnetic = settings.use_magnetometer
         self.resting = self.disturbed = False
         self._rest = RestDetector(settings)
         self._monitor = FieldMonitor(settings)
-        self._north_known = False
+        self._stray = 0.0
         self.kalman = KalmanFilter(dim_x=SIZE, dim_z=3)
         self.kalman.P = _start_covariance(settings)
         self.transition = np.eye(SIZE)
 
     @property
+    def started(self) -> bool:
+        """Whether the first second, in which the direction of up is found, is over."""
+        return self._start is None
+
+    def resume(self, increment: Increment, pause_s: float) -> None:
+        """Find up and north again after a pause, before `increment`; bias and reference field are kept."""
+        fresh = _start_covariance(self.settings)
+        walk = self.settings.bias_walk_rad_s_sqrt_s**2 * pause_s
+        for row in (BIAS, HEADING_BIAS):
+            for column in (BIAS, HEADING_BIAS):
+                fresh[row, column] = self.kalman.P[row, column]
+        fresh[BIAS, BIAS] += walk * np.eye(3)
+        fresh[HEADING_BIAS, HEADING_BIAS] += walk * np.eye(3)
+        self.kalman.P = fresh
+        self._start, self._stray = _Start(), 0.0
+        self._level, self._heading = _upright(increment.velocity_m_s), 0.0
+        self._rest = RestDetector(self.settings)
+
+    @property
     def matrix(self) -> FloatArray:
         """World from sensor, shape (3, 3)."""
         return _about_up(self._heading) @ self._level
+
+    @property
+    def heading_bias(self) -> FloatArray:
+        """Gyroscope bias, shape (3,), by everything that is known."""
+        return self._heading_bias if self._magnetic else self.bias
 
     def snapshot(self) -> Snapshot:
         """What is believed now."""
@@ -160,13 +187,14 @@ class ErrorStateFilter:
         self._decide_rest(increment)
         before = self._level
         self._predict(increment)
+        self.predicted = self._level, self.velocity
         if self._start is not None:
             self._begin(increment)
             return
         self._correct_velocity(increment.duration_s)
         if self.resting:
             self._correct_bias(increment)
-        if increment.field_au is not None and self.settings.use_magnetometer:
+        if increment.field_au is not None and self._magnetic:
             self._correct_heading(before @ increment.field_au, increment)
 
     def _decide_rest(self, increment: Increment) -> None:
@@ -182,7 +210,7 @@ class ErrorStateFilter:
         self.velocity = np.zeros(3)
         over = start.duration_s >= _START_S
         self._start = None if over else start
-        if start.field_s > 0.0 and self.settings.use_magnetometer:
+        if start.field_s > 0.0 and self._magnetic:
             field = self._level @ start.field()
             self._heading = -math.atan2(field[1], field[0])
             if over:
@@ -194,7 +222,9 @@ class ErrorStateFilter:
         duration = increment.duration_s
         lever = self._level * duration
         self.transition = self._transition_of(lever, duration)
-        self.kalman.predict(F=self.transition, Q=self._noise(increment))
+        self.noise = self._noise(increment)
+        self.kalman.predict(F=self.transition, Q=self.noise)
+        self._stray *= self.transition[STRAY, STRAY]
         self._heading += float(lever[HEADING] @ (self.bias - self.heading_bias))
         self.velocity = self.velocity + self._level @ increment.velocity_m_s
         self.velocity[2] -= self.settings.gravity_m_s2 * duration
@@ -206,8 +236,9 @@ class ErrorStateFilter:
         gravity = self.settings.gravity_m_s2
         transition = np.eye(SIZE)
         if not self.resting:
+            transition[STRAY, STRAY] = 1.0 - duration / self.settings.field_place_s
             transition[:HEADING, BIAS] = -lever[:HEADING]
-            transition[HEADING, HEADING_BIAS] = -lever[HEADING]
+            transition[HEADING, HEADING_BIAS if self._magnetic else BIAS] = -lever[HEADING]
             transition[SPEED, BIAS] = -skew(self.velocity) @ lever
         transition[6, 1], transition[7, 0] = gravity * duration, -gravity * duration
         return transition
@@ -222,7 +253,11 @@ class ErrorStateFilter:
         walk = s.bias_walk_rad_s_sqrt_s**2 * duration
         i = np.arange(3)
         noise[i, i] = turning * duration
-        noise[i + 3, i + 3] = noise[i + 9, i + 9] = noise[i + 3, i + 9] = noise[i + 9, i + 3] = walk
+        noise[i + 3, i + 3] = walk
+        if self._magnetic:
+            if not self.resting:
+                noise[STRAY, STRAY] = 2.0 * s.field_sd_rad**2 / s.field_place_s * duration
+            noise[i + 9, i + 9] = noise[i + 3, i + 9] = noise[i + 9, i + 3] = walk
         noise[i + 6, i + 6] = s.force_noise_m_s_sqrt_s**2 * duration
         return noise
 
@@ -241,6 +276,9 @@ class ErrorStateFilter:
         """A resting sensor's gyroscope reads its bias; each copy is told so by itself."""
         variance = _REST_BIAS_RAD**2 / increment.duration_s * np.eye(3)
         tilt = increment.rate_rad_s - self.bias
+        if not self._magnetic:
+            self._masked_update(_OBSERVES_BIAS, tilt, variance, np.ones(SIZE))
+            return
         self._masked_update(_OBSERVES_BIAS, tilt, variance, _INCLINATION)
         heading = increment.rate_rad_s - self.heading_bias
         self._masked_update(_OBSERVES_HEADING_BIAS, heading, variance, _HEADING_ONLY)
@@ -256,13 +294,12 @@ class ErrorStateFilter:
         horizontal = x * x + y * y
         if reading.disturbed or horizontal == 0.0:
             return
-        residual = _wrapped(-math.atan2(y, x) - self._heading)
+        residual = _wrapped(-math.atan2(y, x) - self._heading - self._stray)
         shows = np.zeros((1, SIZE))
         shows[0, :3] = -z * x / horizontal, -z * y / horizontal, 1.0
-        variance = s.field_sd_rad**2 + reading.variance_rad2
-        if self._north_known:
-            variance *= 2.0 * (s.field_rest_time_s if self.resting else s.field_time_s) / duration
-        self._north_known = True
+        shows[0, STRAY] = 1.0
+        variance = s.field_noise_rad_sqrt_s**2 + 2.0 * s.field_off_s * reading.variance_rad2
+        variance /= duration
         self._masked_update(shows, np.array([residual]), np.array([[variance]]), _HEADING_ONLY)
 
     def _doubt_heading(self, room_au: FloatArray) -> None:
@@ -287,12 +324,16 @@ class ErrorStateFilter:
     def _inject(self) -> None:
         """Put the estimated error where it belongs and start again from none."""
         error = self.kalman.x[:, 0]
-        tilt = turn_matrix(np.array([error[0], error[1], 0.0]))
-        self._level = tilt @ self._level
-        self._heading = _wrapped(self._heading + float(error[HEADING]))
+        angle = error[ANGLE].copy()
+        if self._magnetic:
+            self._heading = _wrapped(self._heading + float(angle[HEADING]))
+            angle[HEADING] = 0.0
+        turn = turn_matrix(angle)
+        self._level = turn @ self._level
+        self.velocity = turn @ self.velocity + error[SPEED]
         self.bias = self.bias + error[BIAS]
-        self.velocity = tilt @ self.velocity + error[SPEED]
-        self.heading_bias = self.heading_bias + error[HEADING_BIAS]
+        self._heading_bias = self._heading_bias + error[HEADING_BIAS]
+        self._stray += float(error[STRAY])
         self.kalman.x = np.zeros((SIZE, 1))
 
 
@@ -305,7 +346,7 @@ def _observer(states: slice) -> FloatArray:
 _OBSERVES_SPEED, _OBSERVES_BIAS = _observer(SPEED), _observer(BIAS)
 _OBSERVES_HEADING_BIAS = _observer(HEADING_BIAS)
 _HEADING_ONLY = np.zeros(SIZE)
-_HEADING_ONLY[[HEADING, 9, 10, 11]] = 1.0
+_HEADING_ONLY[[HEADING, 9, 10, 11, STRAY]] = 1.0
 _INCLINATION = 1.0 - _HEADING_ONLY
 
 
@@ -317,8 +358,10 @@ def _start_covariance(settings: FusionSettings) -> FloatArray:
     tilt = (2.0 * settings.speed_m_s / (settings.gravity_m_s2 * _START_S)) ** 2
     covariance[i, i] = tilt, tilt, heading**2
     bias = settings.bias_sd_rad_s**2
-    covariance[i + 3, i + 3] = covariance[i + 9, i + 9] = bias
-    covariance[i + 3, i + 9] = covariance[i + 9, i + 3] = bias
+    covariance[i + 3, i + 3] = bias
+    if settings.use_magnetometer:
+        covariance[STRAY, STRAY] = settings.field_sd_rad**2
+        covariance[i + 9, i + 9] = covariance[i + 3, i + 9] = covariance[i + 9, i + 3] = bias
     covariance[i + 6, i + 6] = (2.0 * settings.speed_m_s) ** 2
     return covariance
 

@@ -33,10 +33,13 @@ class FusionSettings:
         A hand's speed about its mean, zero, and how long it persists.
     force_noise_m_s_sqrt_s : float
         Velocity random walk of the accelerometer, misalignment in quick movement included.
-    field_sd_rad : float
-        How far the magnetic field's heading in a room strays from place to place, 4 deg.
-    field_time_s, field_rest_time_s : float
-        For how long a stray heading persists while the sensor moves, and while it rests.
+    field_sd_rad, field_place_s : float
+        How far the magnetic field's heading strays from place to place in a room, 4 deg, and how long a
+        moving sensor stays in one place.
+    field_noise_rad_sqrt_s : float
+        How it strays within a place: 2 deg/sqrt(Hz).
+    field_off_s : float
+        How long a disturbance that shows in norm and dip persists.
     norm_tolerance, dip_tolerance_rad : float
         A field that differs by more from the reference's norm (a fraction) or dip is disturbed.
     field_memory_s : float
@@ -65,8 +68,9 @@ class FusionSettings:
     speed_time_s: float = 0.5
     force_noise_m_s_sqrt_s: float = 0.01
     field_sd_rad: float = 4.0 * _DEG
-    field_time_s: float = 5.0
-    field_rest_time_s: float = 60.0
+    field_place_s: float = 60.0
+    field_noise_rad_sqrt_s: float = 2.0 * _DEG
+    field_off_s: float = 5.0
     norm_tolerance: float = 0.1
     dip_tolerance_rad: float = 10.0 * _DEG
     field_memory_s: float = 20.0

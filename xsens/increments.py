@@ -1,7 +1,8 @@
-"""Gyroscope and accelerometer samples summed to short increments, so that the filter need not run at every sample.
+"""Gyroscope and accelerometer samples summed to short increments, so that the filter need not run at each.
 
-Within a block the sum is exact for whatever the sensor does: turns are multiplied, specific force is turned into the
-block's first frame before it is added. What the filter does per block then costs little per sample.
+Within a block the sum is exact for whatever the sensor does: turns are multiplied, specific force is
+turned into the block's first frame before it is added. What the filter does per block then costs little
+per sample.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Blocks:
     def __iter__(self) -> Iterator[Increment]:
         last = quaternions.matrices(self.turns_wxyz[:, -1])
         durations = self.step_s.sum(axis=1)
-        has_field = np.isfinite(self.field_au).all(axis=1)
+        has_field = np.asarray(np.isfinite(self.field_au).all(axis=1))
         for k, duration in enumerate(durations):
             field = self.field_au[k] if has_field[k] else None
             yield Increment(
@@ -130,7 +131,7 @@ def _running_product(turns: FloatArray) -> FloatArray:
 
 def _mean_of_finite(vectors: FloatArray) -> FloatArray:
     """Mean over the second axis of (blocks, samples, 3), leaving NaN samples out; NaN if none is left."""
-    finite = np.isfinite(vectors).all(axis=2)
+    finite = np.asarray(np.isfinite(vectors).all(axis=2))
     count = finite.sum(axis=1)
     total = np.where(finite[..., None], vectors, 0.0).sum(axis=1)
     return np.asarray(np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], np.nan))

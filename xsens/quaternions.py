@@ -1,6 +1,7 @@
 """Unit quaternions (scalar first) on arrays of any leading shape: what the filter's inner sums need.
 
-SciPy's ``Rotation`` is the public type; here the overhead of an object per block would cost more than the sum.
+SciPy's ``Rotation`` is the public type; here the overhead of an object per block would cost more than the
+sum.
 """
 
 from __future__ import annotations

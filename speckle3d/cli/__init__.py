@@ -10,7 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from speckle3d.cli import clock, compare, curves, files, phantoms, reconstruction, repeatability
+from speckle3d.cli import clock, compare, curves, files, imu, phantoms, reconstruction, repeatability
 from speckle3d.cli.common import app, calibrate
 from speckle3d.core.errors import Speckle3DError
 
@@ -21,6 +21,7 @@ __all__ = [
     "compare",
     "curves",
     "files",
+    "imu",
     "main",
     "phantoms",
     "reconstruction",

@@ -13,7 +13,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 SQUARE = np.ones(2)
 
 LINE_NOISE_DEG = 0.15
-"""Of a line 30 mm long with 30 independent edges found to 0.1 mm: 0.1 / 30 * sqrt(12 / 30) rad, 0.12 degrees."""
+"""Of a line 30 mm long with 30 independent edges found to 0.1 mm: 0.1 / 30 * sqrt(12 / 30) rad, 0.12 deg."""
 
 
 def tilt_yaw_roll_deg(found, mounting):

@@ -1,0 +1,315 @@
+"""The orientation sensor: its logs, its orientation, its accuracy, and recording it live."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from speckle3d.cli.common import Json, app, emit, note
+from speckle3d.core.errors import InvalidInputError, naming
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.core.streams import TimedRotations
+    from xsens.fusion import Orientation
+    from xsens.samples import ImuLog
+
+imu = typer.Typer(help="The orientation sensor: logs, live data, orientation.", no_args_is_help=True)
+app.add_typer(imu, name="imu")
+
+Log = Annotated[Path, typer.Argument(metavar="LOG", help="A log of the sensor, of any kind that is known.")]
+RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs that do not say.")]
+
+
+class Method(StrEnum):
+    """Where an orientation comes from."""
+
+    smoother = "smoother"
+    filter = "filter"
+    sensor = "sensor"
+
+
+MethodOption = Annotated[
+    Method,
+    typer.Option(
+        help="smoother: from all of the log; filter: as it would be live; sensor: the sensor's own."
+    ),
+]
+Magnetometer = Annotated[
+    bool, typer.Option("--magnetometer/--no-magnetometer", help="Let the magnetic field tell the heading.")
+]
+
+
+@imu.command("info")
+def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> None:
+    """Tell what a log holds, what is missing and what was skipped."""
+    import numpy as np
+
+    log = _read(log_file, rate_hz)
+    rows = [
+        ("samples", str(len(log)), ""),
+        ("duration", f"{log.duration_s:.3f}", "s"),
+        ("rate", f"{log.rate_hz:.2f}", "samples/s"),
+        ("lost", str(log.lost), "samples"),
+        ("gaps", str(len(log.gaps)), ""),
+        ("longest gap", f"{max((gap.duration_s for gap in log.gaps), default=0.0):.3f}", "s"),
+        ("own orientation", str(int(log.oriented.sum())), "samples"),
+    ]
+    for name, unit in (
+        ("accelerometer_m_s2", "m/s^2"),
+        ("gyroscope_rad_s", "rad/s"),
+        ("magnetometer_au", "a.u."),
+    ):
+        values = getattr(log, name)
+        spoken = name.split("_")[0]
+        if values is None or np.isnan(values).all():
+            rows.append((spoken, "none", ""))
+        else:
+            rows.append(
+                (f"{spoken}, median norm", f"{np.nanmedian(np.linalg.norm(values, axis=1)):.4f}", unit)
+            )
+    rows += [("note", text, "") for text in log.notes]
+    if as_json:
+        emit(json.dumps([{"description": d, "value": v, "unit": u} for d, v, u in rows], indent=2))
+        return
+    width = max(len(d) for d, _, _ in rows)
+    for description, value, unit in rows:
+        emit(f"{description.ljust(width)}  {value} {unit}".rstrip())
+
+
+@imu.command("convert")
+def imu_convert(
+    log_file: Log,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="CSV to write.")],
+    rate_hz: RateHz = None,
+) -> None:
+    """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
+    from xsens.logs import write_csv
+
+    log = _read(log_file, rate_hz)
+    write_csv(out, log)
+    _tell(log)
+
+
+@imu.command("orient")
+def imu_orient(
+    log_file: Log,
+    into: Annotated[Path | None, typer.Option(help="Sweep file to put the stream into.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--output", help="CSV of the log with this orientation.")
+    ] = None,
+    method: MethodOption = Method.smoother,
+    magnetometer: Magnetometer = True,
+    time_offset_s: Annotated[
+        float, typer.Option(help="A reading at t belongs to image time t + this; see calibrate clock.")
+    ] = 0.0,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file of this mounting, to go into the sweep with it.")
+    ] = None,
+    replace_stream: Annotated[
+        bool, typer.Option("--replace", help="Replace a stream that the sweep has.")
+    ] = False,
+    rate_hz: RateHz = None,
+    as_json: Json = False,
+) -> None:
+    """Find the sensor's orientation from its log, and put it into a sweep, on its own clock."""
+    from xsens.logs import write_csv
+
+    if into is None and out is None:
+        raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
+    log = _read(log_file, rate_hz)
+    with naming(str(log_file)):
+        rotations, found = _orientation(log, method, magnetometer)
+    if out is not None:
+        write_csv(out, _with(log, rotations))
+    if into is not None:
+        _attach(into, log, rotations, time_offset_s, calibration, replace_stream)
+    _tell(log)
+    rows = _orientation_rows(log, rotations, found)
+    if as_json:
+        emit(json.dumps({name: value for name, value, _ in rows}, indent=2))
+        return
+    for name, value, unit in rows:
+        emit(f"{name}: {value:.3f} {unit}".rstrip())
+
+
+@imu.command("accuracy")
+def imu_accuracy(
+    log_file: Log,
+    reference: Annotated[
+        Path,
+        typer.Option(help="Settings of a mechanism: CSV with tilt, yaw, roll in degrees [time_s, until_s]."),
+    ],
+    calibrations: Annotated[
+        list[Path] | None, typer.Option("--calibration", help="Calibration files; may be repeated.")
+    ] = None,
+    turns: Annotated[
+        str, typer.Option(help="The mechanism's axes from its base to the probe.")
+    ] = "roll, yaw, tilt",
+    method: MethodOption = Method.smoother,
+    magnetometer: Magnetometer = True,
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG of single turns, as Figure 5 of the paper.")
+    ] = None,
+    rate_hz: RateHz = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the angles between all pairs of orientations with a mechanism's (Housden 2008, Table 2)."""
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.io.calibrations import read_calibration
+    from xsens.accuracy import AccuracyTable, pair_errors
+    from xsens.mechanism import read_mechanism_csv, readings_at
+
+    settings = read_mechanism_csv(reference, turns)
+    log = _read(log_file, rate_hz)
+    with naming(str(log_file)):
+        rotations, _ = _orientation(log, method, magnetometer)
+        readings = readings_at(rotations, settings)
+    mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
+    errors = pair_errors(readings, settings.base_from_image, mountings or Rotation.identity())
+    table = AccuracyTable.of({log_file.stem: errors})
+    if figure is not None:
+        from speckle3d.study.figures import save_figure
+        from xsens.accuracy_figures import figure_turns
+
+        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
+    if not mountings:
+        note("no --calibration: the sensor's axes are taken for the image's")
+    if as_json:
+        rows = [{"description": d, "value": v, "unit": u} for d, v, u in table.values()]
+        emit(json.dumps(rows, indent=2))
+        return
+    emit(table.text())
+    emit(
+        f"{len(errors)} errors: pairs of {errors.frames} orientations, {max(len(mountings), 1)} calibrations"
+    )
+
+
+@imu.command("record")
+def imu_record(
+    port: Annotated[str, typer.Argument(help="Serial port of the sensor, as /dev/ttyUSB0 or COM3.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File for the sensor's bytes.")],
+    content: Annotated[str, typer.Option(help="orientation, calibrated, raw, or `as set`.")] = "orientation",
+    rate_hz: Annotated[float | None, typer.Option(help="Samples per second; by default as set.")] = None,
+    baud: Annotated[
+        int | None, typer.Option(help="Of the line; by default the common ones are tried.")
+    ] = None,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Stop after so long; by default at Ctrl-C.")
+    ] = None,
+    append: Annotated[bool, typer.Option("--append", help="Go on in a file that is there.")] = False,
+) -> None:
+    """Record a sensor on a serial port; every byte is in the file as soon as it has come."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    from xsens.device import DeviceSettings
+    from xsens.recording import record
+
+    settings: Any = DeviceSettings(content=content, rate_hz=rate_hz, baud=baud)  # type: ignore[arg-type]
+    console = Console(stderr=True)
+    state = None
+    try:
+        with Live(Text("connecting"), console=console, refresh_per_second=8, transient=True) as live:
+            for state in record(port, out, settings, append, duration_s=duration_s or float("inf")):
+                live.update(Text(state.line()))
+    except KeyboardInterrupt:
+        note("stopped")
+    if state is not None:
+        note(
+            f"{state.samples} samples, {state.lost} lost, {state.interruptions} interruptions; bytes in {out}"
+        )
+
+
+def _read(path: Path, rate_hz: float | None) -> ImuLog:
+    from xsens.logs import Hints, read_log
+
+    return read_log(path, None if rate_hz is None else Hints(rate_hz=rate_hz))
+
+
+def _tell(log: ImuLog) -> None:
+    for text in log.notes:
+        note(text)
+    if log.gaps:
+        longest = max(gap.duration_s for gap in log.gaps)
+        lost = f"{log.lost} samples lost in {len(log.gaps)} gaps"
+        note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
+
+
+def _orientation(
+    log: ImuLog, method: Method, magnetometer: bool
+) -> tuple[TimedRotations, Orientation | None]:
+    if method is Method.sensor:
+        return log.rotations(), None
+    from xsens.fusion import orient
+    from xsens.fusion_settings import FusionSettings
+
+    found = orient(log, FusionSettings(use_magnetometer=magnetometer), smooth=method is Method.smoother)
+    return found.rotations, found
+
+
+def _with(log: ImuLog, rotations: TimedRotations) -> ImuLog:
+    """The log with another orientation in place of the sensor's own."""
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    there = np.isin(log.time_s, rotations.time_s)
+    quaternions = np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1))
+    quaternions[there] = rotations.world_from_sensor.as_quat()
+    return replace(log, world_from_sensor=Rotation.from_quat(quaternions), oriented=there)
+
+
+def _attach(
+    sweep_file: Path,
+    log: ImuLog,
+    rotations: TimedRotations,
+    time_offset_s: float,
+    calibration: Path | None,
+    replace_stream: bool,
+) -> None:
+    import numpy as np
+
+    from speckle3d.core.sweep import OrientationSensor
+    from speckle3d.io.calibrations import read_calibration
+    from speckle3d.io.sweep_writer import attach_orientation
+
+    mounting: Rotation | None = None
+    if calibration is not None:
+        known = read_calibration(calibration)
+        mounting = known.rotation
+        if known.time_offset_s is not None and time_offset_s == 0.0:
+            time_offset_s = known.time_offset_s
+    kept = np.isin(log.time_s, rotations.time_s)
+    vectors = {}
+    for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+        values = getattr(log, name)
+        whole = values is not None and bool(np.isfinite(values[kept]).all())
+        vectors[name] = values[kept] if whole and kept.sum() == len(rotations) else None
+    sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
+    attach_orientation(sweep_file, sensor, replace_stream)
+    note(f"orientation of {len(rotations)} samples in {sweep_file}")
+
+
+def _orientation_rows(
+    log: ImuLog, rotations: TimedRotations, found: Orientation | None
+) -> list[tuple[str, float, str]]:
+    import numpy as np
+
+    rows = [("samples", float(len(rotations)), ""), ("duration", log.duration_s, "s")]
+    if found is not None:
+        heading = found.standard_deviation_rad[:, 2]
+        inclination = np.linalg.norm(found.standard_deviation_rad[:, :2], axis=1) / np.sqrt(2.0)
+        rows += [
+            ("inclination, standard deviation, median", float(np.rad2deg(np.median(inclination))), "deg"),
+            ("heading, standard deviation, median", float(np.rad2deg(np.median(heading))), "deg"),
+            ("magnetic field disturbed", 100.0 * float(np.mean(found.disturbed)), "% of samples"),
+        ]
+    return rows

@@ -1,0 +1,110 @@
+"""The orientation sensor on the command line: logs told, converted, oriented, put into sweeps, judged."""
+
+import json
+
+import numpy as np
+import pytest
+import sweep_examples
+from scipy.spatial.transform import Rotation
+
+from speckle3d.io.load import load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+from xsens.logs import write_csv
+from xsens.samples import ImuLog
+
+RATE_HZ = 100.0
+
+
+def turning(seconds=20.0):
+    """A sensor that is tilted to and fro, and what it measures without noise."""
+    time_s = np.arange(0.0, seconds, 1.0 / RATE_HZ)
+    still = np.clip((time_s - 3.0) / 2.0, 0.0, 1.0)
+    angle = 0.4 * still * np.sin(2 * np.pi * 0.3 * (time_s - 3.0))
+    truth = Rotation.from_rotvec(np.outer(angle, [1.0, 0.0, 0.0]))
+    between = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
+    gyroscope = np.concatenate([between[:1], between])
+    force = truth.inv().apply([0.0, 0.0, 9.80665])
+    field = truth.inv().apply([0.5, 0.0, -0.86])
+    return truth, ImuLog(time_s, force, gyroscope, field, truth, source="test")
+
+
+@pytest.fixture
+def log_file(tmp_path):
+    path = tmp_path / "log" / "log.csv"
+    path.parent.mkdir()
+    write_csv(path, turning()[1])
+    return path
+
+
+def test_a_log_is_told(run, log_file):
+    code, out, _ = run("imu", "info", log_file)
+    assert code == 0
+    assert "100.00 samples/s" in out
+    assert "9.80" in out
+    code, out, _ = run("imu", "info", log_file, "--json")
+    told = {row["description"]: row["value"] for row in json.loads(out)}
+    assert told["samples"] == "2000"
+    assert told["lost"] == "0"
+
+
+def test_a_log_is_converted_and_read_back(run, log_file, tmp_path):
+    assert run("imu", "convert", log_file, tmp_path / "again.csv")[0] == 0
+    code, out, _ = run("imu", "info", tmp_path / "again.csv", "--json")
+    assert code == 0
+    assert json.loads(out)[0]["value"] == "2000"
+
+
+@pytest.mark.parametrize("method", ["smoother", "filter", "sensor"])
+def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path, method):
+    sweep_file = tmp_path / "sweep.h5"
+    write_sweep(sweep_file, sweep_examples.rf_sweep())
+    code, _, err = run(
+        "imu",
+        "orient",
+        log_file,
+        "--into",
+        sweep_file,
+        "--replace",
+        "--method",
+        method,
+        "--time-offset-s",
+        "0.05",
+    )
+    assert code == 0, err
+    stream = load_sweep(sweep_file).orientation
+    assert stream is not None
+    assert stream.time_offset_s == 0.05
+    truth, log = turning()
+    found = stream.readings.at(log.time_s[100:-100])
+    error = (truth[100:-100].inv() * found).magnitude()
+    # Exact readings: what is left is the filter's starting heading and its model of the field. Degrees.
+    assert np.rad2deg(error.max()) < 2.0
+
+
+def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, tmp_path):
+    sweep_file = tmp_path / "sweep.h5"
+    write_sweep(sweep_file, sweep_examples.rf_sweep())
+    assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
+    assert "say to replace it" in refused("imu", "orient", log_file, "--into", sweep_file)
+    assert "neither" in refused("imu", "orient", log_file)
+
+
+def test_accuracy_against_a_mechanism(run, log_file, tmp_path):
+    truth, log = turning()
+    times = np.arange(4.0, 18.0, 0.5)
+    tilt = np.rad2deg(truth[np.searchsorted(log.time_s, times)].as_rotvec()[:, 0])
+    rows = [f"{angle},0,0,{time}" for angle, time in zip(tilt, times, strict=True)]
+    reference = tmp_path / "mechanism.csv"
+    reference.write_text("\n".join(["tilt,yaw,roll,time_s", *rows]) + "\n")
+    code, out, err = run("imu", "accuracy", log_file, "--reference", reference, "--json")
+    assert code == 0, err
+    assert "no --calibration" in err
+    told = {row["description"]: row["value"] for row in json.loads(out)}
+    # Exact readings and settings; what the filter itself makes of them is left. Degrees.
+    assert 0.0 <= told["log: tilt error, standard deviation"] < 1.0
+
+
+def test_what_is_no_log_is_refused_in_one_line(refused, tmp_path):
+    (tmp_path / "noise.bin").write_bytes(bytes(range(256)) * 4)
+    assert "noise.bin" in refused("imu", "info", tmp_path / "noise.bin")
+    assert "absent.bin" in refused("imu", "info", tmp_path / "absent.bin")
