@@ -40,6 +40,9 @@ _PROVED_AFTER_S = 20.0
 _IRON_PRIOR = 0.01
 """Variance of the field's unevenness over that of unknown iron: 3 microtesla against 30."""
 
+_UNEVEN = 0.15
+"""What a reference may leave of the field's norm: that of a room with iron in it."""
+
 _BETTER = 2.0
 """A new reference must leave so much less variance than the one it replaces."""
 
@@ -137,7 +140,7 @@ class _Candidate:
         if self.weight_s < _LEARNT_AFTER_S:
             return None
         room, iron, left = self.solve()
-        if left > (0.1 * np.linalg.norm(room)) ** 2:
+        if left > (_UNEVEN * np.linalg.norm(room)) ** 2:
             return None
         if 1.5 * self._misfit / self.weight_s < _BETTER * left:  # it is of two components of three
             return None

@@ -137,19 +137,27 @@ def _readings(steps: list[Step], level: Smoothed, settings: FusionSettings) -> l
 def _judged(
     steps: list[Step], level: Smoothed, settings: FusionSettings, order: range
 ) -> list[FieldReading | None]:
+    """Judgements in one direction; a first reference that did not prove itself is taken back."""
     monitor = FieldMonitor(settings)
     readings: list[FieldReading | None] = [None] * len(steps)
-    for k in order:
-        increment = steps[k].increment
-        if increment.field_au is None:
-            continue
-        middle = level.matrices[k] @ turn_matrix(
-            0.5 * (increment.rate_rad_s - level.bias_rad_s[k]) * increment.duration_s
-        )
-        rate = math.hypot(*(increment.rate_rad_s - level.bias_rad_s[k]))
-        field = level.matrices[k] @ increment.field_au
-        readings[k] = monitor.read(middle, field, rate, increment.duration_s)
+    wrong = 0
+    for seen, k in enumerate(order):
+        reading = readings[k] = _read(monitor, steps[k], level, k)
+        if reading is not None and reading.restart_au is not None:
+            wrong = seen
+    for k in reversed(order[:wrong]):
+        readings[k] = _read(monitor, steps[k], level, k)
     return readings
+
+
+def _read(monitor: FieldMonitor, step: Step, level: Smoothed, k: int) -> FieldReading | None:
+    increment = step.increment
+    if increment.field_au is None:
+        return None
+    rate = increment.rate_rad_s - level.bias_rad_s[k]
+    middle = level.matrices[k] @ turn_matrix(0.5 * rate * increment.duration_s)
+    field = level.matrices[k] @ increment.field_au
+    return monitor.read(middle, field, math.hypot(*rate), increment.duration_s)
 
 
 def _better(a: FieldReading | None, b: FieldReading | None) -> FieldReading | None:
