@@ -164,7 +164,7 @@ def test_no_sweeps_are_refused(tmp_path):
 
 
 def test_drift_of_a_uniform_stretch(sweeps):
-    """ALGORITHMS I: a straight sweep stretched by 5 % has FDR = ADR = 5 %, MD = 0.05 L, EA = 0."""
+    """A straight sweep stretched by 5 % has FDR = ADR = 5 %, MD = 0.05 L, EA = 0."""
     z = np.linspace(0.0, 20.0, 41)
     true = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z]))
     found = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, 1.05 * z]))
