@@ -12,12 +12,16 @@ if TYPE_CHECKING:
     from xsens.accuracy import AccuracyTable, PairErrors, common_readings, mounting_from_motion, pair_errors
     from xsens.accuracy_figures import figure_turns
     from xsens.bytelogs import parse_stream
+    from xsens.comparison import compare_orientations
     from xsens.device import DeviceError, DeviceSettings
     from xsens.framing import Framer, Message, decode, encode
+    from xsens.fusion import Orientation, orient
+    from xsens.fusion_settings import FusionSettings
     from xsens.live import LiveState
     from xsens.logparts import Hints
     from xsens.logs import read_log, write_csv
     from xsens.mechanism import MechanismSettings, read_mechanism_csv, readings_at
+    from xsens.online import OnlineFilter, OnlineState
     from xsens.recording import Recorder, record
     from xsens.samples import Gap, ImuLog
 
@@ -26,19 +30,25 @@ _HOME = {
     "DeviceError": "device",
     "DeviceSettings": "device",
     "Framer": "framing",
+    "FusionSettings": "fusion_settings",
     "Gap": "samples",
     "Hints": "logparts",
     "ImuLog": "samples",
     "LiveState": "live",
     "MechanismSettings": "mechanism",
     "Message": "framing",
+    "OnlineFilter": "online",
+    "OnlineState": "online",
+    "Orientation": "fusion",
     "PairErrors": "accuracy",
     "Recorder": "recording",
     "common_readings": "accuracy",
+    "compare_orientations": "comparison",
     "decode": "framing",
     "encode": "framing",
     "figure_turns": "accuracy_figures",
     "mounting_from_motion": "accuracy",
+    "orient": "fusion",
     "pair_errors": "accuracy",
     "parse_stream": "bytelogs",
     "read_log": "logs",
@@ -54,19 +64,25 @@ __all__ = [
     "DeviceError",
     "DeviceSettings",
     "Framer",
+    "FusionSettings",
     "Gap",
     "Hints",
     "ImuLog",
     "LiveState",
     "MechanismSettings",
     "Message",
+    "OnlineFilter",
+    "OnlineState",
+    "Orientation",
     "PairErrors",
     "Recorder",
     "common_readings",
+    "compare_orientations",
     "decode",
     "encode",
     "figure_turns",
     "mounting_from_motion",
+    "orient",
     "pair_errors",
     "parse_stream",
     "read_log",

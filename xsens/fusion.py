@@ -15,13 +15,10 @@ from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import BoolArray, TimedRotations
 from xsens.errorstate import ErrorStateFilter
 from xsens.forward import Pass, forward, within_steps
-from xsens.fusion_settings import FusionSettings
+from xsens.fusion_settings import BRIDGED_S, FusionSettings
 from xsens.increments import Samples
 from xsens.samples import ImuLog, IntArray
 from xsens.smoothing import Smoothed, smooth
-
-_BRIDGED_S = 0.1
-"""The longest pause that is integrated through: a hand's rate changes little in it (tremor: below 12 Hz)."""
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: they hold little more than the filter's start."""
@@ -101,9 +98,9 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)
-    breaks = np.flatnonzero(samples.step_s > _BRIDGED_S)
+    breaks = np.flatnonzero(samples.step_s > BRIDGED_S)
     if breaks.size:
-        notes.append(f"{breaks.size} pauses over {_BRIDGED_S:g} s: orientation found anew after each")
+        notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, smooth)
     joined = _Result(*(np.concatenate(parts) for parts in zip(*map(_fields, results), strict=True)))
     rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.wxyz, scalar_first=True))

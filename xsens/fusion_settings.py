@@ -9,6 +9,9 @@ from speckle3d.core.errors import InvalidInputError
 
 _DEG = math.pi / 180.0
 
+BRIDGED_S = 0.1
+"""The longest pause that is integrated through: a hand's rate changes little in it (tremor: below 12 Hz)."""
+
 
 @dataclass(frozen=True)
 class FusionSettings:

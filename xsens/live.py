@@ -11,11 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.core.geometry import FloatArray, rotation_from_axes
+from speckle3d.core.geometry import FloatArray
 from xsens.bytelogs import parse_stream
 from xsens.device import DeviceInfo
 from xsens.logparts import Hints
 from xsens.messages import Framer, MessageId, encode
+from xsens.online import OnlineFilter
 from xsens.samples import ImuLog
 
 RATE_OVER_S = 2.0
@@ -50,7 +51,7 @@ class LiveState:
         Received over the last two seconds.
     bytes_written : int
     world_from_sensor : Rotation, optional
-        The sensor's own orientation, or one by gravity and field that is good while the sensor is still.
+        The sensor's own orientation, or the on-line filter's.
     field : float
         Norm of the magnetic field over that at the start; NaN without a magnetometer.
     dip_change_rad : float
@@ -121,7 +122,7 @@ class Monitor:
             self._connected, self._counter = True, None
             self._framer = Framer()
             self._arrivals.clear()
-            self._attitude = _Attitude()
+            self._attitude = _Attitude(info.rate_hz)
 
     def arrived(self, received: bytes) -> None:
         """Bytes have come, in whatever pieces."""
@@ -177,51 +178,51 @@ class Monitor:
         except Speckle3DError as error:
             self._note = str(error)
             return
-        self._count_lost(log)
-        rotations = self._attitude.follow(log)
+        rotations = self._attitude.follow(log, self._count_lost(log))
         self._field.follow(log, rotations)
 
-    def _count_lost(self, log: ImuLog) -> None:
+    def _count_lost(self, log: ImuLog) -> int:
+        """Count what is missing within the log; returned is what is missing before it."""
         self._lost += log.lost
         if log.counter is None:
-            return
+            return 0
+        before = 0
         if self._counter is not None:
-            self._lost += int(log.counter[0] - self._counter - 1) % _WORD
+            before = int(log.counter[0] - self._counter - 1) % _WORD
+            self._lost += before
         self._counter = int(log.counter[-1]) % _WORD
+        return before
 
 
 class _Attitude:
-    """The sensor's own orientation if it has one, else that of gravity and field since it was last asked."""
+    """The sensor's own orientation if it sends one, else the filter's."""
 
-    def __init__(self) -> None:
+    def __init__(self, rate_hz: float = float("nan")) -> None:
         self.latest: Rotation | None = None
+        self._filter = OnlineFilter()
+        self._step_s = 1.0 / rate_hz if rate_hz > 0 else float("nan")
 
-    def follow(self, log: ImuLog) -> Rotation | None:
-        """Orientation of each sample, if there is any."""
+    def follow(self, log: ImuLog, lost_before: int) -> Rotation | None:
+        """Take in some samples; orientation of each, if the sensor sent them."""
         if log.world_from_sensor is None or not log.oriented.any():
-            self.latest = _levelled(log)
+            self._filtered(log, lost_before)
             return None
         self.latest = log.world_from_sensor[log.oriented][-1]
         return log.world_from_sensor if log.oriented.all() else None
 
-
-def _levelled(log: ImuLog) -> Rotation | None:
-    """Mean orientation by gravity and field, as if the sensor were not accelerated; None if it lacks either.
-
-    Enough to be looked at while recording; the orientation that counts is made from the recording.
-    """
-    if log.accelerometer_m_s2 is None or log.magnetometer_au is None:
-        return None
-    up, field = (
-        values[np.isfinite(values).all(axis=1)] for values in (log.accelerometer_m_s2, log.magnetometer_au)
-    )
-    if not (len(up) and len(field)):
-        return None
-    west = np.cross(up.mean(axis=0), field.mean(axis=0))
-    north = np.cross(west, up.mean(axis=0))
-    if not np.linalg.norm(north) > 0:
-        return None
-    return rotation_from_axes(north, west).inv()
+    def _filtered(self, log: ImuLog, lost_before: int) -> None:
+        if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
+            self.latest = None
+            return
+        steps = np.diff(log.time_s)
+        if steps.size:
+            self._step_s = float(np.median(steps))
+        if not np.isfinite(self._step_s):
+            return
+        first = self._step_s * (1 + lost_before)
+        self._filter.push([first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)
+        state = self._filter.state
+        self.latest = None if state is None else state.world_from_sensor
 
 
 class _Field:

@@ -124,8 +124,8 @@ class TestMonitor:
             field = raw.state(0).field
             assert field == pytest.approx(np.hypot(0.44 + first / 1000, 0.9) / np.hypot(0.44, 0.9), rel=1e-3)
             turned = raw.state(0).world_from_sensor.as_euler("ZYX", degrees=True)
-            # The mean of samples 0 to 99, or 100 to 199, of a tenth of a degree each; counts are 1/7366.
-            np.testing.assert_allclose(turned, [(first + 49.5) / 10, 0.0, 0.0], atol=0.03)
+            # The filter's at the last sample; a tenth of a degree each, counts of 1/7366.
+            np.testing.assert_allclose(turned, [(first + 99) / 10, 0.0, 0.0], atol=0.03)
 
 
 class TestLine:

@@ -1,0 +1,173 @@
+"""Orientation while the samples come: the filter behind a method that takes one sample or many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from xsens.errorstate import ErrorStateFilter
+from xsens.fusion_settings import BRIDGED_S, FusionSettings
+from xsens.increments import Samples, blocks_of
+from xsens.quaternions import turn_matrix
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """What the filter believes after the last sample.
+
+    Attributes
+    ----------
+    world_from_sensor : Rotation, single
+        x magnetic north, y west, z up. Until the magnetometer has spoken, x is where it was at the start.
+    standard_deviation_rad : ndarray, shape (3,)
+        About the world's axes: two of inclination, one of heading; of the last whole increment.
+    gyro_bias_rad_s : ndarray, shape (3,)
+    disturbed : bool
+        Whether the magnetic field is not trusted.
+    resting : bool
+    started : bool
+        Whether the first second, in which up and north are found, is over.
+    """
+
+    world_from_sensor: Rotation
+    standard_deviation_rad: FloatArray
+    gyro_bias_rad_s: FloatArray
+    disturbed: bool
+    resting: bool
+    started: bool
+
+
+class OnlineFilter:
+    """The filter of `xsens.orient`, fed as the sensor speaks.
+
+    Samples are gathered to increments of `FusionSettings.block_s`; between two of them the gyroscope alone
+    carries the orientation, so `state` is always that of the last sample.
+
+    Parameters
+    ----------
+    settings : FusionSettings, optional
+    """
+
+    def __init__(self, settings: FusionSettings | None = None) -> None:
+        self._settings = settings or FusionSettings()
+        self._kalman: ErrorStateFilter | None = None
+        self._pending: list[Samples] = []
+        self._pending_s = self._skipped_s = self._pause_s = 0.0
+        self._force = np.full(3, np.nan)
+
+    def push(
+        self,
+        step_s: npt.ArrayLike,
+        gyroscope_rad_s: npt.ArrayLike,
+        accelerometer_m_s2: npt.ArrayLike,
+        magnetometer_au: npt.ArrayLike | None = None,
+    ) -> None:
+        """Take in samples.
+
+        Parameters
+        ----------
+        step_s : float or array_like, shape (m,)
+            Time from the sample before to each sample; more than 0.1 s is a pause, after which up and north
+            are found again.
+        gyroscope_rad_s, accelerometer_m_s2 : array_like, shape (3,) or (m, 3)
+            A sample without gyroscope (NaN) is left out, one without accelerometer takes the last there was.
+        magnetometer_au : array_like, shape (3,) or (m, 3), optional
+            Rows may be NaN.
+
+        Raises
+        ------
+        MismatchError
+            If the shapes do not fit together.
+        InvalidInputError
+            If a step is not positive and finite.
+        """
+        for step, rate, force, field in zip(
+            *_checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au), strict=True
+        ):
+            self._take(float(step), rate, force, field)
+
+    @property
+    def state(self) -> OnlineState | None:
+        """What is believed after the last sample; None before there is a first increment."""
+        kalman = self._kalman
+        if kalman is None:
+            return None
+        snapshot = kalman.snapshot()
+        matrix = snapshot.matrix
+        if not snapshot.resting:
+            for each in self._pending:
+                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - snapshot.bias_rad_s) * each.step_s[0])
+        return OnlineState(
+            Rotation.from_matrix(matrix),
+            snapshot.sd_rad,
+            snapshot.bias_rad_s,
+            snapshot.disturbed,
+            snapshot.resting,
+            kalman.started,
+        )
+
+    def _take(self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
+        if np.isfinite(force).all():
+            self._force = force
+        if not (np.isfinite(rate).all() and np.isfinite(self._force).all()):
+            self._skipped_s += step_s
+            return
+        step_s += self._skipped_s
+        self._skipped_s = 0.0
+        if step_s > BRIDGED_S and self._kalman is not None:
+            self._advance()
+            self._pause_s = step_s
+        # How the sensor turned in a pause is not known; the first sample's own step is not either.
+        step_s = step_s if step_s <= BRIDGED_S else self._settings.block_s
+        self._pending.append(Samples(np.array([step_s]), rate[None], self._force[None], field[None]))
+        self._pending_s += step_s
+        # Half a sample too short is as near to the block's length as half a sample too long.
+        if self._pending_s + 0.5 * step_s >= self._settings.block_s:
+            self._advance()
+
+    def _advance(self) -> None:
+        """Make an increment of what is pending."""
+        if not self._pending:
+            return
+        bias = np.zeros(3) if self._kalman is None else self._kalman.bias
+        (increment,) = blocks_of(_joined(self._pending), len(self._pending), bias)
+        self._pending, self._pending_s = [], 0.0
+        if self._kalman is None:
+            self._kalman = ErrorStateFilter(self._settings, increment)
+        elif self._pause_s:
+            self._kalman.resume(increment, self._pause_s)
+        self._pause_s = 0.0
+        self._kalman.advance(increment)
+
+
+def _checked(
+    step_s: npt.ArrayLike,
+    gyroscope_rad_s: npt.ArrayLike,
+    accelerometer_m_s2: npt.ArrayLike,
+    magnetometer_au: npt.ArrayLike | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    step = np.atleast_1d(np.asarray(step_s, dtype=float))
+    if not (np.isfinite(step) & (step > 0.0)).all():
+        raise InvalidInputError("step_s: expected positive numbers, got one that is not")
+    field = np.full((step.size, 3), np.nan) if magnetometer_au is None else magnetometer_au
+    vectors = []
+    for name, values in (
+        ("gyroscope_rad_s", gyroscope_rad_s),
+        ("accelerometer_m_s2", accelerometer_m_s2),
+        ("magnetometer_au", field),
+    ):
+        rows = np.atleast_2d(np.asarray(values, dtype=float))
+        if rows.shape != (step.size, 3):
+            raise MismatchError(f"{name}: expected shape {(step.size, 3)}, got {rows.shape}")
+        vectors.append(rows)
+    return step, vectors[0], vectors[1], vectors[2]
+
+
+def _joined(samples: list[Samples]) -> Samples:
+    names = ("step_s", "rate_rad_s", "force_m_s2", "field_au")
+    return Samples(*(np.concatenate([getattr(each, name) for each in samples]) for name in names))
