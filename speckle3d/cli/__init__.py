@@ -10,7 +10,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from speckle3d.cli import clock, compare, curves, files, imu, phantoms, reconstruction, repeatability
+from speckle3d.cli import (
+    clock,
+    compare,
+    curves,
+    files,
+    imu,
+    imu_accuracy,
+    phantoms,
+    reconstruction,
+    repeatability,
+)
 from speckle3d.cli.common import app, calibrate
 from speckle3d.core.errors import Speckle3DError
 
@@ -22,6 +32,7 @@ __all__ = [
     "curves",
     "files",
     "imu",
+    "imu_accuracy",
     "main",
     "phantoms",
     "reconstruction",

@@ -51,7 +51,7 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> No
     """Tell what a log holds, what is missing and what was skipped."""
     import numpy as np
 
-    log = _read(log_file, rate_hz)
+    log = read(log_file, rate_hz)
     rows = [
         ("samples", str(len(log)), ""),
         ("duration", f"{log.duration_s:.3f}", "s"),
@@ -92,9 +92,9 @@ def imu_convert(
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
     from xsens.logs import write_csv
 
-    log = _read(log_file, rate_hz)
+    log = read(log_file, rate_hz)
     write_csv(out, log)
-    _tell(log)
+    tell(log)
 
 
 @imu.command("orient")
@@ -123,73 +123,20 @@ def imu_orient(
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
-    log = _read(log_file, rate_hz)
+    log = read(log_file, rate_hz)
     with naming(str(log_file)):
-        rotations, found = _orientation(log, method, magnetometer)
+        rotations, found = orientation_of(log, method, magnetometer)
     if out is not None:
         write_csv(out, _with(log, rotations))
     if into is not None:
         _attach(into, log, rotations, time_offset_s, calibration, replace_stream)
-    _tell(log)
+    tell(log)
     rows = _orientation_rows(log, rotations, found)
     if as_json:
         emit(json.dumps({name: value for name, value, _ in rows}, indent=2))
         return
     for name, value, unit in rows:
         emit(f"{name}: {value:.3f} {unit}".rstrip())
-
-
-@imu.command("accuracy")
-def imu_accuracy(
-    log_file: Log,
-    reference: Annotated[
-        Path,
-        typer.Option(help="Settings of a mechanism: CSV with tilt, yaw, roll in degrees [time_s, until_s]."),
-    ],
-    calibrations: Annotated[
-        list[Path] | None, typer.Option("--calibration", help="Calibration files; may be repeated.")
-    ] = None,
-    turns: Annotated[
-        str, typer.Option(help="The mechanism's axes from its base to the probe.")
-    ] = "roll, yaw, tilt",
-    method: MethodOption = Method.smoother,
-    magnetometer: Magnetometer = True,
-    figure: Annotated[
-        Path | None, typer.Option(help="PNG of single turns, as Figure 5 of the paper.")
-    ] = None,
-    rate_hz: RateHz = None,
-    as_json: Json = False,
-) -> None:
-    """Compare the angles between all pairs of orientations with a mechanism's (Housden 2008, Table 2)."""
-    from scipy.spatial.transform import Rotation
-
-    from speckle3d.io.calibrations import read_calibration
-    from xsens.accuracy import AccuracyTable, pair_errors
-    from xsens.mechanism import read_mechanism_csv, readings_at
-
-    settings = read_mechanism_csv(reference, turns)
-    log = _read(log_file, rate_hz)
-    with naming(str(log_file)):
-        rotations, _ = _orientation(log, method, magnetometer)
-        readings = readings_at(rotations, settings)
-    mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
-    errors = pair_errors(readings, settings.base_from_image, mountings or Rotation.identity())
-    table = AccuracyTable.of({log_file.stem: errors})
-    if figure is not None:
-        from speckle3d.study.figures import save_figure
-        from xsens.accuracy_figures import figure_turns
-
-        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
-    if not mountings:
-        note("no --calibration: the sensor's axes are taken for the image's")
-    if as_json:
-        rows = [{"description": d, "value": v, "unit": u} for d, v, u in table.values()]
-        emit(json.dumps(rows, indent=2))
-        return
-    emit(table.text())
-    emit(
-        f"{len(errors)} errors: pairs of {errors.frames} orientations, {max(len(mountings), 1)} calibrations"
-    )
 
 
 @imu.command("record")
@@ -229,13 +176,15 @@ def imu_record(
         )
 
 
-def _read(path: Path, rate_hz: float | None) -> ImuLog:
+def read(path: Path, rate_hz: float | None) -> ImuLog:
+    """Read a log of any kind."""
     from xsens.logs import Hints, read_log
 
     return read_log(path, None if rate_hz is None else Hints(rate_hz=rate_hz))
 
 
-def _tell(log: ImuLog) -> None:
+def tell(log: ImuLog) -> None:
+    """Say on stderr what is missing in a log, or had to be assumed."""
     for text in log.notes:
         note(text)
     if log.gaps:
@@ -244,9 +193,10 @@ def _tell(log: ImuLog) -> None:
         note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
 
 
-def _orientation(
+def orientation_of(
     log: ImuLog, method: Method, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
+    """Orientation of a log by one of the methods, with the filter's own account unless it is the sensor's."""
     if method is Method.sensor:
         return log.rotations(), None
     from xsens.fusion import orient

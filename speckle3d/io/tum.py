@@ -73,6 +73,17 @@ def read_tum(path: PathLike, length_unit: LengthUnit = "m") -> TimedPoses:
         return TimedPoses(rows[:, 0].copy(), poses)
 
 
+def is_tum(path: PathLike) -> bool:
+    """Whether a file's first line that is no comment is eight numbers."""
+    try:
+        with Path(path).open(encoding="utf-8") as file:
+            first = next(line for line in file if line.strip() and not line.lstrip().startswith("#"))
+        numbers(first, _COLUMNS, str(path))
+    except (OSError, UnicodeDecodeError, StopIteration, InvalidInputError):
+        return False
+    return True
+
+
 def _read_rows(path: PathLike) -> FloatArray:
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()

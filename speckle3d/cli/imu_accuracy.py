@@ -1,0 +1,131 @@
+"""How well an orientation sensor measures angles, beside a mechanism or an optical tracker."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from speckle3d.cli.common import Json, emit, note
+from speckle3d.cli.imu import Log, Magnetometer, Method, MethodOption, RateHz, imu, orientation_of, read
+from speckle3d.core.errors import InvalidInputError, naming
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.core.streams import TimedRotations
+    from xsens.accuracy import PairErrors
+
+
+@imu.command("accuracy")
+def imu_accuracy(
+    log_file: Log,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Settings of a mechanism: CSV with tilt, yaw, roll in degrees [time_s, until_s]."),
+    ] = None,
+    optical: Annotated[
+        Path | None,
+        typer.Option(help="Orientation by a tracker: TUM text, or a log that carries its own orientation."),
+    ] = None,
+    calibrations: Annotated[
+        list[Path] | None, typer.Option("--calibration", help="Calibration files; may be repeated.")
+    ] = None,
+    turns: Annotated[
+        str, typer.Option(help="The mechanism's axes from its base to the probe.")
+    ] = "roll, yaw, tilt",
+    fit_mounting: Annotated[
+        bool,
+        typer.Option(
+            "--fit-mounting/--aligned",
+            help="The target's axes on the probe: found from the motion, or those of the image.",
+        ),
+    ] = True,
+    time_offset_s: Annotated[
+        float, typer.Option(help="A reading of the sensor at t belongs to the tracker's time t + this.")
+    ] = 0.0,
+    method: MethodOption = Method.smoother,
+    magnetometer: Magnetometer = True,
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG of single turns, as Figure 5 of the paper.")
+    ] = None,
+    rate_hz: RateHz = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2)."""
+    from speckle3d.io.calibrations import read_calibration
+    from xsens.accuracy import AccuracyTable
+
+    if (reference is None) == (optical is None):
+        raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
+    log = read(log_file, rate_hz)
+    mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
+    if not mountings:
+        note("no --calibration: the sensor's axes are taken for the image's")
+    with naming(str(log_file)):
+        rotations, _ = orientation_of(log, method, magnetometer)
+        if reference is not None:
+            errors = _beside_mechanism(rotations, reference, turns, mountings)
+        else:
+            assert optical is not None
+            errors = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+    table = AccuracyTable.of({log_file.stem: errors})
+    if figure is not None:
+        from speckle3d.study.figures import save_figure
+        from xsens.accuracy_figures import figure_turns
+
+        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
+    if as_json:
+        rows = [{"description": d, "value": v, "unit": u} for d, v, u in table.values()]
+        emit(json.dumps(rows, indent=2))
+        return
+    emit(table.text())
+    emit(
+        f"{len(errors)} errors: pairs of {errors.frames} orientations, {max(len(mountings), 1)} calibrations"
+    )
+
+
+def _beside_mechanism(
+    rotations: TimedRotations, reference: Path, turns: str, mountings: list[Rotation]
+) -> PairErrors:
+    from scipy.spatial.transform import Rotation
+
+    from xsens.accuracy import pair_errors
+    from xsens.mechanism import read_mechanism_csv, readings_at
+
+    settings = read_mechanism_csv(reference, turns)
+    readings = readings_at(rotations, settings)
+    return pair_errors(readings, settings.base_from_image, mountings or Rotation.identity())
+
+
+def _beside_tracker(
+    rotations: TimedRotations,
+    optical: Path,
+    time_offset_s: float,
+    fit_mounting: bool,
+    mountings: list[Rotation],
+) -> PairErrors:
+    from scipy.spatial.transform import Rotation
+
+    from xsens.accuracy import common_readings, mounting_from_motion, pair_errors
+
+    measured, target = common_readings(rotations, _tracked(optical), time_offset_s)
+    mounted = Rotation.identity()
+    if fit_mounting:
+        one = Rotation.concatenate(mountings).mean() if mountings else Rotation.identity()
+        mounted = mounting_from_motion(measured * one, target)
+        note("the target's mounting is found from the motion: constant errors of calibration do not show")
+    return pair_errors(measured, target * mounted, mountings or Rotation.identity())
+
+
+def _tracked(path: Path) -> TimedRotations:
+    """Orientation in a TUM file, or a log's own."""
+    from speckle3d.core.streams import TimedRotations
+    from speckle3d.io.tum import is_tum, read_tum
+
+    if is_tum(path):
+        poses = read_tum(path)
+        return TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+    return read(path, None).rotations()
