@@ -11,7 +11,7 @@ import typer
 
 from speckle3d.cli.common import ConfigFile, Json, app, emit, note
 from speckle3d.cli.mounting import CalibrationFiles
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.study.compare import StudyProgress
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 @app.command()
 def compare(
-    sweeps: Annotated[list[Path], typer.Argument(metavar="SWEEP...", help="Sweeps to compare modes on.")],
+    sweeps: Annotated[
+        list[Path] | None, typer.Argument(metavar="SWEEP...", help="Sweeps to compare modes on.")
+    ] = None,
+    *,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the study.")],
     drift: Annotated[
         list[str] | None,
@@ -38,21 +41,37 @@ def compare(
     workers: Annotated[
         int | None, typer.Option(help="Run in so many processes on this machine, instead of in one.")
     ] = None,
+    paper: Annotated[
+        bool,
+        typer.Option("--paper", help="The eleven sweeps of Housden 2008, simulated; tables beside theirs."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Compare drift-correction modes over sweeps with a reference: tables, curves, a report."""
     from speckle3d.config import Config, load_config
     from speckle3d.study.compare import compare_sweeps
+    from speckle3d.study.paper import paper_study
     from speckle3d.study.report import write_report
     from speckle3d.study.schedulers import scheduler_for
 
     settings = load_config(config_file) if config_file else Config()
-    with scheduler_for(scheduler, workers) as where, _shown() as progress:
-        study = compare_sweeps(
-            sweeps, out, drift, reference, curves_file, settings, calibration or (), where, progress
+    if paper:
+        _require_alone(
+            sweeps=sweeps, drift=drift, reference=reference, calibration=calibration, config=config_file
         )
+    elif not sweeps:
+        raise InvalidInputError("expected sweeps to compare, or --paper, got neither")
+    table = None
+    with scheduler_for(scheduler, workers) as where, _shown() as progress:
+        if paper:
+            done = paper_study(out, curves_file, where, progress, _count_simulated)
+            study, table = done.study, done.table
+        else:
+            study = compare_sweeps(
+                sweeps or [], out, drift, reference, curves_file, settings, calibration or (), where, progress
+            )
     write_report(out)
-    emit((out / "study.json").read_text(encoding="utf-8") if as_json else study.table)
+    emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
     failed = [each for each in study.outcomes if each.status == "failed"]
     skipped = sum(each.skipped for each in study.outcomes)
     if skipped:
@@ -62,6 +81,17 @@ def compare(
     note(f"results in {out}; the report is {out / 'report.html'}")
     if len(failed) == len(study.outcomes):
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")
+
+
+def _require_alone(**given: object) -> None:
+    """Refuse what the paper's study fixes."""
+    for name, value in given.items():
+        if value:
+            raise InvalidInputError(f"--paper: expected no {name}, which the study fixes, got {value}")
+
+
+def _count_simulated(done: int, total: int) -> None:
+    note(f"{done} of {total} sweeps simulated")
 
 
 @contextmanager

@@ -136,7 +136,7 @@ def imu_orient(
         emit(json.dumps({name: value for name, value, _ in rows}, indent=2))
         return
     for name, value, unit in rows:
-        emit(f"{name}: {value:.3f} {unit}".rstrip())
+        emit(f"{name}: {value:.5g} {unit}".rstrip())
 
 
 @imu.command("record")

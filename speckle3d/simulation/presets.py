@@ -70,11 +70,15 @@ def _image(settings: SimulationSettings, probe: Probe) -> ImageGrid:
 
 
 def _motion(settings: SimulationSettings) -> HandMotion:
-    motion = HandMotion(drift_mm=settings.drift_mm, reverse=settings.preset == "reversal")
+    motion = HandMotion(drift_mm=settings.drift_mm, reverse=_comes_back(settings))
     if settings.preset != "rotation":
         return motion
     turn = float(np.deg2rad(settings.turn_deg))
     return replace(motion, turn_rad=(turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0))
+
+
+def _comes_back(settings: SimulationSettings) -> bool:
+    return settings.preset == "reversal" or (settings.preset == "rotation" and settings.reverse)
 
 
 def _hand_held(
@@ -86,7 +90,7 @@ def _hand_held(
     number: int,
 ) -> SimulatedSweep:
     motion_seed, clock_seed, tracker_seed, orientation_seed, noise_seed = seed.spawn(5)
-    frames = settings.frames or round(8 * settings.length_mm * (2 if settings.preset == "reversal" else 1))
+    frames = settings.frames or round(8 * settings.length_mm * (2 if _comes_back(settings) else 1))
     image = _image(settings, beam.probe)
     times = frame_times(frames, settings.frame_rate_hz, np.random.default_rng(clock_seed))
     duration = frames / settings.frame_rate_hz

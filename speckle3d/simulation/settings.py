@@ -25,11 +25,13 @@ class SimulationSettings(BaseModel):
         stepped: uniform speckle in exact elevational steps, for decorrelation curves. plane: a water bath's
         floor from all sides, for calibration; its sensors are not calibrated to the image.
     frames : int, optional
-        Frames of a hand-held sweep; by default eight per mm, twice that when it reverses. Of `plane`: 150.
+        Frames of a hand-held sweep; by default eight per mm, twice that when it comes back. Of `plane`: 150.
     steps, step_mm, blocks : int, float, int
         Of `stepped`: frames per block, their distance, and how many independent blocks.
     turn_deg : float
         Of `rotation`: the deliberate turn from first to last frame, about the axis `turn_axis`.
+    reverse : bool
+        Of `rotation`: sweep forward, then back, turning on.
     drift_mm : float
         Of hand-held sweeps: slow lateral and axial wander, standard deviation.
     snr_db : float
@@ -62,6 +64,7 @@ class SimulationSettings(BaseModel):
     blocks: int = Field(4, ge=1)
     turn_deg: float = Field(5.0, ge=-30, le=30)
     turn_axis: Literal["tilt", "yaw"] = "tilt"
+    reverse: bool = False
     crossing_deg: float = Field(90.0, gt=0, lt=180)
     drift_mm: float = Field(0.5, ge=0, le=20)
     snr_db: float = Field(40.0, ge=-10, le=80)
