@@ -14,8 +14,9 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.io import calibrations, reconstructions, sweeps
+from speckle3d.io import calibrations, challenge, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.challenge import Landmarks, is_challenge_scan, read_challenge_scan, read_landmarks
 from speckle3d.io.hdf5 import PathLike, file_format, one_line, open_hdf5, reading
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.metaimage import ImportSettings, read_metaimage
@@ -33,12 +34,12 @@ _UNIT_NAMES = {"hz": "Hz", "db": "dB", "m_s": "m/s", "m_s2": "m/s^2", "rad_s": "
 
 
 def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
-    """Read a sweep from a sweep file, a MetaImage or an NRRD sequence.
+    """Read a sweep from a sweep file, a MetaImage or NRRD sequence, or a scan of the TUS-REC challenge.
 
     Parameters
     ----------
     settings : ImportSettings, optional
-        What the header of an image sequence lacks; a sweep file needs none.
+        What the header of an image sequence lacks; the others need none.
 
     Raises
     ------
@@ -47,8 +48,20 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     InvalidInputError
         If it is of no known kind, or what it holds is not valid.
     """
-    kind = sniff(path)
-    return read_sweep(path) if kind == "hdf5" else read_metaimage(path, settings)
+    if sniff(path) == "image":
+        return read_metaimage(path, settings)
+    return read_challenge_scan(path) if _is_challenge(path) else read_sweep(path)
+
+
+def load_landmarks(path: PathLike) -> Landmarks | None:
+    """Landmarks that come with a sweep; None for all but scans of the TUS-REC challenge."""
+    return read_landmarks(path) if sniff(path) == "hdf5" and _is_challenge(path) else None
+
+
+def companion_files(path: PathLike) -> list[Path]:
+    """Other files that a sweep's content depends on."""
+    is_scan = sniff(path) == "hdf5" and _is_challenge(path)
+    return challenge.companion_files(path) if is_scan else []
 
 
 def describe(path: PathLike) -> list[Row]:
@@ -63,6 +76,8 @@ def describe(path: PathLike) -> list[Row]:
     """
     if sniff(path) == "image":
         return _describe_header(read_header(path))
+    if _is_challenge(path):
+        return [("format", challenge.FORMAT, ""), *_describe_scan(path)]
     with reading(path), open_hdf5(path) as file:
         found = file_format(file)
         if found not in _DESCRIBERS:
@@ -88,9 +103,26 @@ def sniff(path: PathLike) -> str:
     raise InvalidInputError(f"{path}: expected a sweep file, MetaImage or NRRD sequence, got {got}")
 
 
+def _is_challenge(path: PathLike) -> bool:
+    with reading(path), open_hdf5(path) as file:
+        return is_challenge_scan(file)
+
+
+def _describe_scan(path: PathLike) -> list[Row]:
+    marks = read_landmarks(path)
+    return [
+        *_sweep_rows(read_challenge_scan(path)),
+        ("landmarks", str(0 if marks is None else len(marks)), ""),
+    ]
+
+
 def _describe_sweep(path: PathLike) -> list[Row]:
     with open_sweep(path) as sweep:
-        return [*_clock_rows(sweep), *_image_rows(sweep), *_signal_rows(sweep), *_sensor_rows(sweep)]
+        return _sweep_rows(sweep)
+
+
+def _sweep_rows(sweep: Sweep) -> list[Row]:
+    return [*_clock_rows(sweep), *_image_rows(sweep), *_signal_rows(sweep), *_sensor_rows(sweep)]
 
 
 def _clock_rows(sweep: Sweep) -> list[Row]:

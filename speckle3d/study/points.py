@@ -1,4 +1,36 @@
-"""How far a reconstruction is from a reference: displacement of points, and drift of the image centre."""
+"""How far a reconstruction is from a reference: displacement of points, and drift of the image centre.
+
+Both trajectories are first laid on each other at their first frame, so that neither world matters: with
+``W_i`` the pose of frame i, ``T_i = W_0^-1 W_i`` takes points of frame i into frame 0, and
+``t_i = W_(i-1)^-1 W_i`` into the frame before. Hats mark the reconstruction. Frames without a reference are
+left out beforehand, and the frame before is then the last one that has a reference. Every mean over frames is
+over i = 1 to n - 1: the first frame is right by construction.
+
+======  ================================================================================================
+FDR     final drift rate: ``d_(n-1) / L_(n-1)``, with the drift ``d_i = |T^_i c - T_i c|`` of the image
+        centre c and the length of the reference's path ``L_i = sum_(k <= i) |T_k c - T_(k-1) c|``, straight
+        from frame to frame; a share, without unit. A jittery reference has a longer path than the probe.
+ADR     average drift rate: mean over frames of ``d_i / L_i``; frames before the reference moves are left
+        out
+MD      maximum drift: largest ``d_i``, mm
+SD      sum of drift: sum of ``d_i`` over the frames, mm; it grows with the number of frames
+HD      symmetric Hausdorff distance of the two sets of centres ``{T^_i c}`` and ``{T_i c}``, mm: the
+        farthest that a centre of either is from the nearest centre of the other. Only centres at frames
+        count, not the lines between them, and order does not.
+EA      error of angle: mean over frames of the angle of ``T_i^-1 T^_i`` about its axis, degrees
+GPE     global pixel error: mean over frames and over all pixels p of ``|T^_i p - T_i p|``, mm. The pixels
+        are the samples of every vector as they are stored, the first and the last included.
+LPE     local pixel error: the same with ``t_i`` for ``T_i``
+GLE     global landmark error: mean over landmarks of ``|T^_i p - T_i p|``, each at the frame i it is in, mm
+LLE     local landmark error: the same with ``t_i`` for ``T_i``
+======  ================================================================================================
+
+References
+----------
+.. [1] M. Luo et al., "Deep Motion Network for Freehand 3D Ultrasound Reconstruction", MICCAI, 2022: names of
+   FDR to EA; what they are here is what the table says.
+.. [2] Q. Li et al., TUS-REC challenge, assessment criteria, 2024 and 2025: GPE to LLE.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +38,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.distance import directed_hausdorff
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import FloatArray, relative_poses
+from speckle3d.core.sweep import ImageGrid
 
 
 @dataclass(frozen=True)
 class PointErrors:
-    """Displacement errors over an image's points, mean over frames 1 to n - 1, mm.
+    """Displacement errors, mm.
 
     `global_mm` compares poses relative to the first frame (GPE, or GLE at landmarks), `local_mm` poses
     relative to the frame before (LPE, LLE).
@@ -26,35 +60,72 @@ class PointErrors:
 
 @dataclass(frozen=True)
 class DriftRates:
-    """Drift of the image centre with both first frames aligned.
+    """Drift of the image centre with both first frames aligned, as the module's table defines it.
 
     Attributes
     ----------
     final_drift_rate, average_drift_rate : float
-        Drift at the last frame, and mean over frames, as shares of the true path length so far.
-    maximum_drift_mm, sum_of_drift_mm : float
+        FDR and ADR, shares of the true path length so far.
+    maximum_drift_mm, sum_of_drift_mm, hausdorff_mm : float
+        MD, SD and HD.
     mean_angle_deg : float
-        Mean over frames of the absolute angle between estimated and true orientation.
+        EA.
     """
 
     final_drift_rate: float
     average_drift_rate: float
     maximum_drift_mm: float
     sum_of_drift_mm: float
+    hausdorff_mm: float
     mean_angle_deg: float
 
 
 def point_errors(
     world_from_image: RigidTransform, reference: RigidTransform, points_mm: npt.ArrayLike
 ) -> PointErrors:
-    """Displacement errors at points of the image, shape (p, 3), as in the TUS-REC challenge."""
+    """Displacement errors at the same points of every image, shape (p, 3)."""
     points = np.asarray(points_mm, dtype=float)
-    _require_same_length(world_from_image, reference, "reference")
-    found, true = (p[0].inv() * p[1:] for p in (world_from_image, reference))
-    whole = _mean_distance(found, true, points)
-    return PointErrors(
-        whole, _mean_distance(relative_poses(world_from_image), relative_poses(reference), points)
-    )
+    whole, steps = _differences(world_from_image, reference)
+    return PointErrors(*(float(_displaced(each, points).mean()) for each in (whole, steps)))
+
+
+def pixel_errors(world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid) -> PointErrors:
+    """GPE and LPE: displacement errors over every pixel of the images."""
+    whole, steps = _differences(world_from_image, reference)
+    return PointErrors(_mean_over_pixels(whole, grid), _mean_over_pixels(steps, grid))
+
+
+def landmark_errors(
+    world_from_image: RigidTransform,
+    reference: RigidTransform,
+    frames: npt.ArrayLike,
+    points_mm: npt.ArrayLike,
+) -> PointErrors:
+    """GLE and LLE: displacement errors of landmarks, each a point of one image.
+
+    Parameters
+    ----------
+    frames : array_like of int, shape (p,)
+        The frame each landmark is in, from 1 on: the first frame has no error.
+    points_mm : array_like, shape (p, 3)
+        In the image frame.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are no landmarks, or one is in no frame that has an error.
+    """
+    at, points = np.asarray(frames, dtype=int), np.asarray(points_mm, dtype=float)
+    whole, steps = _differences(world_from_image, reference)
+    if not at.size or points.shape != (at.size, 3):
+        raise InvalidInputError(f"landmarks: expected a point per frame, got {at.shape} and {points.shape}")
+    if (wrong := np.flatnonzero((at < 1) | (at > len(whole)))).size:
+        raise InvalidInputError(
+            f"landmark {wrong[0]}: expected a frame from 1 to {len(whole)}, got {at[wrong[0]]}"
+        )
+    errors = (each[at - 1, :, 3] + np.einsum("pij,pj->pi", each[at - 1, :, :3], points)
+              for each in (whole, steps))  # fmt: skip
+    return PointErrors(*(float(np.linalg.norm(each, axis=1).mean()) for each in errors))
 
 
 def drift_rates(
@@ -68,13 +139,13 @@ def drift_rates(
         If the reference does not move.
     """
     centre = np.asarray(centre_mm, dtype=float)
-    _require_same_length(world_from_image, reference, "reference")
+    _require_comparable(world_from_image, reference)
     found, true = (p[0].inv() * p for p in (world_from_image, reference))
-    path = true.apply(centre)
+    path, estimated = true.apply(centre), found.apply(centre)
     travelled = np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))
     if not travelled[-1] > 0:
         raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
-    drift = np.linalg.norm(found.apply(centre) - path, axis=1)[1:]
+    drift = np.linalg.norm(estimated - path, axis=1)[1:]
     moved = travelled > 0
     angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * found.rotation).magnitude())[1:])
     return DriftRates(
@@ -82,15 +153,50 @@ def drift_rates(
         average_drift_rate=float(np.mean(drift[moved] / travelled[moved])),
         maximum_drift_mm=float(drift.max()),
         sum_of_drift_mm=float(drift.sum()),
+        hausdorff_mm=max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
         mean_angle_deg=float(angle.mean()),
     )
 
 
-def _mean_distance(found: RigidTransform, true: RigidTransform, points: FloatArray) -> float:
-    moved = [pose.as_matrix()[:, :3, :3] @ points.T + pose.translation[:, :, None] for pose in (found, true)]
-    return float(np.linalg.norm(moved[0] - moved[1], axis=1).mean())
+def _differences(
+    world_from_image: RigidTransform, reference: RigidTransform
+) -> tuple[FloatArray, FloatArray]:
+    """Matrices of ``T^_i - T_i`` and of ``t^_i - t_i``, shape (n - 1, 3, 4) each."""
+    _require_comparable(world_from_image, reference)
+    both = (world_from_image, reference)
+    whole = [(each[0].inv() * each[1:]).as_matrix()[:, :3] for each in both]
+    steps = [relative_poses(each).as_matrix()[:, :3] for each in both]
+    return whole[0] - whole[1], steps[0] - steps[1]
 
 
-def _require_same_length(poses: RigidTransform, other: RigidTransform, name: str) -> None:
-    if len(poses) != len(other):
-        raise MismatchError(f"{name}: expected {len(poses)} poses, got {len(other)}")
+def _displaced(differences: FloatArray, points: FloatArray) -> FloatArray:
+    """Lengths of the differences at points, shape (n - 1, p)."""
+    moved = differences[:, :, :3] @ points.T + differences[:, :, 3:]
+    return np.asarray(np.linalg.norm(moved, axis=1))
+
+
+def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:
+    """Mean length of the differences over all pixels, a frame at a time."""
+    x, y = (
+        (np.arange(n) - (n - 1) / 2) * spacing
+        for n, spacing in ((grid.vectors, grid.vector_pitch_mm), (grid.samples, grid.sample_spacing_mm))
+    )
+    at_centre = differences[:, :, :3] @ grid.centre_mm + differences[:, :, 3]
+    squares = np.empty((grid.vectors, grid.samples))
+    total = 0.0
+    for across, down, middle in zip(differences[:, :, 0], differences[:, :, 1], at_centre, strict=True):
+        # |m + a x + d y|^2 in powers of y: three passes over the image in place of nine.
+        along = middle + x[:, None] * across
+        np.add.outer(2.0 * along @ down, down @ down * y, out=squares)
+        squares *= y
+        squares += (along**2).sum(axis=1)[:, None]
+        np.sqrt(np.maximum(squares, 0.0, out=squares), out=squares)
+        total += float(squares.mean())
+    return total / len(differences)
+
+
+def _require_comparable(poses: RigidTransform, reference: RigidTransform) -> None:
+    if len(poses) != len(reference):
+        raise MismatchError(f"reference: expected {len(poses)} poses, got {len(reference)}")
+    if len(poses) < 2:
+        raise InsufficientDataError(f"expected at least 2 poses, got {len(poses)}")

@@ -5,37 +5,30 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from scipy.spatial.distance import directed_hausdorff
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import config_from_toml
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import one_line, sha256_of
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import companion_files, load_landmarks, load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.study.job import Reference, available_modes, find_reference, run_job
-from speckle3d.study.points import drift_rates, point_errors
+from speckle3d.study.job import available_modes, find_reference, run_job
+from speckle3d.study.scoring import drift_rows
 from speckle3d.study.summary import plain
 
 DONE = "job.json"
 """Written last into a sweep's folder."""
 
-POINTS = 16
-"""Points per axis at which displacement is averaged over the image, its corners among them."""
+_TEMPORARY = re.compile(r"\.part-[0-9a-f]{8}-")
+"""What a temporary name has before the name that it is to become."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +87,7 @@ def plan_sweep(
     found = (curves or path.parent / "curves.h5").resolve()
     try:
         frames, sha256 = len(load_sweep(path)), sha256_of(path)
-        used = [sha256_of(each) for each in (found, *calibrations)]
+        used = [sha256_of(each) for each in (found, *calibrations, *companion_files(path))]
     except Exception as error:  # noqa: BLE001 - one row that says why
         return SweepOutcome(name, path, "failed", _reason(error))
     parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
@@ -119,53 +112,10 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
         _move(part, job)
     except Exception as error:  # noqa: BLE001
         # One broken sweep, or one bug that it brings to light, must not cost the others.
-        return lost(job, _reason(error).replace(str(part), str(job.folder)))
+        return lost(job, _reason(error))
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return _done(job, seconds)
-
-
-def drift_rows(
-    sweep: Sweep, poses: Mapping[str, RigidTransform], reference: Reference
-) -> list[dict[str, Any]]:
-    """Drift rates and displacement errors of every mode over the frames that have a reference.
-
-    The rates are shares of the path; GLE and LLE need landmarks, which sweeps do not carry.
-    """
-    covered, true = reference.covered, reference.world_from_image
-    return [{"mode": mode} | _drift_row(sweep, each[covered], true) for mode, each in poses.items()]
-
-
-def _drift_row(sweep: Sweep, poses: RigidTransform, true: RigidTransform) -> dict[str, Any]:
-    centre = sweep.grid.centre_mm
-    rates = drift_rates(poses, true, centre)
-    moved = point_errors(poses, true, image_points(sweep))
-    return {
-        "FDR": rates.final_drift_rate,
-        "ADR": rates.average_drift_rate,
-        "MD_mm": rates.maximum_drift_mm,
-        "SD_mm": rates.sum_of_drift_mm,
-        "HD_mm": _hausdorff_mm(poses, true, centre),
-        "EA_deg": rates.mean_angle_deg,
-        "GPE_mm": moved.global_mm,
-        "GLE_mm": None,
-        "LPE_mm": moved.local_mm,
-        "LLE_mm": None,
-    }
-
-
-def _hausdorff_mm(poses: RigidTransform, true: RigidTransform, centre_mm: FloatArray) -> float:
-    """Farthest that a centre of either path is from the other path's nearest; first frames aligned."""
-    one, other = ((each[0].inv() * each).apply(centre_mm) for each in (poses, true))
-    return max(directed_hausdorff(one, other)[0], directed_hausdorff(other, one)[0])
-
-
-def image_points(sweep: Sweep) -> FloatArray:
-    """Evenly spread points of the image, shape (POINTS**2, 3), mm."""
-    low, high = np.min(sweep.grid.corners_mm, axis=0), np.max(sweep.grid.corners_mm, axis=0)
-    across, down = (np.linspace(low[i], high[i], POINTS) for i in (0, 1))
-    x, y = np.meshgrid(across, down)
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
 def _reconstruct(job: SweepJob, part: Path) -> None:
@@ -184,7 +134,7 @@ def _reconstruct(job: SweepJob, part: Path) -> None:
     rows = []
     if reference is not None:
         poses = read_reconstruction(part / "reconstruction.h5", with_pairs=False).poses
-        rows = drift_rows(mounted, poses, reference)
+        rows = drift_rows(mounted, poses, reference, load_landmarks(job.path))
     (part / "drift.json").write_text(json.dumps(plain(rows), allow_nan=False), encoding="utf-8")
 
 
@@ -219,8 +169,9 @@ def _done(job: SweepJob, seconds: float, skipped: bool = False) -> SweepOutcome:
 
 
 def lost(job: SweepJob, reason: str) -> SweepOutcome:
-    """Outcome of a job that has none of its own."""
-    return SweepOutcome(job.name, job.path, "failed", reason, job.sha256, job.key, frames=job.frames)
+    """Outcome of a job that has none of its own; the reason names what was wanted, not temporary files."""
+    told = _TEMPORARY.sub("", reason)
+    return SweepOutcome(job.name, job.path, "failed", told, job.sha256, job.key, frames=job.frames)
 
 
 def _reason(error: Exception) -> str:

@@ -20,7 +20,8 @@ from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.job import Reference
 from speckle3d.study.schedulers import OnCluster, local_cluster
-from speckle3d.study.sweepjob import SweepOutcome, drift_rows, plan_sweep, run_sweep
+from speckle3d.study.scoring import drift_rows
+from speckle3d.study.sweepjob import SweepOutcome, plan_sweep, run_sweep
 
 # Dask's processes leave sockets to the garbage collector when one is killed.
 pytestmark = pytest.mark.filterwarnings(
@@ -148,6 +149,18 @@ def test_a_bug_in_one_sweep_is_its_reason_and_leaves_nothing(sweeps, tmp_path, m
     found = compare_sweeps(sweeps[:1], tmp_path)
     assert found.outcomes[0].reason == "ZeroDivisionError: in the middle"
     assert list((tmp_path / "sweeps").iterdir()) == []
+
+
+def test_a_reason_names_no_temporary_folder(sweeps, tmp_path, monkeypatch):
+    def full(path, *arguments):
+        raise OSError(f"no space for {arguments[2] / '.part-0123abcd-reconstruction.h5'}")
+
+    monkeypatch.setattr("speckle3d.study.sweepjob.run_job", full)
+    # Words are set one space apart; a path with two must not hide its temporary name.
+    found = compare_sweeps(sweeps[:1], tmp_path / "two  spaces")
+    assert "no space for" in found.outcomes[0].reason
+    assert "reconstruction.h5" in found.outcomes[0].reason
+    assert ".part-" not in (tmp_path / "two  spaces" / "study.json").read_text()
 
 
 def test_sweeps_of_one_name_are_told_apart_and_one_given_twice_is_one(sweeps, tmp_path):

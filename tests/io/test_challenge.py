@@ -1,0 +1,116 @@
+import pickle
+
+import challenge_examples as examples
+import h5py
+import numpy as np
+import pytest
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.sweep import BModeSettings
+from speckle3d.io.challenge import read_challenge_calibration, read_landmarks
+from speckle3d.io.load import companion_files, describe, load_landmarks, load_sweep
+
+
+@pytest.fixture(params=["one file", "two files"])
+def scan(request, tmp_path):
+    return examples.write_data_set(tmp_path / "data", split=request.param == "two files")
+
+
+def test_a_scan_is_a_sweep(scan):
+    path, frames, poses, _ = scan
+    sweep = load_sweep(path)
+    assert (len(sweep), sweep.name, sweep.frames.shape) == (12, examples.SCAN, (12, 8, 6))
+    assert sweep.signal == BModeSettings(dynamic_range_db=83.0)
+    np.testing.assert_allclose(np.diff(sweep.frame_time_s), 1 / 20)
+    for i in (0, 7, -1):
+        np.testing.assert_array_equal(sweep.frames[i], frames[i].T)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(sweep.frames))[3], frames[3].T)
+    assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == examples.SCALE_MM
+    # The third column and fifth row, counted from 1, in camera space by the published matrices.
+    pixel = np.diag([*examples.SCALE_MM, 1.0, 1.0]) @ [3.0, 5.0, 0.0, 1.0]
+    expected = poses @ examples.TOOL_FROM_IMAGE @ pixel
+    ours = sweep.tracker.world_from_image(sweep.frame_time_s).apply([2 * 0.25, 4 * 0.2, 0.0])
+    np.testing.assert_allclose(ours, expected[:, :3], rtol=0, atol=1e-9)
+    sweep.frames.close()
+
+
+def test_landmarks_are_counted_from_frame_0_and_pixel_1(scan):
+    path, _, _, marks = scan
+    found = load_landmarks(path)
+    np.testing.assert_array_equal(found.frame, marks[:, 0])
+    np.testing.assert_allclose(found.points_mm[:, 0], (marks[:, 1] - 1) * 0.25)
+    np.testing.assert_allclose(found.points_mm[:, 1], (marks[:, 2] - 1) * 0.2)
+    assert not found.points_mm[:, 2].any()
+
+
+def test_a_scan_is_described_and_its_companions_are_known(tmp_path):
+    path, *_ = examples.write_data_set(tmp_path)
+    rows = {name: value for name, value, _ in describe(path)}
+    assert rows["format"] == "TUS-REC scan"
+    assert (rows["frames"], rows["landmarks"], rows["tracker covers"]) == ("12", "20", "12")
+    assert {each.name for each in companion_files(path)} == {
+        f"{examples.SCAN}.h5",
+        "calib_matrix.csv",
+        "landmark_050.h5",
+    }
+
+
+def test_a_test_scan_has_no_tracker_and_no_landmarks(tmp_path):
+    path, *_ = examples.write_data_set(tmp_path, landmarks=False)
+    (tmp_path / "transfs" / examples.SUBJECT / path.name).unlink()
+    assert load_sweep(path).tracker is None
+    assert read_landmarks(path) is None
+    assert [each.name for each in companion_files(path)] == ["calib_matrix.csv"]
+
+
+def test_a_scan_without_calibration_says_what_it_lacks(tmp_path):
+    path, *_ = examples.write_data_set(tmp_path)
+    (tmp_path / "calib_matrix.csv").unlink()
+    with pytest.raises(InvalidInputError, match=r"expected calib_matrix\.csv beside or above it, got none"):
+        load_sweep(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("words\n1,0,0,0\n", "eight rows of four finite numbers, got 1"),
+        ("\n".join(["1,0,0,0", "0,1,0,0", "0,0,1,0", "0,0,nan,1"] * 2), "got 6"),
+        ("\n".join(["1,0,0,0", "0,-1,0,0", "0,0,1,0", "0,0,0,1"] * 2), "expected a scaling"),
+        ("\n".join(["2,0,0,0", "0,2,0,0", "0,0,2,0", "0,0,0,1"] * 2), "image to tool.*rigid"),
+    ],
+)
+def test_a_wrong_calibration_is_named(tmp_path, content, message):
+    path = tmp_path / "calib_matrix.csv"
+    path.write_text(content)
+    with pytest.raises(InvalidInputError, match=message):
+        read_challenge_calibration(path)
+    path.write_bytes(b"\xff\xfe\xff")
+    with pytest.raises(FileError, match="cannot be read as text"):
+        read_challenge_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("frames", np.zeros((12, 6, 8)), "expected uint8 of shape"),
+        ("frames", np.zeros((12, 8), dtype=np.uint8), "expected uint8 of shape"),
+        ("tforms", np.tile(np.eye(4), (11, 1, 1)), "expected shape"),
+        ("tforms", 2 * np.tile(np.eye(4), (12, 1, 1)), "rigid 4x4"),
+    ],
+)
+def test_a_wrong_scan_is_named(tmp_path, name, values, message):
+    path, *_ = examples.write_data_set(tmp_path, split=False)
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = values
+    with pytest.raises(InvalidInputError, match=message):
+        load_sweep(path)
+
+
+def test_a_landmark_is_in_a_frame(tmp_path):
+    path, *_ = examples.write_data_set(tmp_path)
+    with h5py.File(tmp_path / "landmark" / "landmark_050.h5", "r+") as file:
+        del file[examples.SCAN]
+        file[examples.SCAN] = np.array([[1.5, 2.0, 2.0]])
+    with pytest.raises(InvalidInputError, match="expected a frame and two finite coordinates"):
+        read_landmarks(path)
