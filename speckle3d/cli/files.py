@@ -53,6 +53,11 @@ def simulate(
     blocks: Annotated[int | None, typer.Option(help="stepped: independent blocks.")] = None,
     turn_deg: Annotated[float | None, typer.Option(help="rotation: the deliberate turn.")] = None,
     turn_axis: Annotated[str | None, typer.Option(help="rotation: tilt or yaw.")] = None,
+    crossing_deg: Annotated[float | None, typer.Option(help="crossed: angle of the sweeps (90).")] = None,
+    fan_deg: Annotated[float | None, typer.Option(help="crossed: tilt within each sweep (0).")] = None,
+    uncalibrated: Annotated[
+        bool | None, typer.Option("--uncalibrated", help="crossed: do not say how the sensors are mounted.")
+    ] = None,
     reverse: Annotated[bool | None, typer.Option("--reverse", help="rotation: come back.")] = None,
     drift_mm: Annotated[float | None, typer.Option(help="Slow lateral and axial wander (0.5).")] = None,
     snr_db: Annotated[float | None, typer.Option(help="Speckle over electronic noise (40).")] = None,

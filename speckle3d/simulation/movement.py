@@ -34,6 +34,8 @@ class HandMotion:
         Slow wander of the lateral and axial position over the sweep.
     wander_rad : float
         Slow wander of tilt, yaw and roll over the sweep.
+    start_rad : tuple of float
+        Tilt, yaw and roll of the first frame.
     turn_rad : tuple of float
         Deliberate tilt, yaw and roll from the first frame to the last.
     tremor_band_hz, tremor_mm, tremor_rad
@@ -47,6 +49,7 @@ class HandMotion:
     pause_s: float = 0.3
     drift_mm: float = 0.5
     wander_rad: float = np.deg2rad(0.6)
+    start_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tremor_band_hz: tuple[float, float] = (8.0, 12.0)
     tremor_mm: float = 0.012
@@ -139,7 +142,7 @@ def hand_sweep(
     columns[:, :3] = pivot
     columns[:, 2] += along
     phase = np.clip(time / duration_s, 0.0, 1.0)
-    columns[:, 3:] = _smooth_step(phase)[:, None] * (np.asarray(motion.turn_rad))
+    columns[:, 3:] = motion.start_rad + _smooth_step(phase)[:, None] * np.asarray(motion.turn_rad)
     for axis in range(6):
         slow = motion.drift_mm if axis < 3 else motion.wander_rad
         fast = motion.tremor_mm if axis < 3 else motion.tremor_rad

@@ -71,6 +71,9 @@ def _image(settings: SimulationSettings, probe: Probe) -> ImageGrid:
 
 def _motion(settings: SimulationSettings) -> HandMotion:
     motion = HandMotion(drift_mm=settings.drift_mm, reverse=_comes_back(settings))
+    if settings.preset == "crossed":
+        fan = float(np.deg2rad(settings.fan_deg))
+        return replace(motion, start_rad=(-fan / 2.0, 0.0, 0.0), turn_rad=(fan, 0.0, 0.0))
     if settings.preset != "rotation":
         return motion
     turn = float(np.deg2rad(settings.turn_deg))
@@ -111,17 +114,20 @@ def _hand_held(
         trajectory, span, OrientationModel(), np.random.default_rng(orientation_seed)
     )
     poses = trajectory.medium_from_image(times)
+    mounted = settings.preset != "crossed" or not settings.uncalibrated
     sweep = Sweep(
         SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(noise_seed)),
         image,
         beam.probe.signal,
         times,
-        orientation,
-        tracker,
+        orientation if mounted else replace(orientation, sensor_from_image=None),
+        tracker if mounted else replace(tracker, sensor_from_image=None),
         world * poses,
         name=f"{settings.preset}-{settings.seed}" + ("-crossing" if number else ""),
     )
-    return SimulatedSweep(sweep, settings)
+    if mounted:
+        return SimulatedSweep(sweep, settings)
+    return SimulatedSweep(sweep, settings, tracker.sensor_from_image, orientation.sensor_from_image)
 
 
 def _stepped(

@@ -21,7 +21,8 @@ class SimulationSettings(BaseModel):
     ----------
     preset : str
         phantom: speckle with inclusions, one way. tissue: layers, one way. reversal: tissue, forward and
-        back. rotation: phantom with a deliberate turn. crossed: tissue, two sweeps at a right angle.
+        back. rotation: phantom with a deliberate turn. crossed: tissue, two sweeps at a right angle; for
+        calibration they must fan, and their tracker must not know its mounting (`fan_deg`, `uncalibrated`).
         stepped: uniform speckle in exact elevational steps, for decorrelation curves. plane: a water bath's
         floor from all sides, for calibration; its sensors are not calibrated to the image.
     frames : int, optional
@@ -32,6 +33,10 @@ class SimulationSettings(BaseModel):
         Of `rotation`: the deliberate turn from first to last frame, about the axis `turn_axis`.
     reverse : bool
         Of `rotation`: sweep forward, then back, turning on.
+    crossing_deg, fan_deg : float
+        Of `crossed`: the angle between the sweeps, and how far the probe tilts in each, half either way.
+    uncalibrated : bool
+        Of `crossed`: leave it to a calibration to find how the sensors sit on the probe.
     drift_mm : float
         Of hand-held sweeps: slow lateral and axial wander, standard deviation.
     snr_db : float
@@ -66,6 +71,8 @@ class SimulationSettings(BaseModel):
     turn_axis: Literal["tilt", "yaw"] = "tilt"
     reverse: bool = False
     crossing_deg: float = Field(90.0, gt=0, lt=180)
+    fan_deg: float = Field(0.0, ge=0, le=90)
+    uncalibrated: bool = False
     drift_mm: float = Field(0.5, ge=0, le=20)
     snr_db: float = Field(40.0, ge=-10, le=80)
     reflector: Reflector = "wall"
