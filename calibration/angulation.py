@@ -1,0 +1,278 @@
+"""Whether two sweeps are angulated enough to show how the image sits on the sensor, before solving.
+
+A wrong calibration moves the same point of the object differently in two images. Where it moves both alike -
+along the beam, if the probe is never tilted - no comparison of images can tell.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging 6920, 2008, section 2.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import FloatArray, skew
+from speckle3d.core.streams import BoolArray
+
+PARAMETERS = ("tilt", "yaw", "roll", "x", "y", "z")
+"""Small turns about the image's x, y and z through its centre, and shifts along them."""
+
+REFUSED = 0.1
+"""Disagreement in mm of a mm (or of an image's half size times a radian) of calibration error below which
+sweeps are refused: images that agree to 0.3 mm would then leave 3 mm open. Fans of 6 degrees are at 0.1."""
+
+WEAK = 0.25
+"""Below, the verdict says so; fans of 14 degrees."""
+
+_FRAMES, _POINTS = 12, 9
+_LEAST_OVERLAP = 0.02
+
+
+@dataclass(frozen=True)
+class Angulation:
+    """How strongly each error of a calibration shows where two sweeps see the same points.
+
+    Attributes
+    ----------
+    crossing_deg : float
+        Between the mean directions in which the two probes' image lines run across, 0 to 90.
+    fan_deg : tuple of float
+        By how much the beam's direction turns within each sweep.
+    overlap : tuple of float
+        Share of each sweep's image area that the other sweep covers too.
+    alone : ndarray, shape (6,)
+        RMS disagreement in mm of an error of 1 mm or 1 degree of one parameter, in the order of `PARAMETERS`.
+    recoverable : ndarray, shape (6,)
+        The same with all other parameters free to hide it.
+    """
+
+    crossing_deg: float
+    fan_deg: tuple[float, float]
+    overlap: tuple[float, float]
+    alone: FloatArray
+    recoverable: FloatArray
+    half_size_mm: float
+
+    @property
+    def strength(self) -> FloatArray:
+        """`recoverable` in mm per mm, an angle counting as what it moves at the image's half size."""
+        per_mm = self.recoverable.copy()
+        per_mm[:3] /= np.deg2rad(1.0) * self.half_size_mm
+        return per_mm
+
+    @property
+    def weakest(self) -> str:
+        """The parameter that shows least."""
+        return PARAMETERS[int(np.argmin(self.strength))]
+
+    @property
+    def verdict(self) -> str:
+        """In words."""
+        weakest = float(self.strength.min())
+        if weakest >= WEAK:
+            return "sufficient"
+        kind = "insufficient" if weakest < REFUSED else "weak"
+        return f"{kind}: an error in {self.weakest} shows by {weakest:.2f} mm per mm; {_ADVICE}"
+
+    def require(self) -> None:
+        """Refuse sweeps that cannot tell.
+
+        Raises
+        ------
+        InsufficientDataError
+            Naming the parameter that cannot be found.
+        """
+        if float(self.strength.min()) < REFUSED:
+            raise InsufficientDataError(
+                f"expected two angulated sweeps that cross, got {self.crossing_deg:.0f} degrees between them "
+                f"and fans of {self.fan_deg[0]:.0f} and {self.fan_deg[1]:.0f} degrees: an error of 1 mm in "
+                f"{self.weakest} would show by {self.strength.min():.2f} mm; {_ADVICE}"
+            )
+
+
+_ADVICE = "tilt the probe to and fro within each sweep, and turn it by about 90 degrees between them"
+
+
+def displacement_mm(
+    first: RigidTransform,
+    second: RigidTransform,
+    sensor_from_image: RigidTransform,
+    error: RigidTransform,
+    point_mm: npt.ArrayLike,
+) -> FloatArray:
+    """How far apart a wrong calibration puts one point that two images show, equation 5 of [1]_.
+
+    Parameters
+    ----------
+    first, second : RigidTransform
+        World from sensor for the two images.
+    sensor_from_image : RigidTransform
+        The right calibration; the wrong one is ``sensor_from_image * error``.
+    point_mm : array_like, shape (3,) or (n, 3)
+        In the first image's frame.
+
+    Returns
+    -------
+    ndarray, shape (3,) or (n, 3)
+
+    References
+    ----------
+    .. [1] Wein and Khamene, 2008.
+    """
+    one, other = first * sensor_from_image, second * sensor_from_image
+    seen = (other.inv() * one).apply(np.asarray(point_mm, dtype=float))
+    return np.asarray((other * error).apply(seen) - (one * error).apply(point_mm))
+
+
+def translation_errors_mm(shift_mm: npt.ArrayLike, alpha_rad: float, beta_rad: float) -> FloatArray:
+    """Equations 9 to 11 of [1]_: disagreement of a shift along x, y or z alone, for perpendicular fans.
+
+    Parameters
+    ----------
+    shift_mm : array_like, shape (3,)
+    alpha_rad, beta_rad : float
+        Tilt of the two images about the axis of their fans.
+
+    References
+    ----------
+    .. [1] Wein and Khamene, 2008.
+    """
+    cosines, sines = np.cos(alpha_rad) * np.cos(beta_rad), np.sin(alpha_rad) * np.sin(beta_rad)
+    factors = np.sqrt(2.0 * np.array([1.0, 1.0 - cosines, 1.0 - sines]))
+    return np.asarray(np.abs(np.asarray(shift_mm, dtype=float)) * factors)
+
+
+def angulation(
+    first: RigidTransform, second: RigidTransform, sensor_from_image: RigidTransform, corners_mm: FloatArray
+) -> Angulation:
+    """Judge two sweeps by their poses alone.
+
+    Parameters
+    ----------
+    first, second : RigidTransform, length n and m
+        World from sensor of the frames of each sweep.
+    sensor_from_image : RigidTransform
+        The estimate to start from; only how much the sweeps overlap depends on it strongly.
+    corners_mm : ndarray, shape (4, 3)
+        Of the image, in its own frame.
+
+    Raises
+    ------
+    InsufficientDataError
+        If a sweep has fewer than two frames, or the sweeps never cross, however far their images reach.
+    """
+    if min(len(first), len(second)) < 2:
+        raise InsufficientDataError(f"expected two sweeps, got {len(first)} and {len(second)} frames")
+    one, other = first * sensor_from_image, second * sensor_from_image
+    centre, half = corners_mm.mean(axis=0), 0.5 * np.ptp(corners_mm, axis=0)
+    blocks, overlap = _both_ways(one, other, corners_mm)
+    if max(overlap) < _LEAST_OVERLAP:
+        # A bad start moves sweeps of one place apart; how they are angulated it changes little.
+        blocks, _ = _both_ways(one, _moved_onto(other, one, centre), corners_mm)
+    if not len(blocks):
+        raise InsufficientDataError(
+            "expected two sweeps of one place, got images that nowhere reach the planes of the other sweep's"
+        )
+    information = np.einsum("pij,pik->jk", blocks, blocks) / len(blocks)
+    scale = np.array([np.deg2rad(1.0)] * 3 + [1.0] * 3)
+    information *= np.outer(scale, scale)
+    alone = np.sqrt(np.diag(information))
+    return Angulation(
+        _crossing_deg(one, other),
+        (_fan_deg(one), _fan_deg(other)),
+        overlap,
+        alone,
+        _with_others_free(information),
+        float(np.linalg.norm(half[:2]) / np.sqrt(2.0)),
+    )
+
+
+def _grid(corners_mm: FloatArray) -> FloatArray:
+    low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
+    # The middles of cells, so that each point stands for the same area.
+    share = (np.arange(_POINTS) + 0.5) / _POINTS
+    x, y = np.meshgrid(low[0] + share * (high - low)[0], low[1] + share * (high - low)[1])
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+def _both_ways(
+    one: RigidTransform, other: RigidTransform, corners_mm: FloatArray
+) -> tuple[FloatArray, tuple[float, float]]:
+    """Sensitivities at points of either sweep that the other sees too, and the shares of those points."""
+    first, seen = _disagreements(one, other, corners_mm)
+    second, seen_back = _disagreements(other, one, corners_mm)
+    shares = float(seen.mean()), float(seen_back.mean())
+    return np.concatenate([first[seen], second[seen_back]]), shares
+
+
+def _moved_onto(other: RigidTransform, one: RigidTransform, centre_mm: FloatArray) -> RigidTransform:
+    """A sweep shifted so that the mean of its images' centres is that of another's."""
+    apart = one.apply(centre_mm).mean(axis=0) - other.apply(centre_mm).mean(axis=0)
+    return RigidTransform.from_translation(apart) * other
+
+
+def _disagreements(
+    one: RigidTransform, other: RigidTransform, corners_mm: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """d(disagreement)/d(parameters) at points of some images of one sweep, and which points both see.
+
+    Shapes (p, 3, 6) and (p,); NaN where the other sweep's planes never pass the point.
+    """
+    points, centre, half = _grid(corners_mm), corners_mm.mean(axis=0), 0.5 * np.ptp(corners_mm, axis=0)
+    chosen = np.unique(np.linspace(0, len(one) - 1, _FRAMES).round().astype(int))
+    blocks, inside = [], []
+    for frame in chosen:
+        world = one[frame].apply(points)
+        seen = np.stack([other[k].inv().apply(world) for k in range(len(other))])
+        nearest, passes = _passing(seen[..., 2])
+        local = seen[nearest, np.arange(len(points))]
+        there = other.as_matrix()[nearest][:, :3, :3]
+        here = one[frame].rotation.as_matrix()
+        block = there @ _moves(local - centre) - here @ _moves(points - centre)
+        block[~passes] = np.nan
+        blocks.append(block)
+        inside.append(passes & (np.abs(local - centre)[:, :2] <= half[:2] + 1e-9).all(axis=1))
+    return np.concatenate(blocks), np.concatenate(inside)
+
+
+def _passing(distance_mm: FloatArray) -> tuple[npt.NDArray[np.int64], BoolArray]:
+    """The frame of a sweep whose plane is nearest to each point, and whether the sweep passes the point."""
+    nearest = np.abs(distance_mm).argmin(axis=0)
+    passes = (distance_mm.min(axis=0) <= 0.0) & (distance_mm.max(axis=0) >= 0.0)
+    return nearest, np.asarray(passes)
+
+
+def _moves(local_mm: FloatArray) -> FloatArray:
+    """d(point)/d(turns, shifts) in the image's frame, shape (p, 3, 6)."""
+    return np.concatenate([-skew(local_mm), np.broadcast_to(np.eye(3), (len(local_mm), 3, 3))], axis=2)
+
+
+def _with_others_free(information: FloatArray) -> FloatArray:
+    """Square root of the Schur complement of each parameter, zero where others can hide it."""
+    found = np.zeros(len(information))
+    for k in range(len(information)):
+        rest = np.delete(np.arange(len(information)), k)
+        cross = information[rest, k]
+        hidden = cross @ np.linalg.lstsq(information[np.ix_(rest, rest)], cross, rcond=1e-10)[0]
+        found[k] = np.sqrt(max(information[k, k] - hidden, 0.0))
+    return found
+
+
+def _crossing_deg(one: RigidTransform, other: RigidTransform) -> float:
+    across = [each.rotation.apply([1.0, 0.0, 0.0]).mean(axis=0) for each in (one, other)]
+    cosine = abs(float(across[0] @ across[1])) / float(np.prod([np.linalg.norm(each) for each in across]))
+    return float(np.rad2deg(np.arccos(min(cosine, 1.0))))
+
+
+def _fan_deg(sweep: RigidTransform) -> float:
+    """The largest angle between the beams of a few of a sweep's images."""
+    chosen = np.unique(np.linspace(0, len(sweep) - 1, _FRAMES).round().astype(int))
+    beams = sweep[chosen].rotation.apply([0.0, 1.0, 0.0])
+    return float(np.rad2deg(np.arccos(np.clip((beams @ beams.T).min(), -1.0, 1.0))))
