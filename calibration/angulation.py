@@ -126,9 +126,10 @@ def displacement_mm(
     ----------
     .. [1] Wein and Khamene, 2008.
     """
+    point = np.asarray(point_mm, dtype=float)
     one, other = first * sensor_from_image, second * sensor_from_image
-    seen = (other.inv() * one).apply(np.asarray(point_mm, dtype=float))
-    return np.asarray((other * error).apply(seen) - (one * error).apply(point_mm))
+    seen = (other.inv() * one).apply(point)
+    return np.asarray((other * error).apply(seen) - (one * error).apply(point), dtype=float)
 
 
 def translation_errors_mm(shift_mm: npt.ArrayLike, alpha_rad: float, beta_rad: float) -> FloatArray:

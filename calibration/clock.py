@@ -154,6 +154,16 @@ def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int) -> None:
             f"expected a line that follows the sensor, got {100 * (1 - misfit[best]):.0f} % of its motion "
             "explained at the best delay: move the probe up and down, faster"
         )
+    require_peak(tried_s, misfit, best)
+
+
+def require_peak(tried_s: FloatArray, misfit: FloatArray, best: int) -> None:
+    """Refuse a best delay that lies at the end of the range, or that has a rival.
+
+    Raises
+    ------
+    InsufficientDataError
+    """
     if best in (0, len(tried_s) - 1):
         raise InsufficientDataError(
             f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's end"
