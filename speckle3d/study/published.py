@@ -150,7 +150,7 @@ def _interval(found: MeanInterval, digits: int) -> str:
 
 def _pair(published: float, ours: ModeError | None, name: str, digits: int) -> str:
     value = "missing" if ours is None else f"{getattr(ours, name):+.{digits}f}"
-    return f"{published:+.{digits}f} | {value}".center(13)
+    return f"{published:+5.{digits}f} | {value:5}"
 
 
 def _errors(rows: Sequence[ModeError], mode: str) -> FloatArray:
