@@ -21,6 +21,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.study.job import REFERENCES, SUBSET
 from speckle3d.study.metrics import ModeError
+from speckle3d.study.overall import over_sweeps, overall_text
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
 from speckle3d.study.summary import Summary, csv_text, plain, table_text
 from speckle3d.study.sweepjob import SweepJob, SweepOutcome, finished, lost, plan_sweep, run_sweep
@@ -158,9 +159,12 @@ def _write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_tom
             rows = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
             drift += [{"sweep": outcome.name} | row for row in rows]
     rows = [{"sweep": each.sweep} | asdict(row) for each in summaries for row in each.rows]
+    intervals, paired = over_sweeps(rows, drift)
     table = table_text(summaries) + "".join(
         f"{each.name}  failed: {each.reason}\n" for each in outcomes if each.status == "failed"
     )
+    if overall := overall_text(intervals, paired):
+        table += f"\n{overall}"
     contents = {
         "format": FORMAT,
         "version": VERSION,
@@ -169,8 +173,8 @@ def _write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_tom
         "sweeps": [_entry(outcome) for outcome in outcomes],
         "rows": rows,
         "drift": drift,
-        "intervals": [],
-        "paired": [],
+        "intervals": intervals,
+        "paired": paired,
     }
     texts = {
         "study.json": json.dumps(plain(contents), indent=2, allow_nan=False) + "\n",

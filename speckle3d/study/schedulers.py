@@ -145,6 +145,8 @@ def local_cluster(workers: int) -> Iterator[Any]:
             threads_per_worker=1,
             processes=True,
             dashboard_address=None,
+            # Even so it opens a port, by default the same for every cluster of the machine; 0 is a free one.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             memory_limit=0,
             silence_logs=50,
             env=env | {"MPLBACKEND": os.environ.get("MPLBACKEND", "agg")},

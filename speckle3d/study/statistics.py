@@ -6,6 +6,7 @@ there is no interval to be had, and none is given.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,6 +102,22 @@ def paired_comparison(
     if not _tells(differences):
         return PairedComparison(found, None)
     return PairedComparison(found, float(stats.wilcoxon(differences).pvalue))
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Correct p values of several tests for their number [1]_; None stands for a test that was not made.
+
+    References
+    ----------
+    .. [1] S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6, 1979.
+    """
+    made = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    corrected: list[float | None] = [None] * len(p_values)
+    least = 0.0
+    for rank, (p, i) in enumerate(made):
+        least = max(least, min(1.0, (len(made) - rank) * p))
+        corrected[i] = least
+    return corrected
 
 
 def _held(values: FloatArray) -> FloatArray:

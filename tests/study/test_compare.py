@@ -81,6 +81,20 @@ def test_every_mode_that_has_sensors_and_the_broken_sweep_as_a_row(study):
     assert [path for path in study.directory.rglob("*") if ".part-" in path.name] == []
 
 
+def test_means_over_sweeps_are_in_the_study_and_in_the_table(study):
+    found = held(study.directory)
+    (mean,) = [r for r in found["intervals"] if (r["quantity"], r["mode"]) == ("FDR", "pose")]
+    assert mean["sweeps"] == 2
+    assert mean["mean"] == pytest.approx(np.mean([r["FDR"] for r in found["drift"] if r["mode"] == "pose"]))
+    pairs = [(r["mode"], r["against"]) for r in found["paired"] if r["quantity"] == "length_error_percent"]
+    assert len(pairs) == len(set(pairs)) == 6
+    # Two sweeps cannot tell modes apart.
+    assert {r["better"] for r in found["paired"]} == {None}
+    text = (study.directory / "table.txt").read_text()
+    assert "mean of 2 sweeps" in text
+    assert "no two modes are told apart by these sweeps" in text
+
+
 def test_a_second_start_does_nothing_again_but_what_changed(study, sweeps, tmp_path):
     shutil.copytree(study.directory, tmp_path / "again")
     before = numbers(study.directory)
@@ -113,7 +127,7 @@ def test_workers_give_the_same_bits_though_one_is_killed(study, sweeps, tmp_path
             os.kill(workers[0], signal.SIGKILL)
             killed.append(workers[0])
 
-        thread = threading.Thread(target=kill)
+        thread = threading.Thread(target=kill, daemon=True)
         thread.start()
         found = compare_sweeps(sweeps, tmp_path / "out", scheduler=OnCluster(client))
         thread.join(timeout=20)

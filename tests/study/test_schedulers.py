@@ -3,6 +3,7 @@ import signal
 import time
 
 import pytest
+from cluster_jobs import double, lost, noted, suicide
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.study.schedulers import InProcess, OnCluster, local_cluster, remaining_s, scheduler_for
@@ -11,30 +12,6 @@ from speckle3d.study.schedulers import InProcess, OnCluster, local_cluster, rema
 pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
-
-
-def double(number):
-    return 2 * number
-
-
-def noted(job):
-    """Write down who runs it, and wait for leave to finish."""
-    folder, number = job
-    with open(folder / f"{number}.runs", "a") as runs:
-        runs.write(f"{os.getpid()}\n")
-    while not (folder / f"{number}.go").exists():
-        time.sleep(0.02)
-    return number
-
-
-def suicide(number):
-    if number == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-def lost(job, reason):
-    return reason
 
 
 @pytest.fixture(scope="module")

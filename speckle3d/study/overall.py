@@ -1,0 +1,190 @@
+"""What a study says over all its sweeps: mean errors by mode with intervals, and modes told apart or not.
+
+A sweep is the unit. Of the errors of its parts the mean magnitude counts; drift and displacement are one
+number per sweep anyhow. Two modes are told apart where the interval of their differences, sweep by sweep,
+leaves out zero, and a signed-rank test says so too (p <= `LEVEL`) after Holm's correction for all pairs of
+modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from speckle3d.core.geometry import FloatArray
+from speckle3d.study.statistics import holm, mean_interval, paired_comparison
+
+LEVEL = 0.05
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something to compare modes by: its key in a study's rows, words for it, and how it is written."""
+
+    key: str
+    words: str
+    form: str = "{:.2f}"
+    signed_parts: bool = False
+    """Whether it is an error of every part, with a sign."""
+
+    def shown(self, value: float | None, signed: bool = False) -> str:
+        """Write a value; a dash for none."""
+        if value is None or not np.isfinite(value):
+            return "-"
+        return (self.form.replace(":", ":+") if signed else self.form).format(value)
+
+
+QUANTITIES = (
+    Quantity("length_error_percent", "length error %", "{:.1f}", True),
+    Quantity("length_error_mm", "length error mm", "{:.2f}", True),
+    Quantity("tilt_error_deg", "tilt error deg", "{:.2f}", True),
+    Quantity("yaw_error_deg", "yaw error deg", "{:.2f}", True),
+    Quantity("roll_error_deg", "roll error deg", "{:.2f}", True),
+    Quantity("FDR", "FDR", "{:.1%}"),
+    Quantity("ADR", "ADR", "{:.1%}"),
+    Quantity("MD_mm", "MD mm"),
+    Quantity("SD_mm", "SD mm", "{:.1f}"),
+    Quantity("HD_mm", "HD mm"),
+    Quantity("EA_deg", "EA deg"),
+    Quantity("GPE_mm", "GPE mm", "{:.3f}"),
+    Quantity("GLE_mm", "GLE mm", "{:.3f}"),
+    Quantity("LPE_mm", "LPE mm", "{:.4f}"),
+    Quantity("LLE_mm", "LLE mm", "{:.4f}"),
+)
+
+
+def over_sweeps(
+    rows: Sequence[Row], drift: Sequence[Row]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Intervals of every quantity and mode, and every two modes compared in every quantity.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Errors by sweep, part and mode, as in ``study.json``.
+    drift : sequence of mapping
+        Drift by sweep and mode.
+
+    Returns
+    -------
+    intervals : list of dict
+        ``quantity``, ``mode``, ``sweeps``, ``mean`` over sweeps, and ``low`` and ``high`` of its 95 %
+        bootstrap interval, None where there are too few sweeps.
+    paired : list of dict
+        ``quantity``, ``mode``, ``against``, ``sweeps`` that have both, ``difference`` (mean of mode less
+        against), ``low``, ``high``, ``wilcoxon_p``, ``holm_p``, and ``better``: the mode with less error,
+        None where they are not told apart.
+    """
+    intervals: list[dict[str, Any]] = []
+    paired: list[dict[str, Any]] = []
+    for quantity in QUANTITIES:
+        values = _by_mode(quantity, rows, drift)
+        for mode, each in values.items():
+            found = mean_interval(each)
+            named = {"quantity": quantity.key, "mode": mode, "sweeps": found.sweeps}
+            intervals.append(named | {"mean": found.mean, "low": found.low, "high": found.high})
+        paired += _pairs(quantity, values)
+    return intervals, paired
+
+
+def told_apart(paired: Sequence[Row], quantity: str, one: str, other: str) -> bool:
+    """Whether a study tells two modes apart in a quantity."""
+    return any(
+        row["quantity"] == quantity and {row["mode"], row["against"]} == {one, other} and row["better"]
+        for row in paired
+    )
+
+
+def overall_text(intervals: Sequence[Row], paired: Sequence[Row]) -> str:
+    """Compact table of means and intervals, then the modes that are told apart; empty without any sweep."""
+    if not intervals:
+        return ""
+    modes = list(dict.fromkeys(row["mode"] for row in intervals))
+    sweeps = max(row["sweeps"] for row in intervals)
+    lines = [[f"mean of {sweeps} sweep{'s' * (sweeps != 1)}", *modes]]
+    for quantity in QUANTITIES:
+        cells = {row["mode"]: _cell(quantity, row) for row in intervals if row["quantity"] == quantity.key}
+        if cells:
+            lines.append([quantity.words, *(cells.get(mode, "-") for mode in modes)])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    lines.insert(1, ["-" * width for width in widths])
+    table = [
+        "  ".join(
+            cell.rjust(width) if i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+    return "\n".join(table + _told(intervals, paired)) + "\n"
+
+
+def _by_mode(quantity: Quantity, rows: Sequence[Row], drift: Sequence[Row]) -> dict[str, FloatArray]:
+    """One value per sweep, NaN where a mode has none; modes without any are left out."""
+    held = rows if quantity.signed_parts else drift
+    sweeps, modes = (list(dict.fromkeys(row[key] for row in held)) for key in ("sweep", "mode"))
+    found: dict[str, FloatArray] = {}
+    for mode in modes:
+        mine = [row for row in held if row["mode"] == mode]
+        values = np.array([_of_sweep(quantity, [row for row in mine if row["sweep"] == s]) for s in sweeps])
+        if np.isfinite(values).any():
+            found[mode] = values
+    return found
+
+
+def _of_sweep(quantity: Quantity, rows: Sequence[Row]) -> float:
+    values = np.array([row.get(quantity.key) for row in rows], dtype=float)
+    values = np.abs(values[np.isfinite(values)])
+    return float(values.mean()) if values.size else float("nan")
+
+
+def _pairs(quantity: Quantity, values: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for one, other in combinations(values, 2):
+        if not np.isfinite(values[one] - values[other]).any():
+            continue
+        found = paired_comparison(values[one], values[other])
+        of = found.difference
+        row = {"quantity": quantity.key, "mode": one, "against": other, "sweeps": of.sweeps}
+        rows.append(row | {"difference": of.mean, "low": of.low, "high": of.high,
+                           "wilcoxon_p": found.wilcoxon_p})  # fmt: skip
+    for row, corrected in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):
+        row["holm_p"], row["better"] = corrected, _better(row, corrected)
+    return rows
+
+
+def _better(row: Row, holm_p: float | None) -> str | None:
+    low, high = row["low"], row["high"]
+    if low is None or high is None or holm_p is None or holm_p > LEVEL or low <= 0 <= high:
+        return None
+    return str(row["mode"] if high < 0 else row["against"])
+
+
+def _cell(quantity: Quantity, row: Row) -> str:
+    mean = quantity.shown(row["mean"])
+    if row["low"] is None:
+        return mean
+    return f"{mean} [{quantity.shown(row['low'])}, {quantity.shown(row['high'])}]"
+
+
+def _told(intervals: Sequence[Row], paired: Sequence[Row]) -> list[str]:
+    lines = []
+    if any(row["low"] is not None for row in intervals):
+        lines.append("[..]: 95 % interval over sweeps, by bootstrap")
+    for quantity in QUANTITIES:
+        apart = [_pair_words(row) for row in paired if row["quantity"] == quantity.key and row["better"]]
+        if apart:
+            lines.append(f"told apart in {quantity.words}: {'; '.join(apart)}")
+    if paired and not any(row["better"] for row in paired):
+        lines.append("no two modes are told apart by these sweeps")
+    return lines
+
+
+def _pair_words(row: Row) -> str:
+    worse = row["against"] if row["better"] == row["mode"] else row["mode"]
+    return f"{row['better']} better than {worse} (p {row['holm_p']:.2g})"

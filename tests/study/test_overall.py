@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+
+from speckle3d.study.overall import over_sweeps, overall_text, told_apart
+from speckle3d.study.statistics import holm, mean_interval
+
+
+def study(sweeps, gain=3.0, seed=3):
+    """Rows of `sweeps` sweeps of two parts: `pose` is better than `image` by `gain` % in every one of them.
+
+    `twin` is `image` with errors of the other sign and a little scatter.
+    """
+    rng = np.random.default_rng(seed)
+    rows, drift = [], []
+    for i in range(sweeps):
+        base = 10.0 + rng.uniform(-4.0, 4.0)
+        errors = {
+            "image": base,
+            "twin": base + rng.normal(0.0, 0.5),
+            "pose": base - gain + rng.normal(0.0, 0.3),
+        }
+        for mode, error in errors.items():
+            sign = -1.0 if mode == "twin" else 1.0
+            for part, share in (("f", 0.5), ("r", -1.5)):
+                rows.append(
+                    {"sweep": f"s{i}", "part": part, "mode": mode, "length_error_mm": 0.1,
+                     "length_error_percent": sign * share * error,
+                     "tilt_error_deg": float("nan"), "yaw_error_deg": 0.0,
+                     "roll_error_deg": 0.0}
+                )  # fmt: skip
+            drift.append({"sweep": f"s{i}", "mode": mode, "FDR": 0.01 * error, "GPE_mm": 0.1, "GLE_mm": None})
+    return rows, drift
+
+
+def of(records, quantity, *modes):
+    (found,) = [
+        r
+        for r in records
+        if r["quantity"] == quantity and (r["mode"], r.get("against"))[: len(modes)] == modes
+    ]
+    return found
+
+
+def test_one_number_per_sweep_is_the_mean_magnitude_of_its_parts():
+    rows, drift = study(11)
+    intervals, _ = over_sweeps(rows, drift)
+    found = of(intervals, "length_error_percent", "image")
+    by_sweep = [
+        np.mean(
+            [abs(r["length_error_percent"]) for r in rows if r["sweep"] == f"s{i}" and r["mode"] == "image"]
+        )
+        for i in range(11)
+    ]
+    expected = mean_interval(by_sweep)
+    assert (found["sweeps"], found["mean"], found["low"], found["high"]) == (
+        11, pytest.approx(expected.mean), expected.low, expected.high,
+    )  # fmt: skip
+    assert expected.low < expected.mean < expected.high
+    assert of(intervals, "FDR", "image")["mean"] == pytest.approx(0.01 * expected.mean)
+    # Quantities without a value are left out, those without scatter have no interval.
+    assert {r["quantity"] for r in intervals} & {"tilt_error_deg", "GLE_mm", "MD_mm"} == set()
+    assert of(intervals, "GPE_mm", "pose")["low"] is None
+
+
+def test_modes_that_differ_in_every_sweep_are_told_apart_and_like_ones_not():
+    _, paired = over_sweeps(*study(11))
+    found = of(paired, "length_error_percent", "image", "pose")
+    assert (found["better"], found["sweeps"]) == ("pose", 11)
+    assert 2.5 < found["low"] < found["difference"] < found["high"] < 3.5
+    # All eleven signs alike: 2 of 2**11 assignments; the smallest of three p values counts three times.
+    assert found["wilcoxon_p"] == pytest.approx(2 / 2**11)
+    assert found["holm_p"] >= 2 * found["wilcoxon_p"]
+    assert of(paired, "length_error_percent", "image", "twin")["better"] is None
+    assert told_apart(paired, "FDR", "pose", "image")
+    assert not told_apart(paired, "FDR", "twin", "image")
+
+
+def test_few_sweeps_tell_nothing_apart_though_all_agree():
+    for sweeps in (1, 2, 4, 5):
+        _, paired = over_sweeps(*study(sweeps))
+        assert {row["better"] for row in paired} == {None}
+    text = overall_text(*over_sweeps(*study(4)))
+    assert text.splitlines()[0].startswith("mean of 4 sweeps")
+    assert "no two modes are told apart" in text
+
+
+def test_the_text_is_compact_and_says_who_is_better():
+    intervals, paired = over_sweeps(*study(11))
+    lines = overall_text(intervals, paired).splitlines()
+    assert lines[0].split() == ["mean", "of", "11", "sweeps", "image", "twin", "pose"]
+    (fdr,) = [line for line in lines if line.startswith("FDR")]
+    found = of(intervals, "FDR", "pose")
+    assert f"{found['mean']:.1%} [{found['low']:.1%}, {found['high']:.1%}]" in fdr
+    (apart,) = [line for line in lines if line.startswith("told apart in FDR")]
+    assert "pose better than image (p 0.0029)" in apart
+    assert "twin better" not in apart
+    assert max(len(line) for line in lines) <= 110
+    assert overall_text([], []) == ""
+
+
+def test_a_mode_that_only_some_sweeps_have_is_compared_on_those():
+    rows, drift = study(8)
+    rows = [row for row in rows if not (row["mode"] == "pose" and row["sweep"] in ("s0", "s1"))]
+    intervals, paired = over_sweeps(rows, drift)
+    assert of(intervals, "length_error_percent", "pose")["sweeps"] == 6
+    assert of(paired, "length_error_percent", "image", "pose")["sweeps"] == 6
+
+
+def test_holms_correction_by_hand():
+    assert holm([0.01, None, 0.04, 0.03]) == [
+        pytest.approx(0.03),
+        None,
+        pytest.approx(0.06),
+        pytest.approx(0.06),
+    ]
+    assert holm([0.6, 0.9]) == [1.0, 1.0]
+    assert holm([]) == []
