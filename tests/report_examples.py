@@ -42,8 +42,10 @@ def small_study(folder, curves_file):
         ],
         "rows": rows,
         "drift": [{"sweep": "forward", "mode": "image", "FDR": 0.1234, "GPE_mm": 0.5, "EA_deg": None}],
-        "intervals": [{"mode": "pose", "quantity": "length_error_percent", "low": 0.5, "high": 1.5}],
-        "paired": [],
+        "intervals": [{"mode": "pose", "quantity": "length_error_percent", "sweeps": 2, "mean": 0.987,
+                       "low": 0.5, "high": 1.5}],
+        "paired": [{"mode": "image", "against": "pose", "quantity": "FDR", "sweeps": 2, "difference": 0.111,
+                    "low": 0.021, "high": 0.2, "wilcoxon_p": 0.01, "holm_p": 0.03, "better": "pose"}],
     }  # fmt: skip
     (folder / "study.json").write_text(json.dumps(study), encoding="utf-8")
     return folder

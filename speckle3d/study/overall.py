@@ -93,10 +93,12 @@ def over_sweeps(
     return intervals, paired
 
 
-def told_apart(paired: Sequence[Row], quantity: str, one: str, other: str) -> bool:
-    """Whether a study tells two modes apart in a quantity."""
+def beats(paired: Sequence[Row], quantity: str, mode: str, other: str) -> bool:
+    """Whether a study tells that a mode has less error than another in a quantity."""
     return any(
-        row["quantity"] == quantity and {row["mode"], row["against"]} == {one, other} and row["better"]
+        row["quantity"] == quantity
+        and {row["mode"], row["against"]} == {mode, other}
+        and row["better"] == mode
         for row in paired
     )
 

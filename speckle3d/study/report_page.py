@@ -138,6 +138,17 @@ def records_table(records: Sequence[Mapping[str, Any]], anchors: Mapping[str, st
     return _table(keys, lines, {key for record in records for key, v in record.items() if isinstance(v, str)})
 
 
+def plain_table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Words by line as a table, the first column's to the left; cells are HTML already."""
+    rows = [
+        "<tr>"
+        + "".join(f'<td class="{"" if i else "word"}">{cell}</td>' for i, cell in enumerate(line))
+        + "</tr>"
+        for line in lines
+    ]
+    return _table([escape(head) for head in heads], rows, [escape(heads[0])]) if lines else ""
+
+
 def paragraphs(lines: Sequence[str], style: str = "") -> str:
     """Lines of plain text as paragraphs."""
     return "".join(

@@ -11,12 +11,13 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.study.report import summary_lines, write_report
+from speckle3d.study.report import write_report
 from speckle3d.study.report_data import SweepCurves, load_view, read_study, rejected_patches
 from speckle3d.study.report_figures import MOST_POINTS, decimated, outline, patch_size
 from speckle3d.study.report_images import cut_modes
 from speckle3d.study.report_page import heading_of, records_table
 from speckle3d.study.report_plots import plot_curves, plot_rejected
+from speckle3d.study.report_statistics import intervals_table, paired_table, summary_lines
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +175,45 @@ def test_the_best_in_length_and_the_best_in_tilt_may_differ():
     )
     assert "against 4.0 % with image-based" in length
     assert tilt.startswith("In tilt image-based is closest")
+
+
+def pairs(quantity, *told):
+    """Three modes compared in a quantity; `told` are the pairs that are told apart."""
+    modes = ("image", "orientation", "pose")
+    return [
+        {"quantity": quantity, "mode": a, "against": b, "better": b if (a, b) in told else None,
+         "difference": 1.0, "low": -0.5, "high": 2.5}
+        for i, a in enumerate(modes) for b in modes[i + 1 :]
+    ]  # fmt: skip
+
+
+def test_the_lead_says_where_the_best_is_not_told_apart():
+    three = means(image=4.0, orientation=3.0, pose=2.0)
+    unsure, _ = summary_lines(three, scored(), 2, 0, pairs("length_error_percent"))
+    assert "six DOF correction has the smallest error" in unsure
+    assert unsure.endswith(
+        "not told apart from the other modes by these sweeps: the difference may be chance."
+    )
+    some = pairs("length_error_percent", ("image", "pose"))
+    half, tilt = summary_lines(three, scored(), 2, 0, some)
+    assert half.endswith("It is not told apart from orientation correction: that difference may be chance.")
+    assert "not told apart" in tilt
+    every = pairs("length_error_percent", ("image", "pose"), ("orientation", "pose"))
+    sure, _ = summary_lines(three, scored(), 2, 0, every)
+    assert sure.endswith("The sweeps tell it apart from every other mode.")
+    two, _ = summary_lines(means(image=4.0, pose=2.0), scored(), 2, 0, [])
+    assert "not told apart from image-based by these sweeps" in two
+
+
+def test_means_and_differences_over_sweeps_are_tables(page):
+    words = " ".join(page.words)
+    assert "1.0 (0.5 to 1.5)" in words
+    assert "+11.1% (+2.1% to +20.0%)" in words
+    assert "image-based − six DOF correction" in words
+    table = paired_table(pairs("FDR", ("image", "pose")))
+    assert table.count("<b>") == 1
+    assert "−50.0%" in table
+    assert intervals_table([]) == ""
 
 
 @pytest.mark.parametrize(
