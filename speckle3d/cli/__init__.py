@@ -20,6 +20,7 @@ from speckle3d.cli import (
     phantoms,
     reconstruction,
     repeatability,
+    trajectory,
 )
 from speckle3d.cli.common import app, calibrate
 from speckle3d.core.errors import Speckle3DError
@@ -37,6 +38,7 @@ __all__ = [
     "phantoms",
     "reconstruction",
     "repeatability",
+    "trajectory",
 ]
 
 _STOPPED = 130

@@ -1,0 +1,91 @@
+"""Trajectories as text, and one trajectory scored against another."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from speckle3d.cli.common import Json, app, emit, note
+
+if TYPE_CHECKING:
+    from speckle3d.io.tum import LengthUnit
+
+trajectory = typer.Typer(help="Trajectories as TUM text, and scores of them.", no_args_is_help=True)
+app.add_typer(trajectory, name="trajectory")
+
+Unit = Annotated[str, typer.Option("--length-unit", help="m or mm: of TUM text.")]
+
+_LABELS = (
+    ("FDR", "final drift rate (FDR)", "{:.2%}"),
+    ("ADR", "average drift rate (ADR)", "{:.2%}"),
+    ("MD_mm", "maximum drift (MD)", "{:.4f} mm"),
+    ("SD_mm", "sum of drift (SD)", "{:.3f} mm"),
+    ("HD_mm", "Hausdorff distance (HD)", "{:.4f} mm"),
+    ("EA_deg", "error of angle (EA)", "{:.4f} deg"),
+    ("GPE_mm", "global pixel error (GPE)", "{:.4f} mm"),
+    ("GLE_mm", "global landmark error (GLE)", "{:.4f} mm"),
+    ("LPE_mm", "local pixel error (LPE)", "{:.4f} mm"),
+    ("LLE_mm", "local landmark error (LLE)", "{:.4f} mm"),
+    ("score", "TUS-REC score, 2025", "{:.3f}"),
+)
+
+
+@trajectory.command()
+def export(
+    reconstruction_file: Annotated[Path, typer.Argument(metavar="RECONSTRUCTION")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Text file to write.")],
+    mode: Annotated[str, typer.Option(help="image, orientation, pose: which poses to use.")] = "image",
+    length_unit: Unit = "m",
+) -> None:
+    """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""
+    from speckle3d.io.tum import write_tum
+    from speckle3d.study.trajectories import load_reconstructed
+
+    unit = cast("LengthUnit", length_unit)
+    held = load_reconstructed(reconstruction_file, mode)
+    write_tum(out, held.time_s, held.poses, unit)
+
+
+@trajectory.command()
+def score(
+    estimate_file: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="TUM text or reconstruction.")],
+    reference_file: Annotated[
+        Path, typer.Argument(metavar="REFERENCE", help="TUM text, sweep, TUS-REC scan or reconstruction.")
+    ],
+    mode: Annotated[str, typer.Option(help="image, orientation, pose: of a reconstruction.")] = "image",
+    reference: Annotated[str | None, typer.Option(help="tracker or truth: of a sweep.")] = None,
+    length_unit: Unit = "m",
+    as_json: Json = False,
+) -> None:
+    """Score a trajectory: pose errors as evo has them, drift rates, displacement of pixels and landmarks."""
+    from speckle3d.study.summary import plain
+    from speckle3d.study.trajectories import compare_trajectories, load_estimate, load_reference
+
+    unit = cast("LengthUnit", length_unit)
+    estimate = load_estimate(estimate_file, mode, unit)
+    found = compare_trajectories(estimate, load_reference(reference_file, reference, mode, unit))
+    if as_json:
+        emit(json.dumps(plain(found), indent=2, allow_nan=False))
+        return
+    for line in _lines(found):
+        emit(line)
+    if found["left_out"]:
+        note(f"{found['left_out']} poses of {estimate.name} have no reference and were left out")
+    if found["GPE_mm"] is None:
+        note("neither file tells of images: drift is that of the poses' origin, and no pixels were scored")
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    rows = [("poses", str(found["poses"]))]
+    for name, words in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
+        each = found[name]
+        rows += [
+            (f"{words}, RMS", f"{each.rmse_mm:.4f} mm, {each.rmse_deg:.4f} deg"),
+            (f"{words}, largest", f"{each.max_mm:.4f} mm, {each.max_deg:.4f} deg"),
+        ]
+    rows += [(words, form.format(found[key])) for key, words, form in _LABELS if found[key] is not None]
+    width = max(len(words) for words, _ in rows)
+    return [f"{words.ljust(width)}  {value}" for words, value in rows]

@@ -1,0 +1,85 @@
+import json
+
+import challenge_examples as examples
+import numpy as np
+import pytest
+from drifting import drifted
+
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.tum import read_tum, write_tum
+
+
+def test_what_is_exported_is_read_back(run, reconstructed, tmp_path):
+    for unit in ("m", "mm"):
+        options = ("--mode", "pose", "--length-unit", unit)
+        code, out, err = run("trajectory", "export", reconstructed / "reconstruction.h5", "-o",
+                             tmp_path / "pose.tum", *options)  # fmt: skip
+        assert (code, out) == (0, ""), err
+        back = read_tum(tmp_path / "pose.tum", unit)
+        held = read_reconstruction(reconstructed / "reconstruction.h5")
+        np.testing.assert_array_equal(back.time_s, held.frame_time_s)
+        expected = held.poses["pose"].as_matrix()
+        np.testing.assert_allclose(back.world_from_sensor.as_matrix(), expected, rtol=0, atol=1e-9)
+
+
+def test_a_reconstruction_is_scored_as_its_exported_text_is(run, bench, reconstructed, tmp_path):
+    run("trajectory", "export", reconstructed / "reconstruction.h5", "-o", tmp_path / "image.tum")
+    found = []
+    for estimate in (reconstructed / "reconstruction.h5", tmp_path / "image.tum"):
+        code, out, err = run("trajectory", "score", estimate, bench / "sweep.h5", "--json")
+        assert code == 0, err
+        found.append(json.loads(out))
+    numbers = ("FDR", "ADR", "MD_mm", "SD_mm", "HD_mm", "EA_deg", "GPE_mm", "LPE_mm")
+    assert [found[0][n] for n in numbers] == pytest.approx([found[1][n] for n in numbers], abs=1e-9)
+    assert found[0]["APE"] == pytest.approx(found[1]["APE"], abs=1e-9)
+    assert found[0]["reference"] == "sweep.h5, truth"
+    assert (found[0]["poses"], found[0]["GLE_mm"]) == (24, None)
+
+
+def test_scores_are_printed(run, bench, reconstructed, tmp_path):
+    code, out, err = run("trajectory", "score", reconstructed / "reconstruction.h5", bench / "sweep.h5")
+    assert code == 0, err
+    assert out.splitlines()[0].split() == ["poses", "24"]
+    assert "final drift rate (FDR)" in out
+    assert "global pixel error (GPE)" in out
+    assert "landmark" not in out
+    run("trajectory", "export", reconstructed / "reconstruction.h5", "-o", tmp_path / "a.tum")
+    code, out, err = run("trajectory", "score", tmp_path / "a.tum", tmp_path / "a.tum")
+    assert code == 0, err
+    assert "no pixels were scored" in err
+    assert "GPE" not in out
+
+
+def test_a_scan_of_the_challenge_is_scored(run, tmp_path):
+    path, *_ = examples.write_data_set(tmp_path)
+    sweep = load_sweep(path)
+    true = sweep.tracker.world_from_image(sweep.frame_time_s)
+    write_tum(tmp_path / "e.tum", sweep.frame_time_s, drifted(true, np.random.default_rng(1)))
+    code, out, err = run("trajectory", "score", tmp_path / "e.tum", path)
+    assert code == 0, err
+    assert "local landmark error (LLE)" in out
+    assert "TUS-REC score, 2025" in out
+    code, out, err = run("info", path)
+    assert (code, "TUS-REC scan" in out) == (0, True), err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("export", "RECONSTRUCTION", "-o", "OUT", "--mode", "sideways"), "expected one of image"),
+        (("export", "RECONSTRUCTION", "-o", "OUT", "--length-unit", "km"), "expected m or mm, got 'km'"),
+        (("export", "SWEEP", "-o", "OUT"), "expected format 'speckle3d.reconstruction'"),
+        (("score", "SWEEP", "SWEEP"), "expected format 'speckle3d.reconstruction'"),
+        (("score", "NONE", "SWEEP"), "expected a file, got none"),
+        (("score", "RECONSTRUCTION", "SWEEP", "--reference", "guess"), "expected a reference among"),
+    ],
+)
+def test_a_wrong_option_is_one_line(refused, bench, reconstructed, tmp_path, arguments, message):
+    places = {
+        "RECONSTRUCTION": reconstructed / "reconstruction.h5",
+        "SWEEP": bench / "sweep.h5",
+        "OUT": tmp_path / "out.tum",
+        "NONE": tmp_path / "none.tum",
+    }
+    assert message in refused("trajectory", *(places.get(each, each) for each in arguments))
