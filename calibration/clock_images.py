@@ -23,6 +23,7 @@ from scipy.signal import savgol_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.clock import SEARCH_S, Delay, require_peak
+from calibration.imagestacks import TrackedImages
 from calibration.pairing import covered
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
@@ -57,12 +58,8 @@ class _Way:
 
 
 def delay_from_images(
-    images: Images,
-    grid: ImageGrid,
-    frame_time_s: FloatArray,
-    readings: TimedPoses,
+    tracked: TrackedImages,
     sensor_from_image: RigidTransform,
-    around_s: float = 0.0,
     search_s: float = SEARCH_S,
     queries: int = FINE,
     progress: Callable[[int, int], None] | None = None,
@@ -71,15 +68,12 @@ def delay_from_images(
 
     Parameters
     ----------
-    images : indexable or callable
-        Grey images by frame number, shape (vector, sample).
-    frame_time_s : ndarray, shape (n,)
-    readings : TimedPoses
-        World from sensor; interpolated by slerp.
+    tracked : TrackedImages
+        A motion forward and back; its readings are interpolated by slerp.
     sensor_from_image : RigidTransform
         Rough is enough.
-    around_s, search_s : float
-        Delays from `around_s` - `search_s` to `around_s` + `search_s` are tried.
+    search_s : float
+        Delays within it of the recording's own are tried.
     queries : int
         Images of each way that place the peak.
 
@@ -91,10 +85,12 @@ def delay_from_images(
     """
     if queries < 2:
         raise InvalidInputError(f"queries: expected at least 2, got {queries}")
+    grid, frame_time_s, readings = tracked.grid, tracked.frame_time_s, tracked.readings
+    around_s = tracked.time_offset_s
     there = np.flatnonzero(covered(readings, frame_time_s, around_s, search_s))
     steady = smoothed(readings, _SMOOTHED_S)
     part = _there_and_back(steady.at(frame_time_s[there] - around_s) * sensor_from_image, grid)
-    pooled = _Pooled(images, grid)
+    pooled = _Pooled(tracked.images, grid)
 
     def likeness(number: int) -> _Likeness:
         ways = tuple(_way(there, each, number) for each in part)

@@ -4,14 +4,26 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, calibrate, emit, note
+from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
 from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+
+if TYPE_CHECKING:
+    from calibration.clock import Delay
+    from speckle3d.core.calibration import Calibration
+
+
+class By(StrEnum):
+    """What shows the delay."""
+
+    line = "line"
+    images = "images"
 
 
 @calibrate.command("clock")
@@ -19,35 +31,85 @@ def calibrate_clock(
     images: Images,
     poses: Poses = None,
     pixel_mm: PixelMm = None,
-    sensor: Annotated[str, typer.Option(help="tracker or orientation.")] = "tracker",
+    by: Annotated[
+        By,
+        typer.Option(
+            help="line: a plane's echo follows the sensor; images: a sweep forward and back over tissue."
+        ),
+    ] = By.line,
+    sensor: Annotated[str, typer.Option(help="line: tracker or orientation.")] = "tracker",
     region: Region = None,
     search_s: Annotated[float, typer.Option(min=0.02, help="Delays to either side of the file's own.")] = 0.5,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration file to copy, with the clock offset that was found.")
+        Path | None,
+        typer.Option(help="Calibration to start from (images), and to copy with the offset that was found."),
     ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--output", help="Where that copy goes.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Find a sensor's clock offset from a plane's line while the probe goes up and down (or rolls)."""
-    from calibration.clock import delay_from_lines, line_signal
-    from speckle3d.cli.recordings import open_recording
+    """Find a sensor's clock offset: a motion forward and back, or up and down (or rolling) over a plane."""
     from speckle3d.io.calibrations import read_calibration, write_calibration
 
-    if (calibration is None) != (out is None):
-        raise InvalidInputError("expected --calibration and -o together, or neither")
+    if out is not None and calibration is None:
+        raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
+    if by is By.line and calibration is not None and out is None:
+        raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     known = None if calibration is None else read_calibration(calibration)
+    if by is By.images:
+        found, frames = _by_images(images, poses, pixel_mm, known, search_s)
+        told = f"images of the two ways correlate by {found.followed:.2f}"
+    else:
+        found, frames = _by_line(images, poses, pixel_mm, sensor, region, search_s)
+        told = f"the sensor explains {100 * found.followed:.0f} % of the line's motion in {frames} frames"
+    if known is not None and out is not None:
+        write_calibration(out, replace(known, time_offset_s=found.seconds))
+        note(f"calibration with this offset in {out}")
+    if as_json:
+        table = {"time_offset_s": found.seconds, "standard_error_s": found.standard_error_s}
+        emit(json.dumps(table | {"followed": found.followed, "frames": frames}, indent=2))
+        return
+    emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
+    emit(told)
+
+
+def _by_line(
+    images: Path,
+    poses: Path | None,
+    pixel_mm: tuple[float, float] | None,
+    sensor: str,
+    region: str | None,
+    search_s: float,
+) -> tuple[Delay, int]:
+    """The delay, and in how many frames a line was found."""
+    from calibration.clock import delay_from_lines, line_signal
+    from speckle3d.cli.recordings import open_recording
+
     recording = open_recording(images, poses, pixel_mm, sensor)
     seen = find_lines(recording, region, images)
     with naming(str(images)):
         signal = line_signal(seen.marks_px, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
         times = recording.frame_time_s[seen.frame]
         found = delay_from_lines(signal, times, recording.readings, recording.time_offset_s, search_s)
-    if known is not None and out is not None:
-        write_calibration(out, replace(known, time_offset_s=found.seconds))
-        note(f"calibration with this offset in {out}")
-    if as_json:
-        table = {"time_offset_s": found.seconds, "standard_error_s": found.standard_error_s}
-        emit(json.dumps(table | {"followed": found.followed, "frames": len(seen.frame)}, indent=2))
-        return
-    emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
-    emit(f"the sensor explains {100 * found.followed:.0f} % of the line's motion in {len(seen.frame)} frames")
+    return found, len(seen.frame)
+
+
+def _by_images(
+    images: Path,
+    poses: Path | None,
+    pixel_mm: tuple[float, float] | None,
+    known: Calibration | None,
+    search_s: float,
+) -> tuple[Delay, int]:
+    """The delay, and how many frames there were."""
+    from calibration.clock_images import delay_from_images
+    from speckle3d.cli.recordings import open_tracked
+
+    tracked, held = open_tracked(images, poses, pixel_mm, None if known is None else known.time_offset_s)
+    mounting = held if known is None else known.sensor_from_image
+    if mounting is None:
+        raise InsufficientDataError(
+            f"{images}: expected --calibration, how the image sits on the sensor, at least roughly; got none"
+        )
+    with progress_bar("trying delays") as progress, naming(str(images)):
+        found = delay_from_images(tracked, mounting, search_s, progress=progress)
+    return found, len(tracked.frame_time_s)

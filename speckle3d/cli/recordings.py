@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
+from calibration.imagestacks import TrackedImages
 from calibration.job import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -43,6 +45,32 @@ def open_recording(
     return Recording(
         pictures, size, grid.first_sample_depth_mm / size[1], sweep.frame_time_s, readings, offset
     )
+
+
+def open_tracked(
+    images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, time_offset_s: float | None = None
+) -> tuple[TrackedImages, RigidTransform | None]:
+    """Open tracked images, and how the file says the image sits on the sensor, if it does.
+
+    Parameters
+    ----------
+    time_offset_s : float, optional
+        In place of the file's own.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there is no tracker.
+    """
+    sweep = _load(images, pixel_mm)
+    readings, offset = (
+        _readings(sweep, images, "tracker") if poses is None else _readings_of(poses, "tracker")
+    )
+    assert isinstance(readings, TimedPoses)
+    pictures, grid = _grey(sweep)
+    offset = offset if time_offset_s is None else time_offset_s
+    mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
+    return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset, images.name), mounting
 
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:

@@ -120,6 +120,21 @@ def test_a_clock_that_is_off_is_found(run, scans, tmp_path):
     assert error_of(out, scans / "bar.h5")[1] < 0.3
 
 
+def test_a_clock_is_found_from_images_forward_and_back(run, refused, scans, tmp_path):
+    sweep, out = tmp_path / "back.h5", tmp_path / "c.h5"
+    options = ("--preset", "reversal", "--vectors", "20", "--samples", "1000", "--length-mm", "10")
+    assert run("simulate", sweep, *options, "--frames", "50", "--seed", "3")[0] == 0
+    code, table, err = run("calibrate", "clock", sweep, "--by", "images", "--search-s", "0.2", "--json")
+    assert code == 0, err
+    told = json.loads(table)
+    # The simulated tracker's latency of 40 ms, its jitter of 0.15 mm, 10 mm/s for a second each way.
+    assert told["time_offset_s"] == pytest.approx(-0.04, abs=0.012)
+    assert told["standard_error_s"] < 0.01
+    # The plane scan's sensors are not calibrated.
+    assert "expected --calibration" in refused("calibrate", "clock", scans / "bar.h5", "--by", "images")
+    assert "expected --calibration" in refused("calibrate", "clock", sweep, "--by", "images", "-o", out)
+
+
 def test_a_clock_offset_that_is_given_is_kept_even_if_zero(run, scans, tmp_path):
     exact, out = tmp_path / "exact.h5", tmp_path / "c.h5"
     exact.write_bytes((scans / "bar.h5").read_bytes())

@@ -1,0 +1,222 @@
+"""Tracked images made ready for comparison: reduced, blurred alike in all directions, thinned along the sweep.
+
+Interpolation smooths, and a similarity rewards what is smooth alike. So both sides of every comparison are
+brought to one resolution first: blurred within the images, and across them by averaging neighbours, coarser
+than speckle and than the distance between images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.images import GreyArray, Images, PosedImages
+
+IntArray = npt.NDArray[np.int64]
+
+BASE_PIXEL_MM = 0.35
+"""Images are reduced to about this: half the finest blur that comparisons use."""
+
+FEWEST_FRAMES = 10
+
+_PIXELS_PER_BLUR = 2.0
+"""Pixels to a standard deviation of the blur: linear interpolation then loses under 2 % of any wave left."""
+
+_SMOOTHED_FRAMES = 3.0
+"""Over how many frames a tracker's jitter is averaged before the way it travelled is measured."""
+
+
+@dataclass(frozen=True)
+class TrackedImages:
+    """Images of one sweep and the readings of the sensor on the probe.
+
+    Parameters
+    ----------
+    images : indexable or callable
+        Grey images by frame number, shape (vector, sample): B-mode, log-compressed; NaN where there is none.
+    grid : ImageGrid
+    frame_time_s : ndarray, shape (n,)
+    readings : TimedPoses
+        World from sensor.
+    time_offset_s : float
+        A reading at t belongs to image time t + `time_offset_s`.
+    name : str
+        For messages.
+    """
+
+    images: Images
+    grid: ImageGrid
+    frame_time_s: FloatArray
+    readings: TimedPoses
+    time_offset_s: float = 0.0
+    name: str = "sweep"
+
+    def covered(self) -> IntArray:
+        """Numbers of the frames that the sensor's readings cover."""
+        return np.flatnonzero(self.readings.covers(self.frame_time_s - self.time_offset_s))
+
+    def world_from_sensor(self, frames: IntArray) -> RigidTransform:
+        """Pose of the sensor at frames by number."""
+        return self.readings.at(self.frame_time_s[frames] - self.time_offset_s)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Images of one resolution with the sensor's pose at each.
+
+    Attributes
+    ----------
+    images : ndarray of float32, shape (n, u, v)
+        NaN where they show nothing.
+    pixels : ndarray, shape (4,)
+        Pixel size along u and v, and where the first pixel's centre lies, mm.
+    world_from_sensor : RigidTransform, length n
+    """
+
+    images: GreyArray
+    pixels: FloatArray
+    world_from_sensor: RigidTransform
+
+    @cached_property
+    def sensor_matrices(self) -> FloatArray:
+        """World from sensor, shape (n, 4, 4)."""
+        return np.asarray(self.world_from_sensor.as_matrix())
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, which: IntArray) -> Stack:
+        return Stack(self.images[which], self.pixels, self.world_from_sensor[which])
+
+    @property
+    def centre_mm(self) -> FloatArray:
+        """The images' centre in the image's frame, shape (3,)."""
+        last = np.array(self.images.shape[1:]) - 1.0
+        return np.append(self.pixels[2:] + last * self.pixels[:2] / 2.0, 0.0)
+
+    def blurred(self, sigma_mm: float) -> Stack:
+        """The same images with a Gaussian over them, on as few pixels as it needs."""
+        sigma = np.append(0.0, sigma_mm / self.pixels[:2])
+        there = np.isfinite(self.images)
+        grey = gaussian_filter(np.where(there, self.images, np.float32(0.0)), sigma, truncate=3.0)
+        weight = gaussian_filter(there.astype(np.float32), sigma, truncate=3.0)
+        # Near a border more than half of the weight must lie on the image.
+        level = np.where(there & (weight > 0.45), grey / np.maximum(weight, np.float32(1e-6)), np.nan)
+        steps = np.maximum(1, np.floor(sigma[1:] / _PIXELS_PER_BLUR + 1e-6)).astype(int)
+        pixels = np.concatenate([self.pixels[:2] * steps, self.pixels[2:]])
+        few = np.ascontiguousarray(level[:, :: steps[0], :: steps[1]], dtype=np.float32)
+        return replace(self, images=few, pixels=pixels)
+
+    def thinned(self, sensor_from_image: RigidTransform, spacing_mm: float, sigma_mm: float) -> Stack:
+        """Gaussian means of neighbouring images and their poses, at equal distances along the sweep.
+
+        Parameters
+        ----------
+        sensor_from_image : RigidTransform
+            About right: says how far the images are apart, and where their centres are held.
+        """
+        to_centre = sensor_from_image * RigidTransform.from_translation(self.centre_mm)
+        centre = self.world_from_sensor * to_centre
+        way = travelled(centre)
+        count = max(2, int(way[-1] / spacing_mm) + 1)
+        knots = np.linspace(way[0], way[-1], count)
+        weight = np.exp(-0.5 * ((way - knots[:, None]) / sigma_mm) ** 2) + 1e-12
+        # A pause is not more of an image: frames count by the way they stand for.
+        weight *= np.maximum(np.gradient(way), 1e-3 * way[-1] / len(way))
+        weight /= weight.sum(axis=1, keepdims=True)
+        turn = Rotation.concatenate([centre.rotation.mean(row) for row in weight])
+        held = RigidTransform.from_components(weight @ centre.translation, turn)
+        return Stack(_weighted(self.images, weight), self.pixels, held * to_centre.inv())
+
+
+def travelled(centre: RigidTransform) -> FloatArray:
+    """Distance travelled along the images' normals up to each image, mm, a tracker's jitter taken out."""
+    place = gaussian_filter1d(centre.translation, _SMOOTHED_FRAMES, axis=0, mode="nearest")
+    normal = centre.rotation.apply([0.0, 0.0, 1.0])
+    steps = np.abs(np.einsum("ij,ij->i", np.diff(place, axis=0), normal[1:]))
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def read_stack(
+    tracked: TrackedImages,
+    pixel_mm: float = BASE_PIXEL_MM,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Stack, IntArray]:
+    """Read a sweep's images, reduced to about `pixel_mm`, and their frame numbers.
+
+    Pixels that never change are not part of the picture (a sector's surroundings, writing): they become NaN.
+
+    Raises
+    ------
+    InsufficientDataError
+        If readings cover too few frames, or no pixel ever changes.
+    """
+    frames = tracked.covered()
+    if len(frames) < FEWEST_FRAMES:
+        raise InsufficientDataError(
+            f"{tracked.name}: expected at least {FEWEST_FRAMES} frames with sensor readings, got {len(frames)}"
+        )
+    grid = tracked.grid
+    source = PosedImages(tracked.images, grid, _every_pose(tracked, frames))
+    size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+    bins = np.minimum(np.maximum(1, np.round(pixel_mm / size)).astype(int), [grid.vectors, grid.samples])
+    shape = (len(frames), grid.vectors // bins[0], grid.samples // bins[1])
+    if min(shape[1:]) < 8:
+        raise InvalidInputError(
+            f"{tracked.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either way, "
+            f"got {shape[1]} x {shape[2]}"
+        )
+    images = np.empty(shape, np.float32)
+    for n, frame in enumerate(frames):
+        images[n] = _binned(source.read(int(frame)), bins, shape[1:])
+        if progress:
+            progress(n + 1, len(frames))
+    still = ~(np.ptp(images, axis=0) > 0)
+    if still.all():
+        raise InsufficientDataError(
+            f"{tracked.name}: expected images that change, got the same in all frames"
+        )
+    images[:, still & ~np.isnan(images).any(axis=0)] = np.nan
+    first = size * (bins - 1) / 2.0 + [0.0, grid.first_sample_depth_mm]
+    return Stack(images, np.concatenate([size * bins, first]), tracked.world_from_sensor(frames)), frames
+
+
+def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
+    """One pose to each image, as the reader asks for; frames without a reading are not read."""
+    known = getattr(tracked.images, "shape", (len(tracked.frame_time_s),))[0]
+    if known != len(tracked.frame_time_s):
+        raise MismatchError(
+            f"{tracked.name}: expected {known} frame times for {known} images, got {len(tracked.frame_time_s)}"
+        )
+    return RigidTransform.identity(len(tracked.frame_time_s))
+
+
+def _binned(image: GreyArray, bins: npt.NDArray[np.int_], shape: tuple[int, int]) -> GreyArray:
+    """Means over blocks of pixels; NaN where any of them is."""
+    whole = image[: shape[0] * bins[0], : shape[1] * bins[1]]
+    blocks = whole.reshape(shape[0], bins[0], shape[1], bins[1])
+    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
+
+
+def _weighted(images: GreyArray, weight: FloatArray) -> GreyArray:
+    """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
+    flat = images.reshape(len(images), -1)
+    there = np.isfinite(flat)
+    share = weight.astype(np.float32)
+    total = share @ np.where(there, flat, np.float32(0.0))
+    if there.all(axis=0).sum() + (~there).all(axis=0).sum() == flat.shape[1]:
+        mean = np.where(there[0], total, np.float32(np.nan))
+    else:
+        seen = share @ there.astype(np.float32)
+        mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
+    return np.asarray(mean.reshape(len(weight), *images.shape[1:]), dtype=np.float32)
