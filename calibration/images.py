@@ -1,0 +1,289 @@
+"""Calibration without a phantom: two crossing sweeps of anything with structure must agree with each other.
+
+Images of each sweep are compared with what the other shows in their place, cut straight from its frames, and
+the calibration is moved until they are as alike as they can be.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging, 2008.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from calibration.crossing import Crossing, Level, Progress, prepare
+from calibration.imagecovariance import covariance_at_origin, point_covariance
+from calibration.imagefit import Estimate, Refined, refine
+from calibration.imagesearch import search
+from calibration.imagestacks import TrackedImages
+from calibration.similarity import Comparison
+from calibration.simplex import climb
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+
+__all__ = [
+    "Crossing",
+    "ImageCalibration",
+    "ImageSettings",
+    "Improvement",
+    "Progress",
+    "TrackedImages",
+    "calibrate_crossing",
+    "calibrate_images",
+    "prepare",
+]
+
+Method = Literal["gauss-newton", "nelder-mead"]
+
+FINE = (Level(1.0), Level(0.7))
+"""Resolutions at which the answer of the search is refined. The last is still coarser than speckle."""
+
+SHOWN_SIGMA_MM = 1.0
+"""Blur at which similarities are reported, in units of the crossing."""
+
+LEAST_SIMILARITY = 0.15
+"""Mean correlation of patches below which the sweeps show nothing in common."""
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """How to calibrate from two crossing sweeps.
+
+    Parameters
+    ----------
+    method : str
+        ``"gauss-newton"``, or ``"nelder-mead"`` as published.
+    scales : bool
+        Estimate the two pixel sizes too.
+    capture_mm, capture_deg : float
+        How far each parameter of the start may be off; with zero both, the start is only refined.
+        The published method has no such range.
+    threads : int
+    """
+
+    method: Method = "gauss-newton"
+    scales: bool = False
+    capture_mm: float = 20.0
+    capture_deg: float = 20.0
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(Method):
+            raise InvalidInputError(
+                f"method: expected one of {', '.join(get_args(Method))}, got {self.method!r}"
+            )
+        for name, most in (("capture_mm", 100.0), ("capture_deg", 90.0)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= most:
+                raise InvalidInputError(f"{name}: expected 0 to {most:g}, got {value}")
+        if self.threads < 1:
+            raise InvalidInputError(f"threads: expected at least 1, got {self.threads}")
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """Mean correlation of images with cuts of the other sweep, at the start and at the answer.
+
+    NaN where the sweeps overlap in no image by three tenths.
+    """
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class ImageCalibration:
+    """Where the image is on the sensor, found from two crossing sweeps.
+
+    Attributes
+    ----------
+    sensor_from_image : RigidTransform
+    scales, scale_errors : ndarray, shape (2,)
+        Factors on the pixel sizes across and along the beams, and their standard errors; one and zero
+        where they were not estimated.
+    covariance : ndarray, shape (6, 6)
+        Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
+        then displacements along them in mm. From how the answer changes when one part of the scanned tissue
+        after another is left out, so it knows of speckle, reflections and jitter; not of an error that all of
+        the tissue shares, such as an uncorrected delay of the sensor. Where that leaves fewer than two parts,
+        infinite.
+    condition_number : float
+        Of the normal matrix's root with columns scaled to unit norm; a large one means that the sweeps leave
+        some motion of the image undetermined.
+    weakest : str
+        The parameter that makes up most of the least determined direction.
+    similarity, held_out : Improvement
+        Of images that were compared, and of frames that were left out of everything.
+    frames_used, frames_held_out : tuple of ndarray of int
+        Frame numbers in either sweep.
+    evaluations : int
+        How many times the sweeps were compared.
+    """
+
+    method: Method
+    start: RigidTransform
+    sensor_from_image: RigidTransform
+    scales: FloatArray
+    scale_errors: FloatArray
+    pixel_mm: FloatArray
+    covariance: FloatArray
+    condition_number: float
+    weakest: str
+    similarity: Improvement
+    held_out: Improvement
+    frames_used: tuple[tuple[int, ...], tuple[int, ...]]
+    frames_held_out: tuple[tuple[int, ...], tuple[int, ...]]
+    evaluations: int
+    converged: bool
+
+    def covariance_of(self, point_mm: FloatArray) -> FloatArray:
+        """Covariance of where a point of the image lies, along the image's axes, shape (3, 3), mm^2."""
+        return point_covariance(self.covariance, point_mm)
+
+
+def calibrate_images(
+    first: TrackedImages,
+    second: TrackedImages,
+    start: RigidTransform,
+    settings: ImageSettings | None = None,
+    progress: Progress | None = None,
+) -> ImageCalibration:
+    """Find where the image is on the sensor from two crossing sweeps.
+
+    Parameters
+    ----------
+    start : RigidTransform
+        A guess of sensor from image: a ruler's, or an old calibration.
+    progress : callable, optional
+        Called with the stage, and how many of how many of its steps are done.
+
+    Raises
+    ------
+    InvalidInputError, MismatchError
+        If the images, grids and start are not what they must be.
+    InsufficientDataError
+        If there are too few frames, or the sweeps do not overlap or have nothing in common.
+    """
+    return calibrate_crossing(prepare(first, second, progress), start, settings, progress)
+
+
+def calibrate_crossing(
+    crossing: Crossing,
+    start: RigidTransform,
+    settings: ImageSettings | None = None,
+    progress: Progress | None = None,
+) -> ImageCalibration:
+    """Calibrate from sweeps that are prepared already: `calibrate_images` for many starts."""
+    if not start.single:
+        raise InvalidInputError("start: expected a single transform, got a row of them")
+    chosen = settings or ImageSettings()
+    first = Estimate(start, np.ones(2))
+    with ThreadPoolExecutor(chosen.threads) as pool:
+        if chosen.method == "nelder-mead":
+            climbed = climb(crossing, first, chosen.scales, pool, progress)
+            found, evaluations, converged = climbed.estimate, climbed.evaluations, climbed.converged
+            refined = _look(crossing, found, chosen, pool)
+        else:
+            found, looks = _within_reach(crossing, first, chosen, pool, progress)
+            refined, steps = _refined(crossing, found, chosen, pool, progress)
+            found, evaluations, converged = refined.estimate, looks + steps, refined.converged
+    _require_alike(refined)
+    return _result(crossing, chosen, first, found, refined, evaluations, converged)
+
+
+def _within_reach(
+    crossing: Crossing,
+    first: Estimate,
+    settings: ImageSettings,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None,
+) -> tuple[Estimate, int]:
+    if settings.capture_mm == 0.0 and settings.capture_deg == 0.0:
+        return first, 0
+    reach = np.deg2rad(settings.capture_deg)
+    found = search(crossing, first, settings.capture_mm, float(reach), pool, progress)
+    return found.estimate, found.evaluations
+
+
+def _refined(
+    crossing: Crossing,
+    found: Estimate,
+    settings: ImageSettings,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None,
+) -> tuple[Refined, int]:
+    evaluations = 0
+    for number, level in enumerate(FINE):
+        refined = refine(crossing.level(level, found.sensor_from_image), found, _free(settings), pool=pool)
+        found, evaluations = refined.estimate, evaluations + refined.evaluations
+        if progress:
+            progress("refining", number + 1, len(FINE))
+    return refined, evaluations
+
+
+def _look(crossing: Crossing, found: Estimate, settings: ImageSettings, pool: ThreadPoolExecutor) -> Refined:
+    """The derivatives at an answer that was found without them."""
+    comparison = crossing.level(FINE[-1], found.sensor_from_image)
+    return refine(comparison, found, _free(settings), max_steps=1, pool=pool)
+
+
+def _free(settings: ImageSettings) -> tuple[int, ...]:
+    return tuple(range(8 if settings.scales else 6))
+
+
+def _require_alike(refined: Refined) -> None:
+    mean = refined.likeness.mean
+    if not mean >= LEAST_SIMILARITY:
+        got = "no overlap" if np.isnan(mean) else f"a correlation of {mean:.2f} at best"
+        raise InsufficientDataError(
+            f"expected sweeps that show the same structure (a correlation of at least {LEAST_SIMILARITY:g}), "
+            f"got {got}"
+        )
+
+
+def _result(
+    crossing: Crossing,
+    settings: ImageSettings,
+    first: Estimate,
+    found: Estimate,
+    refined: Refined,
+    evaluations: int,
+    converged: bool,
+) -> ImageCalibration:
+    spread = covariance_at_origin(crossing, refined)
+    near = found.sensor_from_image
+    shown = crossing.whole(SHOWN_SIGMA_MM, 10, near), crossing.check(SHOWN_SIGMA_MM, near)
+    return ImageCalibration(
+        method=settings.method,
+        start=first.sensor_from_image,
+        sensor_from_image=near,
+        scales=found.scales,
+        scale_errors=np.sqrt(np.diag(spread.covariance)[6:8]),
+        pixel_mm=crossing.pixel_mm * found.scales,
+        covariance=spread.covariance[:6, :6],
+        condition_number=spread.condition_number,
+        weakest=spread.weakest,
+        similarity=_improvement(shown[0], first, found),
+        held_out=_improvement(shown[1], first, found),
+        frames_used=_numbers(crossing.frames_used),
+        frames_held_out=_numbers(crossing.frames_held_out),
+        evaluations=evaluations,
+        converged=converged,
+    )
+
+
+def _improvement(comparison: Comparison, first: Estimate, found: Estimate) -> Improvement:
+    before, after = (comparison.at(one.sensor_from_image, one.scales).mean for one in (first, found))
+    return Improvement(before, after)
+
+
+def _numbers(frames: tuple[np.ndarray, np.ndarray]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    a, b = (tuple(int(n) for n in row) for row in frames)
+    return a, b

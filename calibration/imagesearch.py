@@ -1,0 +1,121 @@
+"""From a start far off into the reach of Gauss-Newton: many cheap looks, the best followed up, fewer each time."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import qmc
+
+from calibration.crossing import Crossing, Level, Progress
+from calibration.imagefit import Estimate, Refined, refine
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import FloatArray
+
+GLANCE = Level(4.0, images=6, side=5, overlap=0.0)
+FOLLOWED = Level(3.0, images=8, side=5)
+COMPARED = Level(2.0, images=8)
+
+_GLANCES = 1024
+"""Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
+once, but slopes that lead to it start much farther out."""
+
+_FOLLOWED, _COMPARED = 20, 5
+
+_STEPS = 12
+
+_SAME_MM = 1.5
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the search ended, and in how many comparisons."""
+
+    estimate: Estimate
+    evaluations: int
+
+
+def search(
+    crossing: Crossing,
+    start: Estimate,
+    capture_mm: float,
+    capture_rad: float,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None = None,
+) -> Found:
+    """Look all over a box of six parameters about the start.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the sweeps show nothing in common anywhere.
+    """
+    say = progress or _silent
+    first = start.sensor_from_image
+    places = _spread(first, crossing.centre_mm, capture_mm, capture_rad)
+    glance = crossing.level(GLANCE, first)
+    scores = np.empty(len(places))
+    for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
+        scores[n] = score
+        say("looking around", n + 1, len(places))
+    best = [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:_FOLLOWED] if scores[n] > -1]
+    if not best:
+        raise InsufficientDataError(
+            f"expected sweeps that overlap within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees of "
+            "the start, got no overlap anywhere"
+        )
+    followed = _refined(crossing, FOLLOWED, best, pool, say, "following up")
+    apart = _distinct([one.estimate for one in followed], crossing.centre_mm)[:_COMPARED]
+    compared = _refined(crossing, COMPARED, apart, pool, say, "comparing")
+    looks = len(places) + sum(one.evaluations for one in followed + compared)
+    return Found(compared[0].estimate, looks)
+
+
+def _spread(
+    first: RigidTransform, pivot_mm: FloatArray, capture_mm: float, capture_rad: float
+) -> list[RigidTransform]:
+    """The start, and places spread evenly from which an increment within the box leads to it."""
+    places = 2.0 * qmc.Sobol(6, rng=1).random(_GLANCES) - 1.0
+    places[0] = 0.0
+    turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
+    away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
+    return list(first * away.inv())
+
+
+def _refined(
+    crossing: Crossing,
+    level: Level,
+    starts: list[Estimate],
+    pool: ThreadPoolExecutor,
+    say: Progress,
+    stage: str,
+) -> list[Refined]:
+    """Refine each, best first."""
+    comparison = crossing.level(level, starts[0].sensor_from_image)
+    done = []
+    for one in pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
+        done.append(one)
+        say(stage, len(done), len(starts))
+    return sorted(done, key=lambda one: -one.likeness.score)
+
+
+def _distinct(estimates: list[Estimate], centre_mm: FloatArray) -> list[Estimate]:
+    """Leave out those that came to the same place as a better one."""
+    kept: list[Estimate] = []
+    for one in estimates:
+        if all(_apart(one, other, centre_mm) > _SAME_MM for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _apart(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
+    """Distance, mm: of the centre, and of what turns about it 20 mm away."""
+    step = other.sensor_from_image.inv() * one.sensor_from_image
+    moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))
+    return float(np.hypot(moved, 20.0 * step.rotation.magnitude()))
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass
