@@ -7,18 +7,21 @@ import threading
 import time
 from dataclasses import replace
 
+import challenge_examples
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.job import Reference
+from speckle3d.study.points import landmark_errors
 from speckle3d.study.schedulers import OnCluster, local_cluster
 from speckle3d.study.scoring import drift_rows
 from speckle3d.study.sweepjob import SweepOutcome, plan_sweep, run_sweep
@@ -201,6 +204,33 @@ def test_drift_of_a_uniform_stretch(sweeps):
     expected = {"FDR": 0.05, "ADR": 0.05, "MD_mm": 1.0, "SD_mm": 20.5, "HD_mm": 1.0, "EA_deg": 0.0}
     expected |= {"GPE_mm": 0.5125, "LPE_mm": 0.025}
     assert {name: row[name] for name in expected} == pytest.approx(expected, abs=1e-9)
+
+
+def test_landmarks_that_come_with_a_sweep_are_scored(sweeps, tmp_path, monkeypatch):
+    marks = Landmarks(np.array([3, 20]), np.array([[1.0, 2.0, 0.0], [4.0, 8.0, 0.0]]))
+    monkeypatch.setattr("speckle3d.study.sweepjob.load_landmarks", lambda path: marks)
+    found = compare_sweeps(sweeps[:1], tmp_path, ["pose"])
+    sweep = load_sweep(sweeps[0])
+    (entry,) = held(tmp_path)["sweeps"]
+    poses = read_reconstruction(tmp_path / entry["folder"] / "reconstruction.h5").poses["pose"]
+    expected = landmark_errors(poses, sweep.truth, marks.frame, marks.points_mm)
+    (row,) = [row for row in found.drift if row["mode"] == "pose"]
+    assert (row["GLE_mm"], row["LLE_mm"]) == pytest.approx((expected.global_mm, expected.local_mm))
+    assert {row["quantity"] for row in held(tmp_path)["intervals"]} >= {"GLE_mm", "LLE_mm"}
+
+
+def test_a_scan_is_another_when_a_file_beside_it_is(sweeps, tmp_path):
+    path, *_ = challenge_examples.write_data_set(tmp_path)
+    curves = sweeps[0].parent / "curves.h5"
+
+    def key():
+        return plan_sweep("scan", path, tmp_path, curves, Config().to_toml(), None, None, ()).key
+
+    before = key()
+    assert key() == before
+    csv_path = tmp_path / "calib_matrix.csv"
+    csv_path.write_text(csv_path.read_text().replace("33.0", "34.0"))
+    assert key() != before
 
 
 def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path):

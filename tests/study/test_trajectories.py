@@ -127,7 +127,7 @@ def test_poses_meet_by_time_and_those_without_a_reference_are_left_out():
 def test_what_does_not_belong_together_is_refused(tmp_path):
     poses = hand_sweep(np.random.default_rng(0), 5)
     early, late = (Trajectory(name, np.arange(5) + t, poses) for name, t in (("early", 0.0), ("late", 4.0)))
-    with pytest.raises(MismatchError, match="early and late: expected at least 2 times .* got 1"):
+    with pytest.raises(MismatchError, match=r"early and late: expected at least 2 times .* got 1"):
         compare_trajectories(early, late)
     one, two = (Trajectory("a", np.arange(5.0), poses, ImageGrid(5, 5, pitch, 1.0)) for pitch in (1.0, 2.0))
     with pytest.raises(MismatchError, match="images of one size"):
