@@ -8,6 +8,7 @@ modes.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -178,15 +179,25 @@ def _told(intervals: Sequence[Row], paired: Sequence[Row]) -> list[str]:
     lines = []
     if any(row["low"] is not None for row in intervals):
         lines.append("[..]: 95 % interval over sweeps, by bootstrap")
+    found: dict[str, list[str]] = {}
     for quantity in QUANTITIES:
-        apart = [_pair_words(row) for row in paired if row["quantity"] == quantity.key and row["better"]]
-        if apart:
-            lines.append(f"told apart in {quantity.words}: {'; '.join(apart)}")
-    if paired and not any(row["better"] for row in paired):
+        words = _better_words([row for row in paired if row["quantity"] == quantity.key])
+        if words:
+            found.setdefault(words, []).append(quantity.words)
+    for words, names in found.items():
+        lines += textwrap.wrap(f"less {', '.join(names)}: {words}", 100, subsequent_indent="  ")
+    if found:
+        lines.append(f"(told apart sweep by sweep: signed-rank p <= {LEVEL:g} after Holm's correction)")
+    if paired and not found:
         lines.append("no two modes are told apart by these sweeps")
     return lines
 
 
-def _pair_words(row: Row) -> str:
-    worse = row["against"] if row["better"] == row["mode"] else row["mode"]
-    return f"{row['better']} better than {worse} (p {row['holm_p']:.2g})"
+def _better_words(rows: Sequence[Row]) -> str:
+    """Each mode that is better than others, and those it is better than."""
+    worse: dict[str, list[str]] = {}
+    for row in rows:
+        if row["better"]:
+            other = row["against"] if row["better"] == row["mode"] else row["mode"]
+            worse.setdefault(row["better"], []).append(other)
+    return "; ".join(f"{mode} than {', '.join(others)}" for mode, others in worse.items())

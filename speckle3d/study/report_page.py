@@ -192,15 +192,19 @@ def _shown(key: str, value: Any, signed: bool) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        digits = (
-            1 if key.endswith("percent") or key.endswith("_s") else 2 if key.endswith(("_mm", "_deg")) else 3
-        )
-        return f"{value:{'+' if signed else ''}.{digits}f}"
+        return f"{value:{'+' if signed else ''}.{_digits(key)}f}"
     if isinstance(value, list):
         return ", ".join(_shown(key, one, signed) for one in value)
     if isinstance(value, dict):
         return ", ".join(f"{name} {_shown(key, one, signed)}" for name, one in value.items())
     return str(value)
+
+
+def _digits(key: str) -> int:
+    if key.startswith(("LPE", "LLE")):
+        # From one frame to the next: hundredths of a millimetre are already large.
+        return 4
+    return 1 if key.endswith(("percent", "_s")) else 2 if key.endswith(("_mm", "_deg")) else 3
 
 
 def _hash(text: str) -> str:

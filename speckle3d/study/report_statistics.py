@@ -142,6 +142,6 @@ def _difference(quantity: Quantity, row: Row | None) -> str:
     text = quantity.shown(row["difference"], signed=True)
     if row["low"] is not None:
         low, high = (quantity.shown(row[end], signed=True) for end in ("low", "high"))
-        text += f" ({low} to {high})"
+        text += f"<br>({low} to {high})"
     text = text.replace("-", "−")
     return f"<b>{text}</b>" if row["better"] else text

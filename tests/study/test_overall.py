@@ -92,9 +92,8 @@ def test_the_text_is_compact_and_says_who_is_better():
     (fdr,) = [line for line in lines if line.startswith("FDR")]
     found = of(intervals, "FDR", "pose")
     assert f"{found['mean']:.1%} [{found['low']:.1%}, {found['high']:.1%}]" in fdr
-    (apart,) = [line for line in lines if line.startswith("told apart in FDR")]
-    assert "pose better than image (p 0.0029)" in apart
-    assert "twin better" not in apart
+    (apart,) = [line for line in lines if line.startswith("less ")]
+    assert apart == "less length error %, FDR: pose than image, twin"
     assert max(len(line) for line in lines) <= 110
     assert overall_text([], []) == ""
 
