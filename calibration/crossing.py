@@ -1,4 +1,4 @@
-"""Two crossing sweeps prepared once, and how they are compared: at which resolution, where, and in which frames."""
+"""Two crossing sweeps prepared once, and how they are compared: how sharp, where, and in which frames."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | No
     extent = float(np.sqrt(max(grid.width_mm, 1.0) * (grid.depth_mm - grid.first_sample_depth_mm)))
     unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
     stacks, numbers = [], []
-    for number, tracked in enumerate((first, second)):
+    for tracked in (first, second):
         step = None if progress is None else _step_of(progress, f"reading {tracked.name}")
         stack, frames = read_stack(tracked, BASE_PIXEL_MM * unit, step)
         stacks.append(stack)

@@ -1,4 +1,4 @@
-"""How well two crossing sweeps determine the calibration: by leaving out one part of the tissue after another."""
+"""How well two crossing sweeps determine the calibration: by leaving out one part after another."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.crossing import Crossing
 from calibration.imagefit import Refined, about_pivot
+from calibration.imagestacks import IntArray
 from speckle3d.core.geometry import FloatArray, skew
 
-BLOCK_MM = 8.0
-"""Side of the blocks of tissue left out: wider than a patch, since patches that overlap err alike."""
+BLOCK_MM = 16.0
+"""Side of the blocks of tissue left out, in units of the images' size: some patches wide, as neighbours see
+the same reflections and so err alike."""
+
+STRETCH = 3
+"""Images compared that are left out together: a tracker's error lasts from one to the next."""
 
 NAMES = ("tilt", "yaw", "roll", "x", "y", "z", "lateral pixel size", "axial pixel size")
 
@@ -25,56 +29,70 @@ class Spread:
     weakest: str
 
 
-def covariance_at_origin(crossing: Crossing, refined: Refined) -> Spread:
-    """Jackknife over blocks of tissue, each left out by one Gauss-Newton step.
+def covariance_at_origin(refined: Refined, unit: float) -> Spread:
+    """Jackknife over blocks of tissue and over stretches of the sweeps, left out by one Gauss-Newton step.
+
+    What differs from block to block of tissue (speckle, reflections) and from image to image (poses) adds up.
+    Poses count twice: those of the images compared, and those of the images cut, of which there are as many.
+
+    Parameters
+    ----------
+    unit : float
+        Size of the images relative to the usual.
 
     References
     ----------
     .. [1] R. M. Bell and D. F. McCaffrey, "Bias reduction in standard errors for linear regression with
        multi-stage samples", Survey Methodology, 2002 (leaving out a cluster at a time).
     """
-    likeness, chosen = refined.likeness, np.array(refined.free)
+    chosen = np.array(refined.free)
     base = about_pivot(refined.pivot_mm)[:, chosen]
-    normal = base.T @ (refined.weight[:, None, None] * likeness.normal) @ base
-    gradient = (refined.weight[:, None] * likeness.gradient) @ base
-    block = _blocks(crossing, refined)
-    total, slope = normal.sum(axis=0), gradient.sum(axis=0)
+    normal = base.T @ (refined.weight[:, None, None] * refined.likeness.normal) @ base
+    gradient = (refined.weight[:, None] * refined.likeness.gradient) @ base
+    total = normal.sum(axis=0)
     norms = np.sqrt(np.diag(total))
-    if not (norms > 0).all() or block.max(initial=0) < 1:
-        return Spread(_embedded(np.full((len(chosen),) * 2, np.inf), chosen), float("inf"), "all")
+    if not (norms > 0).all():
+        return Spread(_held(np.full(total.shape, np.inf), chosen), float("inf"), "all")
     values, vectors = np.linalg.eigh(total / np.outer(norms, norms))
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
-    weakest = NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]]
-    count = block.max() + 1
-    left = np.empty((count, len(chosen)))
+    tissue = _jackknife(normal, gradient, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
+    poses = _jackknife(normal, gradient, _numbered(np.column_stack(_stretches(refined))))
+    covariance = base @ (tissue + 2.0 * poses) @ base.T
+    return Spread(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]])
+
+
+def _jackknife(normal: FloatArray, gradient: FloatArray, cluster: IntArray) -> FloatArray:
+    """Covariance from the Gauss-Newton steps that follow from leaving out each cluster of patches."""
+    total, slope, count = normal.sum(axis=0), gradient.sum(axis=0), int(cluster.max()) + 1
+    if count < 2:
+        return np.full(total.shape, np.inf)
+    steps = np.empty((count, len(total)))
     for number in range(count):
-        out = block == number
-        left[number] = np.linalg.lstsq(
-            total - normal[out].sum(axis=0), slope - gradient[out].sum(axis=0), rcond=None
-        )[0]
-    left -= left.mean(axis=0)
-    covariance = (count - 1) / count * left.T @ left
-    return Spread(_embedded(base @ covariance @ base.T, np.arange(8)), condition, weakest)
+        out = cluster == number
+        left = total - normal[out].sum(axis=0)
+        steps[number] = np.linalg.lstsq(left, slope - gradient[out].sum(axis=0), rcond=None)[0]
+    steps -= steps.mean(axis=0)
+    return np.asarray((count - 1) / count * steps.T @ steps)
+
+
+def _numbered(cells: FloatArray) -> IntArray:
+    """Number of each patch's cell, from zero."""
+    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
+
+
+def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
+    """Sweep, and stretch of it, that each patch's image belongs to."""
+    sweep, image = refined.sources.T
+    return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
+
+
+def _held(covariance: FloatArray, chosen: IntArray) -> FloatArray:
+    full = np.zeros((len(NAMES),) * 2)
+    full[np.ix_(chosen, chosen)] = covariance
+    return full
 
 
 def point_covariance(covariance: FloatArray, point_mm: FloatArray) -> FloatArray:
     """Covariance of a point of the image from that of its pose at the image's origin, shape (3, 3)."""
     moved = np.hstack([-skew(np.asarray(point_mm, dtype=float)), np.eye(3)])
     return np.asarray(moved @ covariance @ moved.T)
-
-
-def _embedded(covariance: FloatArray, chosen: FloatArray) -> FloatArray:
-    full = np.zeros((8, 8))
-    full[np.ix_(chosen, chosen)] = covariance
-    return full
-
-
-def _blocks(crossing: Crossing, refined: Refined) -> FloatArray:
-    """Number of the block of tissue in which each patch lies, from zero."""
-    place = refined.places_mm
-    cell = np.floor(place / (BLOCK_MM * crossing.unit)).astype(int)
-    counted = refined.weight > 0
-    numbers = np.full(len(cell), -1)
-    if counted.any():
-        numbers[counted] = np.unique(cell[counted], axis=0, return_inverse=True)[1].ravel()
-    return numbers

@@ -2,7 +2,7 @@
 
 The patch and its cut, both without their mean and of unit length, differ by a vector whose squared length is
 2 (1 - correlation); its derivative gives Gauss-Newton its matrix, and the exact derivative of the correlation
-its gradient. A patch that stays unlike counts less and less (Geman and McClure), one without structure little.
+its gradient. A patch that stays unlike counts less and less (Geman and McClure), one without structure too.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.imagestacks import IntArray
 from calibration.similarity import Comparison, Likeness
 from speckle3d.core.geometry import FloatArray, skew
 
@@ -58,6 +59,8 @@ class Refined:
         Of each patch.
     places_mm : ndarray, shape (p, 3)
         Where in the world the patches lie.
+    sources : ndarray of int, shape (p, 2)
+        Which sweep and which of its images they are on.
     pivot_mm : ndarray, shape (3,)
         The point of the image that turns leave in place.
     free : tuple of int
@@ -68,6 +71,7 @@ class Refined:
     likeness: Likeness
     weight: FloatArray
     places_mm: FloatArray
+    sources: IntArray
     pivot_mm: FloatArray
     free: tuple[int, ...]
     evaluations: int
@@ -113,7 +117,7 @@ def refine(
         if damping > 1e6:
             break
     places = comparison.places_mm(estimate.sensor_from_image)
-    return Refined(estimate, here, weight, places, pivot, free, evaluations, converged)
+    return Refined(estimate, here, weight, places, comparison.images, pivot, free, evaluations, converged)
 
 
 def weights(likeness: Likeness) -> FloatArray:

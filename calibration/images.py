@@ -42,8 +42,9 @@ __all__ = [
 
 Method = Literal["gauss-newton", "nelder-mead"]
 
-FINE = (Level(1.0), Level(0.7))
-"""Resolutions at which the answer of the search is refined. The last is still coarser than speckle."""
+FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
+"""Resolutions at which the answer of the search is refined. The last is still coarser than speckle; many
+images tell more there than patches that overlap, since every pose errs for itself."""
 
 SHOWN_SIGMA_MM = 1.0
 """Blur at which similarities are reported, in units of the crossing."""
@@ -110,10 +111,10 @@ class ImageCalibration:
         where they were not estimated.
     covariance : ndarray, shape (6, 6)
         Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
-        then displacements along them in mm. From how the answer changes when one part of the scanned tissue
-        after another is left out, so it knows of speckle, reflections and jitter; not of an error that all of
-        the tissue shares, such as an uncorrected delay of the sensor. Where that leaves fewer than two parts,
-        infinite.
+        then displacements along them in mm. From how the answer changes when one part of the scanned tissue,
+        or one stretch of a sweep, after another is left out, so it knows of speckle, reflections and jitter;
+        not of an error that all of them share, such as an uncorrected delay of the sensor or a wrong speed of
+        sound. Infinite where the sweeps determine nothing.
     condition_number : float
         Of the normal matrix's root with columns scaled to unit norm; a large one means that the sweeps leave
         some motion of the image undetermined.
@@ -257,7 +258,7 @@ def _result(
     evaluations: int,
     converged: bool,
 ) -> ImageCalibration:
-    spread = covariance_at_origin(crossing, refined)
+    spread = covariance_at_origin(refined, crossing.unit)
     near = found.sensor_from_image
     shown = crossing.whole(SHOWN_SIGMA_MM, 10, near), crossing.check(SHOWN_SIGMA_MM, near)
     return ImageCalibration(

@@ -1,4 +1,4 @@
-"""From a start far off into the reach of Gauss-Newton: many cheap looks, the best followed up, fewer each time."""
+"""From a start far off into the reach of Gauss-Newton: many cheap looks, the best followed up."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def search(
     best = [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:_FOLLOWED] if scores[n] > -1]
     if not best:
         raise InsufficientDataError(
-            f"expected sweeps that overlap within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees of "
-            "the start, got no overlap anywhere"
+            f"expected sweeps that overlap within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
+            "of the start, got no overlap anywhere"
         )
     followed = _refined(crossing, FOLLOWED, best, pool, say, "following up")
     apart = _distinct([one.estimate for one in followed], crossing.centre_mm)[:_COMPARED]

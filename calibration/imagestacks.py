@@ -1,4 +1,4 @@
-"""Tracked images made ready for comparison: reduced, blurred alike in all directions, thinned along the sweep.
+"""Tracked images made ready for comparison: reduced, blurred alike in all directions, thinned.
 
 Interpolation smooths, and a similarity rewards what is smooth alike. So both sides of every comparison are
 brought to one resolution first: blurred within the images, and across them by averaging neighbours, coarser
@@ -164,7 +164,7 @@ def read_stack(
     frames = tracked.covered()
     if len(frames) < FEWEST_FRAMES:
         raise InsufficientDataError(
-            f"{tracked.name}: expected at least {FEWEST_FRAMES} frames with sensor readings, got {len(frames)}"
+            f"{tracked.name}: expected at least {FEWEST_FRAMES} frames with readings, got {len(frames)}"
         )
     grid = tracked.grid
     source = PosedImages(tracked.images, grid, _every_pose(tracked, frames))
@@ -196,7 +196,8 @@ def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
     known = getattr(tracked.images, "shape", (len(tracked.frame_time_s),))[0]
     if known != len(tracked.frame_time_s):
         raise MismatchError(
-            f"{tracked.name}: expected {known} frame times for {known} images, got {len(tracked.frame_time_s)}"
+            f"{tracked.name}: expected {known} frame times for {known} images, "
+            f"got {len(tracked.frame_time_s)}"
         )
     return RigidTransform.identity(len(tracked.frame_time_s))
 

@@ -113,6 +113,14 @@ class Comparison:
         parts = list(run(lambda way: self._one_way(way, matrix, factor, derivatives), (0, 1)))
         return Likeness(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
+    @property
+    def images(self) -> IntArray:
+        """Which sweep, and which image of its stack, each patch is on, shape (p, 2)."""
+        rows = [
+            np.column_stack([np.full(len(p.where), n), p.where[:, 0]]) for n, p in enumerate(self.patches)
+        ]
+        return np.concatenate(rows)
+
     def places_mm(self, sensor_from_image: RigidTransform) -> FloatArray:
         """Where the patches' centres lie in the world, shape (p, 3)."""
         rows = []
