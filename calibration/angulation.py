@@ -24,15 +24,16 @@ from speckle3d.core.streams import BoolArray
 PARAMETERS = ("tilt", "yaw", "roll", "x", "y", "z")
 """Small turns about the image's x, y and z through its centre, and shifts along them."""
 
-REFUSED = 0.1
+REFUSED = 0.05
 """Disagreement in mm of a mm (or of an image's half size times a radian) of calibration error below which
-sweeps are refused: images that agree to 0.3 mm would then leave 3 mm open. Fans of 6 degrees are at 0.1."""
+sweeps are refused: images that agree to 0.1 mm would leave 2 mm open. Along the beam, fans of 7 degrees."""
 
-WEAK = 0.25
-"""Below, the verdict says so; fans of 14 degrees."""
+WEAK = 0.15
+"""Below, the verdict says so; along the beam, fans of 21 degrees."""
 
 _FRAMES, _POINTS = 12, 9
-_LEAST_OVERLAP = 0.02
+_LEAST_OVERLAP = 0.25
+"""Below, the sweeps are judged as if their middles were in one place: a start off by 20 mm parts them."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,10 @@ def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
     ]
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
     rows += [
-        ("RMS residual", *readable(calibration.rms, calibration.rms_unit)),
+        (
+            "RMS residual" if calibration.rms_unit else "correlation lost",
+            *readable(calibration.rms, calibration.rms_unit),
+        ),
         ("condition number", f"{calibration.condition_number:.1f}", ""),
         ("frames used", used, ""),
     ]

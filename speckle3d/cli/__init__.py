@@ -13,6 +13,7 @@ import typer
 from speckle3d.cli import (
     clock,
     compare,
+    crossing,
     curves,
     files,
     imu,
@@ -30,6 +31,7 @@ __all__ = [
     "calibrate",
     "clock",
     "compare",
+    "crossing",
     "curves",
     "files",
     "imu",

@@ -115,7 +115,7 @@ def calibrate_plane(
     """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
     from calibration.job import plane_job
 
-    _require_free(out, images, poses, validation)
+    require_free(out, images, poses, validation)
     lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
     recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
     seen = find_lines(recording, region, images, lines)
@@ -159,7 +159,7 @@ def calibrate_orientation(
     """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
     from calibration.job import orientation_job
 
-    _require_free(out, images, poses, validation)
+    require_free(out, images, poses, validation)
     lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
     recording, job = _prepared(images, poses, pixel_mm, sensor, time_offset, outlier_sigma)
     seen = find_lines(recording, region, images, lines)
@@ -202,7 +202,7 @@ def calibrate_wires(
 
     if validation is None and validation_points is not None:
         raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
-    _require_free(out, images, points, poses, validation, validation_points, Path(phantom))
+    require_free(out, images, points, poses, validation, validation_points, Path(phantom))
     config: WireConfig | None = None
     if phantom not in ("cross", "three"):
         config = read_wire_phantom(phantom)
@@ -224,7 +224,7 @@ def calibrate_wires(
     _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
 
 
-def _require_free(out: Path, *inputs: Path | None) -> None:
+def require_free(out: Path, *inputs: Path | None) -> None:
     """Refuse an output that cannot be written, or that would take the place of its report or of an input."""
     from speckle3d.io.hdf5 import require_target
 

@@ -1,0 +1,221 @@
+"""Calibration without a phantom, from two crossing sweeps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
+from speckle3d.cli.phantoms import Out, PixelMm, require_free
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RigidTransform
+
+    from calibration.angulation import Angulation
+    from calibration.clock import Delay
+    from calibration.imageresults import Found
+    from calibration.images import ImageSettings
+    from calibration.imagestacks import TrackedImages
+    from speckle3d.core.calibration import Calibration
+
+
+class ImageMethod(StrEnum):
+    """How the answer is looked for."""
+
+    gauss_newton = "gauss-newton"
+    nelder_mead = "nelder-mead"
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """Both sweeps, the start, and the sweep that tells the clock."""
+
+    sweeps: tuple[TrackedImages, TrackedImages]
+    start: RigidTransform
+    clock: TrackedImages | None
+
+
+@calibrate.command("images")
+def calibrate_images(
+    first: Annotated[Path, typer.Argument(metavar="A", help="Tracked sweep: sweep file, MetaImage, NRRD.")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Another of the same place, turned by 90 deg.")],
+    out: Out,
+    start: Annotated[
+        Path | None, typer.Option(help="Calibration to start from; by default A's own, if it has one.")
+    ] = None,
+    start_mm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Start by ruler: the image's top left corner seen from the sensor, x y z."),
+    ] = None,
+    start_deg: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Start by eye: turns from sensor to image, roll yaw tilt (fixed x, y, z of TR 303)."
+        ),
+    ] = None,
+    poses: Annotated[
+        list[Path] | None, typer.Option(help="File with readings, if not in A and B; once for each.")
+    ] = None,
+    pixel_mm: PixelMm = None,
+    method: Annotated[
+        ImageMethod, typer.Option(help="By derivatives, or as published (Wein 2008).")
+    ] = ImageMethod.gauss_newton,
+    scales: Annotated[bool, typer.Option("--scales", help="Estimate the pixel size too.")] = False,
+    capture_mm: Annotated[float, typer.Option(help="How far the start may be off, each way.")] = 20.0,
+    capture_deg: Annotated[float, typer.Option(help="The same for its turns.")] = 20.0,
+    clock: Annotated[
+        Path | None,
+        typer.Option(help="Sweep forward and back: solve, find the clock offset from it, solve again."),
+    ] = None,
+    time_offset_s: Annotated[
+        float | None, typer.Option(help="The sensor's clock offset, in place of the files' own.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a position sensor from two crossing sweeps of anything with visible structure."""
+    from calibration.images import ImageSettings
+
+    readings = _one_each(poses)
+    require_free(out, first, second, start, clock, *(poses or ()))
+    settings = ImageSettings(method.value, scales, capture_mm, capture_deg)
+    given = _open(first, second, readings, pixel_mm, time_offset_s, clock, start, start_mm, start_deg)
+    enough = _angulation(given.sweeps, given.start)
+    enough.require()
+    found = _solve(given.sweeps, given.start, settings)
+    delay = None
+    if given.clock is not None:
+        delay = _clock(given.clock, found.result.sensor_from_image)
+        note(f"sensor clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s; solving again")
+        sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
+        given = replace(given, sweeps=(sweeps[0], sweeps[1]))
+        found = _solve(given.sweeps, found.result.sensor_from_image, settings)
+    # The start said how the sweeps turn; only the answer says what they share.
+    enough = _angulation(given.sweeps, found.result.sensor_from_image)
+    _finish((first, second), out, given, found, enough, delay, as_json)
+
+
+def _one_each(poses: list[Path] | None) -> list[Path | None]:
+    if poses is None or not poses:
+        return [None, None]
+    if len(poses) != 2:
+        raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
+    return list(poses)
+
+
+def _open(
+    first: Path,
+    second: Path,
+    readings: list[Path | None],
+    pixel_mm: tuple[float, float] | None,
+    time_offset_s: float | None,
+    clock: Path | None,
+    start: Path | None,
+    start_mm: tuple[float, float, float] | None,
+    start_deg: tuple[float, float, float] | None,
+) -> _Inputs:
+    from speckle3d.cli.recordings import open_tracked
+    from speckle3d.io.calibrations import read_calibration
+
+    known = None if start is None else read_calibration(start)
+    if time_offset_s is None and known is not None:
+        time_offset_s = known.time_offset_s
+    one, mounting = open_tracked(first, readings[0], pixel_mm, time_offset_s)
+    other, _ = open_tracked(second, readings[1], pixel_mm, time_offset_s)
+    back = None if clock is None else open_tracked(clock, None, pixel_mm, time_offset_s)[0]
+    return _Inputs((one, other), _start(known, start_mm, start_deg, mounting, first), back)
+
+
+def _start(
+    known: Calibration | None,
+    start_mm: tuple[float, float, float] | None,
+    start_deg: tuple[float, float, float] | None,
+    mounting: RigidTransform | None,
+    first: Path,
+) -> RigidTransform:
+    import numpy as np
+    from scipy.spatial.transform import RigidTransform
+
+    from speckle3d.core.geometry import rotation_from_fixed_angles
+
+    by_ruler = start_mm is not None or start_deg is not None
+    if by_ruler and known is not None:
+        raise InvalidInputError("expected --start or --start-mm with --start-deg, got both")
+    if by_ruler:
+        if start_mm is None or start_deg is None:
+            raise InvalidInputError("expected --start-mm and --start-deg together, got one of them")
+        roll, yaw, tilt = np.deg2rad(start_deg)
+        return RigidTransform.from_components(start_mm, rotation_from_fixed_angles(roll, yaw, tilt))
+    if known is not None:
+        return known.sensor_from_image
+    if mounting is None:
+        raise InsufficientDataError(
+            f"{first}: expected a start, within 20 mm and 20 degrees: --start CAL.h5, or --start-mm X Y Z "
+            "with --start-deg ROLL YAW TILT; got none"
+        )
+    return mounting
+
+
+def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform) -> Angulation:
+    from calibration.angulation import angulation
+
+    posed = [each.world_from_sensor(each.covered()) for each in sweeps]
+    return angulation(posed[0], posed[1], start, sweeps[0].grid.corners_mm)
+
+
+def _solve(
+    sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageSettings
+) -> Found:
+    from calibration.imageresults import solve
+
+    with progress_bar("comparing sweeps") as bar:
+        return solve(
+            *sweeps, start, settings, None if bar is None else lambda _stage, done, of: bar(done, of)
+        )
+
+
+def _clock(tracked: TrackedImages, mounting: RigidTransform) -> Delay:
+    from calibration.clock_images import delay_from_images
+
+    with progress_bar("trying delays") as progress:
+        return delay_from_images(tracked, mounting, progress=progress)
+
+
+def _finish(
+    paths: tuple[Path, Path],
+    out: Path,
+    given: _Inputs,
+    found: Found,
+    enough: Angulation,
+    delay: Delay | None,
+    as_json: bool,
+) -> None:
+    """Write the calibration, its table and its pictures, and print the table."""
+    from importlib.metadata import version
+
+    from calibration.imageresults import as_calibration, figure_of, notes_of
+    from calibration.report import json_report, text_report
+    from speckle3d.core.calibration import Source
+    from speckle3d.io.calibrations import write_calibration
+    from speckle3d.io.hdf5 import atomic_path, sha256_of
+    from speckle3d.study.figures import save_figure
+
+    names, hashes = (" ".join(map(of, paths)) for of in (str, sha256_of))
+    result = replace(
+        as_calibration(found, enough, given.sweeps), source=Source(names, hashes, version("speckle3d"))
+    )
+    told = notes_of(found, enough)
+    if delay is not None:
+        told.append(f"clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s, from images")
+    table = text_report(result, (), told)
+    write_calibration(out, result)
+    with atomic_path(out.with_suffix(".txt")) as part:
+        part.write_text(table, encoding="utf-8")
+    save_figure(figure_of(found, enough, given.sweeps), out.with_suffix(".png"))
+    emit(json.dumps(json_report(result) | {"notes": told}, indent=2) if as_json else table)
+    note(f"calibration in {out}, report in {out.with_suffix('.txt')} and {out.with_suffix('.png')}")
