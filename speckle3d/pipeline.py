@@ -6,10 +6,11 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.blocks import Block, ImageSink, MatchedBlock, MatchedFrame, blocks_of, match_block
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
@@ -21,10 +22,12 @@ from speckle3d.motion.distances import DistanceEstimator
 from speckle3d.motion.matching import FrameMatcher
 from speckle3d.motion.phantom import phantom_samples
 from speckle3d.solution import PairSink, Solution, Tracked
-from speckle3d.walk import ImageSink, Walk, prefetch
+from speckle3d.walk import Walk
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
+BlockSource = Callable[[Block], MatchedBlock | None]
+"""Gives a block that has been matched already, None for one that has not."""
 
 
 def track(
@@ -34,8 +37,16 @@ def track(
     progress: Progress | None = None,
     sink: PairSink | None = None,
     images: ImageSink | None = None,
+    matched: BlockSource | None = None,
 ) -> Tracked:
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches if asked.
+
+    Parameters
+    ----------
+    images : callable, optional
+        Not called with frames of blocks that `matched` gives.
+    matched : callable, optional
+        Asked for each block of frames before it is matched here.
 
     Raises
     ------
@@ -50,11 +61,22 @@ def track(
     matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane, settings.matching)
     curves.key.require_same(matcher.key)
     walk = Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
-    for frame, ready in enumerate(prefetch(walk, images)):
-        walk.advance(frame, ready)
+    for each in _matched(walk, images, matched):
+        walk.place(each)
         if progress:
-            progress(frame + 1, len(sweep))
+            progress(each.frame + 1, len(sweep))
     return Solution(walk, curves).solve(sink)
+
+
+def _matched(walk: Walk, images: ImageSink | None, given: BlockSource | None) -> Iterator[MatchedFrame]:
+    """All frames of a sweep in order, from blocks that are there and those that are matched now."""
+    for block in blocks_of(len(walk.sweep), walk.config.trajectory.block_frames):
+        held = None if given is None else given(block)
+        if held is not None:
+            walk.times.include(held.seconds)
+            yield from held.frames
+        else:
+            yield from match_block(walk.sweep, walk.matcher, walk.config, block, images, walk.times)
 
 
 def calibrate_curves(

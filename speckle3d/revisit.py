@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from speckle3d.blocks import median_correlation
 from speckle3d.core.geometry import FloatArray
 from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.distances import EchoModel
 from speckle3d.motion.inplane import PatchMatch
 from speckle3d.motion.matching import ReadyFrame
 from speckle3d.motion.planes import PairPlane
-from speckle3d.walk import Walk, median_correlation
+from speckle3d.walk import Walk
 
 AWAY_MM = 3.0
 """Travel between two visits: less is within reach of the pairs measured anyway."""

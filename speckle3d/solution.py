@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.blocks import StageTimes
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray, mirrored
@@ -33,7 +34,7 @@ from speckle3d.motion.trajectory import (
 )
 from speckle3d.motion.uncertainty import pose_covariance
 from speckle3d.revisit import find_revisits
-from speckle3d.walk import StageTimes, Walk
+from speckle3d.walk import Walk
 
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""

@@ -44,6 +44,12 @@ class TrajectorySettings(BaseModel):
         description="Travel between the frames of a sweep that comes back at which they are matched with "
         "those of its way there; 0: never.",
     )
+    block_frames: int = Field(
+        400,
+        ge=10,
+        description="Most frames of a sweep that are matched in one go; longer sweeps are matched in blocks, "
+        "which may run at the same time.",
+    )
     join: Literal["graph", "chain"] = Field(
         "graph",
         description="graph: least squares over all pairs. chain: each frame by the one earlier frame that "
@@ -57,6 +63,10 @@ class PairSchedule:
     def __init__(self, settings: TrajectorySettings | None = None) -> None:
         self.settings = settings or TrajectorySettings()
         self._keys: list[int] = []
+
+    def begin(self, keys: list[int]) -> None:
+        """Begin in the middle of a sweep, with the key frames before it, latest last."""
+        self._keys = list(keys)
 
     def references(self, frame: int) -> list[int]:
         """Earlier frames to measure `frame` against, latest first."""

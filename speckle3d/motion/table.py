@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
-from speckle3d.motion.inplane import InPlaneMotion, PatchMatch
+from speckle3d.core.geometry import FloatArray
+from speckle3d.motion.inplane import InPlaneMotion
 from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.patches import IntArray
+
+
+class Matched(Protocol):
+    """What two frames have in common: the correlation of each patch, shape (p,), and in-plane motion."""
+
+    @property
+    def correlation(self) -> FloatArray: ...  # noqa: D102
+
+    @property
+    def motion(self) -> InPlaneMotion: ...  # noqa: D102
 
 
 class CorrelationTable:
@@ -21,7 +34,7 @@ class CorrelationTable:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def append(self, first: int, second: int, match: PatchMatch) -> None:
+    def append(self, first: int, second: int, match: Matched) -> None:
         """Add one pair."""
         self._frames.append((first, second))
         self._correlation.append(match.correlation.astype(np.float32))
