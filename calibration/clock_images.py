@@ -29,8 +29,8 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import GreyArray, Images
-from speckle3d.imaging.reslice import ReslicePlane, reslice_frames
+from speckle3d.imaging.images import ChosenImages, GreyArray, Images
+from speckle3d.imaging.reslice import image_plane, reslice_frames
 
 PIXEL_MM = 0.3
 """Of the compared images: finer than the beam, so that speckle tells too, which the way back shows again."""
@@ -157,11 +157,11 @@ class _Likeness:
     ) -> None:
         self._images, self._times, self._readings = images, frame_time_s, readings
         self._mounting, self._ways = sensor_from_image, ways
-        plane = _image_plane(RigidTransform.identity(), images.grid)
+        plane = image_plane(RigidTransform.identity(), images.grid, PIXEL_MM)
         alone = RigidTransform.identity(1)
         # An image in its own plane is the same whatever the delay.
         self._own = {
-            int(k): reslice_frames(_Some(images, np.array([k])), images.grid, alone, plane, 1.0)
+            int(k): reslice_frames(ChosenImages(images, np.array([k])), images.grid, alone, plane, 1.0)
             for way in ways
             for k in way.queries
         }
@@ -171,28 +171,15 @@ class _Likeness:
         found = []
         for mine, other in (self._ways, self._ways[::-1]):
             poses = self._poses(other.frames, delay_s)
-            reach, source = _reach_mm(poses), _Some(self._images, other.frames)
+            reach, source = _reach_mm(poses), ChosenImages(self._images, other.frames)
             for query, pose in zip(mine.queries, self._poses(mine.queries, delay_s), strict=True):
-                plane = _image_plane(pose, self._images.grid)
+                plane = image_plane(pose, self._images.grid, PIXEL_MM)
                 resliced = reslice_frames(source, self._images.grid, poses, plane, reach)
                 found.append(_correlation(self._own[int(query)], resliced))
         return np.array(found)
 
     def _poses(self, frames: npt.NDArray[np.int64], delay_s: float) -> RigidTransform:
         return self._readings.at(self._times[frames] - delay_s) * self._mounting
-
-
-class _Some:
-    """Some of the images, counted from zero."""
-
-    def __init__(self, images: _Pooled, frames: npt.NDArray[np.int64]) -> None:
-        self._images, self._frames = images, frames
-
-    def __getitem__(self, index: int) -> GreyArray:
-        return self._images[int(self._frames[index])]
-
-    def __len__(self) -> int:
-        return len(self._frames)
 
 
 def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
@@ -250,12 +237,6 @@ def _way(there: npt.NDArray[np.int64], part: _Part, number: int) -> _Way:
     inner = part.index[(part.share > 0.1) & (part.share < 0.9)]
     chosen = np.unique(np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(int))
     return _Way(there[part.index], there[inner[chosen]])
-
-
-def _image_plane(world_from_image: RigidTransform, grid: ImageGrid) -> ReslicePlane:
-    top = RigidTransform.from_translation([0.0, grid.first_sample_depth_mm, 0.0])
-    height = grid.depth_mm - grid.first_sample_depth_mm
-    return ReslicePlane(world_from_image * top, grid.width_mm, height, PIXEL_MM)
 
 
 def _reach_mm(poses: RigidTransform) -> float:

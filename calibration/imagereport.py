@@ -15,8 +15,8 @@ from calibration.angulation import PARAMETERS, Angulation, displacement_mm
 from calibration.imagecurves import AXES, SimilarityCurves, SimilarityMap
 from calibration.imagestacks import TrackedImages
 from speckle3d.core.geometry import FloatArray
-from speckle3d.imaging.images import GreyArray
-from speckle3d.imaging.reslice import ReslicePlane, reslice_frames
+from speckle3d.imaging.images import ChosenImages, GreyArray
+from speckle3d.imaging.reslice import image_plane, reslice_frames
 
 PIXEL_MM = 0.15
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")
@@ -47,18 +47,17 @@ def pictures(
     shown: TrackedImages, other: TrackedImages, frame: int, start: RigidTransform, found: RigidTransform
 ) -> Pictures:
     """Cut the plane of one image out of the other sweep, with either calibration."""
-    grid = shown.grid
-    top = RigidTransform.from_translation([0.0, grid.first_sample_depth_mm, 0.0])
-    height = grid.depth_mm - grid.first_sample_depth_mm
+    grid, frames = shown.grid, other.covered()
     sensor = shown.world_from_sensor(np.array([frame]))[0]
     cuts = []
     for mounting in (start, found):
-        frames = other.covered()
         poses = other.world_from_sensor(frames) * mounting
-        plane = ReslicePlane(sensor * mounting * top, grid.width_mm, height, PIXEL_MM)
-        cuts.append(reslice_frames(_Some(other, frames), other.grid, poses, plane, _reach_mm(poses)))
-    flat = ReslicePlane(top, grid.width_mm, height, PIXEL_MM)
-    own = reslice_frames(_Some(shown, np.array([frame])), grid, RigidTransform.identity(1), flat, 1.0)
+        plane = image_plane(sensor * mounting, grid, PIXEL_MM)
+        source = ChosenImages(other.images, frames)
+        cuts.append(reslice_frames(source, other.grid, poses, plane, _reach_mm(poses)))
+    alone, flat = RigidTransform.identity(1), image_plane(RigidTransform.identity(), grid, PIXEL_MM)
+    own = reslice_frames(ChosenImages(shown.images, np.array([frame])), grid, alone, flat, 1.0)
+    height = grid.depth_mm - grid.first_sample_depth_mm
     return Pictures(own, cuts[0], cuts[1], grid.width_mm, height, f"{shown.name}, frame {frame}")
 
 
@@ -151,20 +150,6 @@ def _errors(axis: int, values: FloatArray, shift: bool) -> RigidTransform:
     if shift:
         return RigidTransform.from_translation(along)
     return RigidTransform.from_rotation(Rotation.from_rotvec(np.deg2rad(along)))
-
-
-class _Some:
-    """Some frames of a sweep, counted from zero."""
-
-    def __init__(self, tracked: TrackedImages, frames: np.ndarray) -> None:
-        self._images, self._frames = tracked.images, frames
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        number = int(self._frames[index])
-        return self._images(number) if callable(self._images) else self._images[number]
-
-    def __len__(self) -> int:
-        return len(self._frames)
 
 
 def _reach_mm(poses: RigidTransform) -> float:

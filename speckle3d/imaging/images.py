@@ -91,6 +91,29 @@ class PosedImages:
         return scaled
 
 
+@dataclass(frozen=True)
+class ChosenImages:
+    """Some of the images, counted from zero.
+
+    Parameters
+    ----------
+    images : indexable or callable
+    frames : ndarray of int, shape (n,)
+        Which.
+    """
+
+    images: Images
+    frames: npt.NDArray[np.int64]
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        """Read one image, shape (vector, sample)."""
+        number = int(self.frames[index])
+        return self.images(number) if callable(self.images) else self.images[number]
+
+    def __len__(self) -> int:
+        return int(self.frames.size)
+
+
 def require_poses(world_from_image: RigidTransform) -> None:
     """Raise `InvalidInputError` unless there is a row of at least one pose."""
     if world_from_image.single or len(world_from_image) == 0:

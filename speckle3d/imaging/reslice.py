@@ -148,6 +148,13 @@ def reslice_volume(volume: Volume, plane: ReslicePlane) -> GreyArray:
     return np.asarray(cut, dtype=np.float32)
 
 
+def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:
+    """The plane of one image, as large as the image: what another sweep shows there."""
+    top = RigidTransform.from_translation([0.0, grid.first_sample_depth_mm, 0.0])
+    height = grid.depth_mm - grid.first_sample_depth_mm
+    return ReslicePlane(world_from_image * top, grid.width_mm, height, pixel_mm)
+
+
 def along_sweep_plane(
     world_from_image: RigidTransform,
     grid: ImageGrid,
