@@ -262,4 +262,23 @@ def _orientation_rows(
             ("heading, standard deviation, median", float(np.rad2deg(np.median(heading))), "deg"),
             ("magnetic field disturbed", 100.0 * float(np.mean(found.disturbed)), "% of samples"),
         ]
+        if log.oriented.any():
+            rows += _beside_own(log, rotations)
     return rows
+
+
+def _beside_own(log: ImuLog, rotations: TimedRotations) -> list[tuple[str, float, str]]:
+    """How far the orientation found is from the sensor's own."""
+    import numpy as np
+
+    from xsens.comparison import compare_orientations
+
+    apart = compare_orientations(rotations, log.rotations())
+    return [
+        (f"{what}, RMS difference from the sensor's own", float(np.rad2deg(value)), "deg")
+        for what, value in (
+            ("inclination", apart.inclination_rms_rad),
+            ("heading", apart.heading_rms_rad),
+            ("heading, constant offset removed", apart.heading_rms_without_offset_rad),
+        )
+    ]

@@ -1,10 +1,13 @@
 """Orientation on the BROAD trials: errors beside VQF's in the same run, and speed against real time.
 
 python tests/benchmarks/bench_fusion.py FOLDER   (with the trials' .mat files)
+
+With --sensitivity: each of the filter's parameters halved and doubled, and what that does to the errors.
 """
 
 import sys
 import time
+from dataclasses import fields, replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -13,6 +16,7 @@ from broad import TRIALS, errors_deg, read_trial
 from vqf import VQF
 
 from xsens.fusion import orient
+from xsens.fusion_settings import FusionSettings
 
 
 def main():
@@ -31,5 +35,29 @@ def main():
             print(f"  {label:9} {errors_deg(found, true, moving).round(2)}, {pace:.0f} times real time")
 
 
+def sensitivity():
+    """Total error of filter | smoother on each trial, degrees."""
+    trials = [read_trial(Path(sys.argv[1]), name) for name in TRIALS]
+    print(f"{'':32} " + " ".join(f"{name[:13]:^13}" for name in TRIALS))
+    row("as it is", FusionSettings(), trials)
+    for entry in fields(FusionSettings):
+        value = getattr(FusionSettings(), entry.name)
+        if not isinstance(value, bool) and entry.name != "gravity_m_s2":
+            for factor in (0.5, 2.0):
+                changed = replace(FusionSettings(), **{entry.name: factor * value})
+                row(f"{entry.name} x {factor:g}", changed, trials)
+
+
+def row(label, settings, trials):
+    cells = []
+    for log, true, moving in trials:
+        both = []
+        for smooth in (False, True):
+            found = orient(log, settings, smooth).rotations.world_from_sensor.as_quat(scalar_first=True)
+            both.append(errors_deg(found, true, moving)[0])
+        cells.append(f"{both[0]:5.2f} | {both[1]:5.2f}")
+    print(f"{label:32} " + " ".join(cells), flush=True)
+
+
 if __name__ == "__main__":
-    main()
+    sensitivity() if "--sensitivity" in sys.argv else main()

@@ -81,6 +81,16 @@ def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_pa
     assert np.rad2deg(error.max()) < 2.0
 
 
+def test_the_orientation_found_is_compared_with_the_sensors_own(run, log_file, tmp_path):
+    code, out, err = run("imu", "orient", log_file, "-o", tmp_path / "o.csv", "--json")
+    assert code == 0, err
+    told = json.loads(out)
+    # The log's own orientation is the truth, its readings are exact; see the test above. Degrees.
+    assert 0.0 < told["inclination, RMS difference from the sensor's own"] < 1.0
+    code, out, _ = run("imu", "orient", log_file, "-o", tmp_path / "o.csv", "--method", "sensor")
+    assert "sensor's own" not in out
+
+
 def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, tmp_path):
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
