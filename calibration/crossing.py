@@ -10,6 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.imagestacks import (
     BASE_PIXEL_MM,
+    WHOLE,
     IntArray,
     Stack,
     TrackedImages,
@@ -47,12 +48,15 @@ class Level:
         Points along a patch's side, `sigma_mm` apart.
     overlap : float
         Of neighbouring patches.
+    least_weight : float
+        Share of the blur that must lie on the image.
     """
 
     sigma_mm: float
     images: int = 12
     side: int = 7
     overlap: float = 0.5
+    least_weight: float = WHOLE
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,9 @@ class Crossing:
     frames_held_out: tuple[IntArray, IntArray]
     pixel_mm: FloatArray
     unit: float
-    _kept: dict[tuple[int, float, bool], Stack] = field(default_factory=dict, repr=False, compare=False)
+    _kept: dict[tuple[int, float, float, bool], Stack] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     @property
     def centre_mm(self) -> FloatArray:
@@ -86,7 +92,7 @@ class Crossing:
     def level(self, level: Level, sensor_from_image: RigidTransform) -> Comparison:
         """Compare patches all over a number of images, both ways, near a calibration."""
         sigma = level.sigma_mm * self.unit
-        thin = self._thinned(sigma, sensor_from_image)
+        thin = self._thinned(sigma, sensor_from_image, level.least_weight)
         patches = [
             spread_patches(stack, evenly(len(stack), level.images), level.side, sigma, level.overlap)
             for stack in thin
@@ -105,7 +111,10 @@ class Crossing:
         """Compare the images held out with cuts of the other sweep, from which its own are left out too."""
         sigma = sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image)
-        held = self._blurred(0, sigma, held_out=True), self._blurred(1, sigma, held_out=True)
+        held = (
+            self._blurred(0, sigma, held_out=True),
+            self._blurred(1, sigma, held_out=True),
+        )
         a, b = (whole_images(stack, np.arange(len(stack)), sigma) for stack in held)
         gap = self._gap(sigma, thin, sensor_from_image)
         return Comparison(held, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
@@ -116,10 +125,12 @@ class Crossing:
         a, b = (whole_images(stack, evenly(len(stack), images), 0.7 * self.unit) for stack in fine)
         return Comparison(fine, (a, b), max(2.0 * self.unit, 2.0), least_share=LEAST_OVERLAP)
 
-    def _thinned(self, sigma_mm: float, sensor_from_image: RigidTransform) -> tuple[Stack, Stack]:
+    def _thinned(
+        self, sigma_mm: float, sensor_from_image: RigidTransform, least_weight: float = WHOLE
+    ) -> tuple[Stack, Stack]:
         spacing = [frame_spacing(stack, sensor_from_image) for stack in self.used]
         a, b = (
-            self._blurred(way, sigma_mm).thinned(
+            self._blurred(way, sigma_mm, least_weight).thinned(
                 sensor_from_image,
                 max(0.75 * sigma_mm, spacing[way]),
                 max(0.7 * sigma_mm, 0.5 * spacing[way]),
@@ -128,10 +139,12 @@ class Crossing:
         )
         return a, b
 
-    def _blurred(self, way: int, sigma_mm: float, held_out: bool = False) -> Stack:
-        key = way, sigma_mm, held_out
+    def _blurred(
+        self, way: int, sigma_mm: float, least_weight: float = WHOLE, held_out: bool = False
+    ) -> Stack:
+        key = way, sigma_mm, least_weight, held_out
         if key not in self._kept:
-            self._kept[key] = (self.held_out if held_out else self.used)[way].blurred(sigma_mm)
+            self._kept[key] = (self.held_out if held_out else self.used)[way].blurred(sigma_mm, least_weight)
         return self._kept[key]
 
     def _gap(self, sigma_mm: float, stacks: tuple[Stack, Stack], sensor_from_image: RigidTransform) -> float:

@@ -14,8 +14,8 @@ from calibration.imagefit import Estimate, Refined, refine
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray
 
-GLANCE = Level(4.0, images=6, side=5, overlap=0.0)
-FOLLOWED = Level(3.0, images=8, side=5)
+GLANCE = Level(4.0, images=6, side=5, overlap=0.0, least_weight=0.45)
+FOLLOWED = Level(3.0, images=8, side=5, least_weight=0.45)
 COMPARED = Level(2.0, images=8)
 
 _GLANCES = 1024
@@ -66,7 +66,16 @@ def search(
             f"expected sweeps that overlap within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
             "of the start, got no overlap anywhere"
         )
-    followed = _refined(crossing, FOLLOWED, best, pool, say, "following up")
+    followed = [
+        one
+        for one in _refined(crossing, FOLLOWED, best, pool, say, "following up")
+        if _within(first, one.estimate.sensor_from_image, capture_mm, capture_rad)
+    ]
+    if not followed:
+        raise InsufficientDataError(
+            f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
+            "of the start, got none but farther off"
+        )
     apart = _distinct([one.estimate for one in followed], crossing.centre_mm)[:_COMPARED]
     compared = _refined(crossing, COMPARED, apart, pool, say, "comparing")
     looks = len(places) + sum(one.evaluations for one in followed + compared)
@@ -99,6 +108,14 @@ def _refined(
         done.append(one)
         say(stage, len(done), len(starts))
     return sorted(done, key=lambda one: -one.likeness.score)
+
+
+def _within(first: RigidTransform, found: RigidTransform, capture_mm: float, capture_rad: float) -> bool:
+    """Whether a place is no farther from the start than a corner of the box, and a fifth."""
+    step = found.inv() * first
+    far = np.sqrt(3.0) * 1.2
+    length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
+    return bool(length <= far * capture_mm + 1.0 and angle <= far * capture_rad + 0.02)
 
 
 def _distinct(estimates: list[Estimate], centre_mm: FloatArray) -> list[Estimate]:

@@ -66,14 +66,15 @@ def crossing_sweeps(
 ):
     """Two sweeps of one scene, and the true sensor_from_image; jitter in mm and degrees."""
     rng = np.random.default_rng(seed)
-    grid = grid or ImageGrid(72, 300, 0.45, 0.12)
-    side = max(length_mm, grid.width_mm) + 24.0 + grid.depth_mm * np.tan(np.deg2rad(fan_deg / 2.0))
+    grid = grid or ImageGrid(64, 240, 0.45, 0.14)
+    fans = np.broadcast_to(fan_deg, 2)
+    side = max(length_mm, grid.width_mm) + 24.0 + grid.depth_mm * np.tan(np.deg2rad(max(fans) / 2.0))
     size = np.array([side, grid.depth_mm + 12.0, side])
     level, sheets = tissue(rng, size, voxel_mm)
     made = []
     for number in range(2):
         grey = seen_by(rng, level, sheets, voxel_mm, 2 - 2 * number, 0.15) if speckle else level
-        poses = _path(rng, frames, length_mm, fan_deg, crossing_deg * number, grid, size)
+        poses = _path(rng, frames, length_mm, fans[number], crossing_deg * number, grid, size)
         images = _frames(grey, voxel_mm, poses, grid)
         sensor = poses * MOUNTING.inv() * _jitter(rng, frames, jitter)
         time_s = np.arange(frames) * 0.04
