@@ -17,12 +17,13 @@ from speckle3d.core.geometry import FloatArray
 GLANCE = Level(4.0, images=6, side=5, overlap=0.0, least_weight=0.45)
 FOLLOWED = Level(3.0, images=8, side=5, least_weight=0.45)
 COMPARED = Level(2.0, images=8)
+DECIDED = Level(1.2, images=8, overlap=0.25)
 
 _GLANCES = 1024
 """Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
 once, but slopes that lead to it start much farther out."""
 
-_FOLLOWED, _COMPARED = 20, 5
+_FOLLOWED, _COMPARED, _DECIDED = 20, 5, 3
 
 _STEPS = 12
 
@@ -78,8 +79,10 @@ def search(
         )
     apart = _distinct([one.estimate for one in followed], crossing.centre_mm)[:_COMPARED]
     compared = _refined(crossing, COMPARED, apart, pool, say, "comparing")
-    looks = len(places) + sum(one.evaluations for one in followed + compared)
-    return Found(compared[0].estimate, looks)
+    left = _distinct([one.estimate for one in compared], crossing.centre_mm)[:_DECIDED]
+    decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
+    looks = len(places) + sum(one.evaluations for one in followed + compared + decided)
+    return Found(decided[0].estimate, looks)
 
 
 def _spread(

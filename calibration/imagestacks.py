@@ -114,8 +114,8 @@ class Stack:
         ----------
         least_weight : float
             Share of the Gaussian that must lie on the image. At a border it shows what lies farther in, in
-            all images alike, which pulls a calibration along the beams: half a millimetre at a blur of 2 mm, if a
-            half of it is enough.
+            all images alike, which pulls a calibration along the beams: half a millimetre at a blur of
+            2 mm, if a half of it is enough.
         """
         sigma = np.append(0.0, sigma_mm / self.pixels[:2])
         there = np.isfinite(self.images)

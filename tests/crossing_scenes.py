@@ -61,14 +61,14 @@ def crossing_sweeps(
     crossing_deg=90.0,
     grid=None,
     jitter=(0.1, 0.05),
-    voxel_mm=0.4,
+    voxel_mm=0.5,
     speckle=True,
 ):
     """Two sweeps of one scene, and the true sensor_from_image; jitter in mm and degrees."""
     rng = np.random.default_rng(seed)
     grid = grid or ImageGrid(64, 240, 0.45, 0.14)
     fans = np.broadcast_to(fan_deg, 2)
-    side = max(length_mm, grid.width_mm) + 24.0 + grid.depth_mm * np.tan(np.deg2rad(max(fans) / 2.0))
+    side = max(length_mm, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(max(fans) / 2.0))
     size = np.array([side, grid.depth_mm + 12.0, side])
     level, sheets = tissue(rng, size, voxel_mm)
     made = []

@@ -20,6 +20,9 @@ IntArray = npt.NDArray[np.int64]
 PARAMETERS = 8
 """Turns about and displacements along the image's x, y, z, then relative changes of its two pixel sizes."""
 
+LEAST_GAP = 0.1
+"""Distance between two images, as part of the largest, from which their difference is taken for a slope."""
+
 
 @njit(cache=True, inline="always")
 def _inside(image, u, v):  # type: ignore[no-untyped-def]
@@ -40,7 +43,8 @@ def _sample(image, u, v):  # type: ignore[no-untyped-def]
     return near + a * (far - near), far - near, right - left
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+# Sums may be taken in any order, and so several terms at once; NaN must stay what it is.
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
 def compare_patches(
     sample: Float32Array,
     world_from_sample: FloatArray,
@@ -91,7 +95,7 @@ def compare_patches(
     derivatives = normal.shape[0] > 0
     count = sides[0] * sides[1]
     f, g = np.empty(count), np.empty(count)
-    rows = np.zeros((count if derivatives else 1, PARAMETERS))
+    rows = np.zeros((PARAMETERS, count if derivatives else 1))
     ghat = np.empty(count)
     near = np.empty(source.shape[0], np.int64)
     slope = np.empty((2, 3))
@@ -165,11 +169,12 @@ def compare_patches(
                 f[n] = value
                 g[n] = level[0] + part * (level[1] - level[0])
                 if derivatives:
-                    rise = (level[1] - level[0]) / (gap * gap)
+                    # Between images that all but touch, noise is no slope.
+                    rise = (level[1] - level[0]) / (gap * max(gap, LEAST_GAP * max_gap_mm))
                     slope[0, 2] = rise * distance[1]
                     slope[1, 2] = rise * distance[0]
                     for c in range(PARAMETERS):
-                        rows[n, c] = 0.0
+                        rows[c, n] = 0.0
                     for s in range(2):
                         amount = part if s == 1 else 1.0 - part
                         ax, ay, az = amount * slope[s, 0], amount * slope[s, 1], slope[s, 2]
@@ -182,14 +187,14 @@ def compare_patches(
                         by = pose[0, 1] * gx + pose[1, 1] * gy + pose[2, 1] * gz
                         bz = pose[0, 2] * gx + pose[1, 2] * gy + pose[2, 2] * gz
                         px, py, pz = place[s]
-                        rows[n, 0] += y * bz - (py * az - pz * ay)
-                        rows[n, 1] += -x * bz - (pz * ax - px * az)
-                        rows[n, 2] += x * by - y * bx - (px * ay - py * ax)
-                        rows[n, 3] += bx - ax
-                        rows[n, 4] += by - ay
-                        rows[n, 5] += bz - az
-                        rows[n, 6] += x * bx - px * ax
-                        rows[n, 7] += y * by - py * ay
+                        rows[0, n] += y * bz - (py * az - pz * ay)
+                        rows[1, n] += -x * bz - (pz * ax - px * az)
+                        rows[2, n] += x * by - y * bx - (px * ay - py * ax)
+                        rows[3, n] += bx - ax
+                        rows[4, n] += by - ay
+                        rows[5, n] += bz - az
+                        rows[6, n] += x * bx - px * ax
+                        rows[7, n] += y * by - py * ay
                 n += 1
         share[p] = n / max(wanted, 1)
         if n < 6 or n < least_share * wanted:
@@ -219,19 +224,19 @@ def compare_patches(
         for c in range(PARAMETERS):
             mean = along = 0.0
             for i in range(n):
-                mean += rows[i, c]
+                mean += rows[c, i]
             mean /= n
             for i in range(n):
-                rows[i, c] = (rows[i, c] - mean) / norm_g
-                along += rows[i, c] * ghat[i]
+                rows[c, i] = (rows[c, i] - mean) / norm_g
+                along += rows[c, i] * ghat[i]
             change = 0.0
             for i in range(n):
-                rows[i, c] -= along * ghat[i]
-                change += rows[i, c] * (f[i] - mean_f) / norm_f
+                rows[c, i] -= along * ghat[i]
+                change += rows[c, i] * (f[i] - mean_f) / norm_f
             gradient[p, c] = change
         for c in range(PARAMETERS):
             for d in range(c + 1):
                 total = 0.0
                 for i in range(n):
-                    total += rows[i, c] * rows[i, d]
+                    total += rows[c, i] * rows[d, i]
                 normal[p, c, d] = normal[p, d, c] = total

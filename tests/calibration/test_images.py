@@ -41,15 +41,17 @@ def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     start = displaced(scene[2], np.random.default_rng(seed))
     result = found if seed == 0 else calibrate_crossing(crossing, start)
     error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
-    # Half a millimetre, and 0.2 mm along the beams, where averaging over starts is no help.
+    # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.
     assert np.linalg.norm(error) < 0.5
-    assert abs(error[1]) < 0.2
+    assert np.linalg.norm(error[[0, 2]]) < 0.1
     turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
     assert np.rad2deg(turned) < 0.5
 
 
 def test_result_says_what_was_gained(found):
-    assert found.similarity.after > found.similarity.before
+    # No overlap at all at such a start, or less alike.
+    assert not found.similarity.before >= found.similarity.after
+    assert found.similarity.after > 0.9
     assert found.held_out.after > 0.9
     assert found.converged
     assert found.evaluations > 1000
@@ -96,9 +98,9 @@ def test_pixel_sizes_are_found():
     start = displaced(truth, np.random.default_rng(4), 2.0, 2.0)
     result = calibrate_images(*views, start, dataclasses.replace(REFINE, scales=True))
     assert (result.scale_errors > 0).all()
-    assert (np.abs(result.scales - [1.03, 0.98]) < 4.0 * result.scale_errors).all()
-    # Three per cent off at first.
-    assert abs(result.scales[0] - 1.03) < 0.01
+    # The size across the beams, three per cent off at first; that along them stays uncertain.
+    assert abs(result.scales[0] - 1.03) < min(0.01, 4.0 * result.scale_errors[0])
+    assert result.scale_errors[1] > 3.0 * result.scale_errors[0]
     np.testing.assert_allclose(
         result.pixel_mm / result.scales, [wrong.vector_pitch_mm, wrong.sample_spacing_mm]
     )
@@ -188,7 +190,8 @@ def test_progress_is_told(scene, others):
     start = displaced(others[2], np.random.default_rng(10), 1.0, 1.0)
     calibrate_images(*others[:2], start, progress=lambda *step: told.append(step))
     stages = [stage for stage, *_ in told]
-    order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing", "refining"]
+    order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
+    order += ["deciding", "refining"]
     assert list(dict.fromkeys(stages)) == order
     assert all(1 <= done <= total for _, done, total in told)
 
@@ -231,3 +234,14 @@ def test_bad_input_is_named(scene):
         ImageSettings(capture_mm=-1.0)
     with pytest.raises(InvalidInputError, match="threads"):
         ImageSettings(threads=0)
+
+
+def test_no_bias_along_the_beams():
+    errors = []
+    for seed in range(4):
+        first, second, truth = crossing_sweeps(seed, frames=36, jitter=(0.0, 0.0))
+        start = displaced(truth, np.random.default_rng(seed), 0.5, 0.5)
+        result = calibrate_images(first, second, start, REFINE)
+        errors.append(centre_error_mm(result.sensor_from_image, truth, first.grid)[1])
+    # Published: 2 mm. The bound; of a scene's own reflections 0.1 mm remain, half as much of four.
+    assert abs(np.mean(errors)) < 0.15
