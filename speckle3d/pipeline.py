@@ -10,7 +10,15 @@ from collections.abc import Callable, Iterator, Sequence
 
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.blocks import Block, ImageSink, MatchedBlock, MatchedFrame, blocks_of, match_block
+from speckle3d.blocks import (
+    Block,
+    ImageSink,
+    MatchedBlock,
+    MatchedFrame,
+    StageTimes,
+    blocks_of,
+    match_block,
+)
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
@@ -56,16 +64,41 @@ def track(
         If frames have no speckle in common.
     """
     settings = config or Config()
-    if len(sweep) < 2:
-        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
-    matcher = FrameMatcher(sweep, settings.intensity, settings.patches, settings.inplane, settings.matching)
-    curves.key.require_same(matcher.key)
+    matcher = _matcher_for(sweep, curves, settings)
     walk = Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
     for each in _matched(walk, images, matched):
         walk.place(each)
         if progress:
             progress(each.frame + 1, len(sweep))
     return Solution(walk, curves).solve(sink)
+
+
+def match_ahead(
+    sweep: Sweep,
+    curves: DecorrelationCurves,
+    block: Block,
+    config: Config | None = None,
+    images: ImageSink | None = None,
+) -> MatchedBlock:
+    """Match one block of a sweep, for `track` to take; any process may do so, and in any order.
+
+    Raises
+    ------
+    MismatchError, InsufficientDataError
+        As `track`, before any work is done: the curves are not used otherwise.
+    """
+    settings, times = config or Config(), StageTimes()
+    matcher = _matcher_for(sweep, curves, settings)
+    frames = list(match_block(sweep, matcher, settings, block, images, times))
+    return MatchedBlock(frames, times.seconds)
+
+
+def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
+    if len(sweep) < 2:
+        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
+    matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
+    curves.key.require_same(matcher.key)
+    return matcher
 
 
 def _matched(walk: Walk, images: ImageSink | None, given: BlockSource | None) -> Iterator[MatchedFrame]:

@@ -1,8 +1,9 @@
 """Sweeps in, a study's folder out: what ``speckle3d compare`` does.
 
 Every sweep is one job with a folder of its own, which appears whole or not at all under a name that holds a
-hash of everything that determines its content. A study started again finds those folders and skips their
-sweeps; a worker that is killed leaves nothing behind but the work it was at.
+hash of everything that determines its content. Before a long sweep come jobs for blocks of its frames, whose
+results are kept in ``blocks/`` until the sweep is done. A study started again finds folders and blocks and
+skips what they hold; a worker that is killed leaves nothing behind but the work it was at.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import io
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -24,10 +26,27 @@ from speckle3d.study.metrics import ModeError
 from speckle3d.study.overall import over_sweeps, overall_text
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
 from speckle3d.study.summary import Summary, csv_text, plain, table_text
-from speckle3d.study.sweepjob import SweepJob, SweepOutcome, finished, lost, plan_sweep, run_sweep
+from speckle3d.study.sweepjob import (
+    BlockJob,
+    BlockOutcome,
+    SweepJob,
+    SweepOutcome,
+    block_files,
+    finished,
+    lost,
+    lost_block,
+    plan_blocks,
+    plan_sweep,
+    run_block,
+    run_sweep,
+)
 
 FORMAT = "speckle3d.study"
 VERSION = 1
+MATCHING_SHARE = 0.7
+"""Of a sweep's time, roughly (``tests/benchmarks/bench_speed.py``); the rest is its own job's."""
+Task = SweepJob | BlockJob
+TaskOutcome = SweepOutcome | BlockOutcome
 KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
 
 
@@ -50,20 +69,35 @@ class StudyProgress:
     frames: int
     done: int = 0
     failed: int = 0
-    done_frames: int = 0
+    done_frames: float = 0.0
     remaining_s: float | None = None
-    _timed: list[tuple[int, float]] = field(default_factory=list)
+    blocks: int = 0
+    _timed: list[tuple[float, float]] = field(default_factory=list)
+    _matched: dict[str, float] = field(default_factory=dict)
 
     def add(self, outcome: SweepOutcome, frames: int, workers: int) -> None:
         """Count a finished sweep; only those that took time say how long others take."""
         self.done += 1
-        self.done_frames += frames
+        self.done_frames += frames - self._matched.pop(outcome.name, 0.0)
         self.failed += outcome.status == "failed"
         if outcome.status == "done" and not outcome.skipped:
             self._timed.append((frames, outcome.seconds))
+        self._look_ahead(workers)
+
+    def add_block(self, outcome: BlockOutcome, workers: int) -> None:
+        """Count a block of a sweep that is not finished, one of `blocks` that are left."""
+        self.blocks -= 1
+        work = MATCHING_SHARE * outcome.frames
+        self._matched[outcome.name] = self._matched.get(outcome.name, 0.0) + work
+        self.done_frames += work
+        if not outcome.reason and not outcome.skipped:
+            self._timed.append((work, outcome.seconds))
+        self._look_ahead(workers)
+
+    def _look_ahead(self, workers: int) -> None:
+        running = min(workers, self.sweeps - self.done + self.blocks)
         left = self.frames - self.done_frames
-        running = min(workers, self.sweeps - self.done)
-        self.remaining_s = remaining_s(self._timed, left, running) if left else 0.0
+        self.remaining_s = remaining_s(self._timed, left, running) if self.done < self.sweeps else 0.0
 
 
 def compare_sweeps(
@@ -90,7 +124,7 @@ def compare_sweeps(
     curves : path, optional
         Decorrelation curves; by default curves.h5 beside each sweep.
     progress : callable, optional
-        Called at the beginning and after each sweep.
+        Called at the beginning and after each sweep, and each block of a long one.
     """
     if not paths:
         raise InvalidInputError("expected at least one sweep, got none")
@@ -103,17 +137,43 @@ def compare_sweeps(
         for name, path in _named(paths)
     ]
     jobs = [each for each in plan if isinstance(each, SweepJob)]
+    by_name = {job.name: job for job in jobs}
     outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
-    so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs))
+    tasks, after = _tasks(jobs)
+    so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
     if progress:
         progress(so_far)
-    for number, outcome in where.run(run_sweep, jobs, lost):
-        outcomes[outcome.name] = _require_here(outcome, jobs[number])
-        so_far.add(outcome, jobs[number].frames, where.workers)
+    for _, outcome in where.run(run_task, tasks, lost_task, after):
+        if isinstance(outcome, BlockOutcome):
+            so_far.add_block(outcome, where.workers)
+        else:
+            outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
+            so_far.add(outcome, by_name[outcome.name].frames, where.workers)
         if progress:
             progress(so_far)
     _clear(jobs)
     return _write_study(directory, [outcomes[each.name] for each in plan], settings)
+
+
+def run_task(task: Task) -> TaskOutcome:
+    """Do a sweep's or a block's job."""
+    return run_block(task) if isinstance(task, BlockJob) else run_sweep(task)
+
+
+def lost_task(task: Task, reason: str) -> TaskOutcome:
+    """Outcome of a job that has none of its own."""
+    return lost_block(task, reason) if isinstance(task, BlockJob) else lost(task, reason)
+
+
+def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[Task], dict[int, range]]:
+    """All jobs, and which come after which: a long sweep's own after those of its blocks."""
+    tasks: list[Task] = []
+    after: dict[int, range] = {}
+    for job in jobs:
+        blocks = plan_blocks(job)
+        after[len(tasks) + len(blocks)] = range(len(tasks), len(tasks) + len(blocks))
+        tasks += [*blocks, job]
+    return tasks, after
 
 
 def _require_here(outcome: SweepOutcome, job: SweepJob) -> SweepOutcome:
@@ -147,6 +207,8 @@ def _clear(jobs: Sequence[SweepJob]) -> None:
     for job in jobs:
         for part in job.folder.parent.glob(f".part-*-{job.folder.name}"):
             shutil.rmtree(part, ignore_errors=True)
+        with suppress(OSError):
+            block_files(job).folder.parent.rmdir()
 
 
 def _write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:

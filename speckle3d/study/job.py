@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
@@ -19,26 +19,26 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.streams import BoolArray
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.direction import sensed_orientation
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.motion.intensity import Float32Array, IntensityExtractor
+from speckle3d.motion.intensity import Float32Array
 from speckle3d.motion.quality import describe
 from speckle3d.pipeline import Progress, correct, require_modes, track
 from speckle3d.solution import Tracked
+from speckle3d.study.blockfiles import BlockFiles
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.metrics import END_FRAMES, ModeError, accumulated, compare_modes
+from speckle3d.study.strip import Strip
 from speckle3d.study.summary import Summary, table_text, write_summary
 
 REFERENCES = ("tracker", "truth")
 SUBSET = "image+subset"
 """Mode of the images alone with the patches that contradict the sensed orientation left out."""
-STRIP_MM = 2.4
-STRIP_SPACING_MM = 0.1
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,7 @@ def run_job(
     config: Config | None = None,
     progress: Progress | None = None,
     calibrations: Sequence[PathLike] = (),
+    blocks: BlockFiles | None = None,
 ) -> JobResult:
     """Reconstruct a sweep and write everything that belongs to it into `directory`.
 
@@ -85,20 +86,20 @@ def run_job(
         What to compare with; by default the truth if stored, else the tracker, else nothing.
     calibrations : sequence of path
         Calibration files, at most one for each sensor, in place of what the sweep says of its sensors.
+    blocks : BlockFiles, optional
+        Blocks of the sweep that have been matched already.
     """
     settings = config or Config()
     began = time.perf_counter()
     sweep, mounted = apply_calibrations(sweep, calibrations)
+    compared = require_possible(sweep, drift, reference, settings)
     fitted = [mode for mode in drift if mode != SUBSET]
-    require_modes(sweep, fitted)
-    if SUBSET in drift:
-        _require_subset(sweep, settings)
-    compared = find_reference(sweep, reference)
     make_folder(directory)
-    strip = _Strip(sweep, settings)
+    strip = Strip(sweep, settings)
     path = directory / "reconstruction.h5"
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
-        tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep)
+        held = None if blocks is None else partial(blocks.read, strip=strip)
+        tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep, held)
         corrections = correct(tracked, sweep, fitted, settings)
         poses = {"image": tracked.image}
         if SUBSET in drift and tracked.subset is not None:
@@ -110,6 +111,22 @@ def run_job(
     files = [path, *write_summary(directory, [summary])]
     files += _draw(directory, sweep, poses, compared, strip, tracked.covariance)
     return JobResult(directory, summary, table_text([summary]), tuple(files), time.perf_counter() - began)
+
+
+def require_possible(
+    sweep: Sweep, drift: Sequence[str], reference: str | None, config: Config
+) -> Reference | None:
+    """Check that a sweep has what is asked of it, before any work is done; returns the reference.
+
+    Raises
+    ------
+    InvalidInputError, InsufficientDataError
+        Naming the mode or the reference that cannot be.
+    """
+    require_modes(sweep, [mode for mode in drift if mode != SUBSET])
+    if SUBSET in drift:
+        _require_subset(sweep, config)
+    return find_reference(sweep, reference)
 
 
 def available_modes(sweep: Sweep, config: Config) -> list[str]:
@@ -238,46 +255,12 @@ def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
     }
 
 
-class _Strip:
-    """A few vectors about the middle of every frame, pooled in depth: enough for a reslice, and small."""
-
-    def __init__(self, sweep: Sweep, config: Config) -> None:
-        grid = IntensityExtractor.for_sweep(sweep, config.intensity).grid
-        width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
-        self._first = (grid.vectors - width) // 2
-        self._pool = max(1, round(STRIP_SPACING_MM / grid.sample_spacing_mm))
-        self.grid = ImageGrid(
-            width,
-            grid.samples // self._pool,
-            grid.vector_pitch_mm,
-            grid.sample_spacing_mm * self._pool,
-            grid.first_sample_depth_mm + (self._pool - 1) / 2 * grid.sample_spacing_mm,
-        )
-        self.left_mm = self._first * grid.vector_pitch_mm
-        self._images: list[npt.NDArray[np.float16]] = []
-
-    def keep(self, index: int, intensity: Float32Array) -> None:
-        """Keep the strip of the next frame."""
-        part = intensity[self._first : self._first + self.grid.vectors, : self.grid.samples * self._pool]
-        pooled = part.reshape(self.grid.vectors, self.grid.samples, self._pool).mean(axis=2)
-        decibel = 10 * np.log10(np.maximum(pooled, 1e-12))
-        self._images.append(decibel.astype(np.float16))
-
-    def __getitem__(self, index: int) -> Float32Array:
-        return self._images[index].astype(np.float32)
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-        return len(self._images), self.grid.vectors, self.grid.samples
-
-
 def _draw(
     directory: Path,
     sweep: Sweep,
     poses: dict[str, RigidTransform],
     reference: Reference | None,
-    strip: _Strip,
+    strip: Strip,
     covariance: FloatArray,
 ) -> list[Path]:
     drift = figure_drift(
@@ -304,7 +287,7 @@ def _draw(
 
 
 def _reslice(
-    strip: _Strip, world_from_image: RigidTransform
+    strip: Strip, world_from_image: RigidTransform
 ) -> tuple[Float32Array, tuple[float, float, float, float]]:
     plane = along_sweep_plane(world_from_image, strip.grid, strip.grid.width_mm / 2, pixel_mm=0.1)
     plane = replace(plane, height_mm=min(plane.height_mm, 200.0), width_mm=min(plane.width_mm, 400.0))

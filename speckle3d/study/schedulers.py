@@ -2,14 +2,15 @@
 
 A job is a function of one argument that returns a result and does not raise; both ways call the same function
 with the same argument, so the results are the same. A job that its worker does not survive, tried again on
-others, becomes a result by `lost`, so that it cannot stop a study.
+others, becomes a result by `lost`, so that it cannot stop a study. A job may come after others: it starts
+when they have ended, and is lost if one of them was.
 """
 
 from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -21,6 +22,8 @@ from speckle3d.io.hdf5 import one_line
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+After = Mapping[int, Collection[int]]
+"""Numbers of the jobs that each job comes after, all of them lower than its own."""
 
 CONNECT_S = 20
 """How long a cluster may take to answer; one on the same network takes far below a second."""
@@ -32,7 +35,11 @@ class Scheduler(Protocol):
     """Runs jobs somewhere and hands over each result as it comes, in any order."""
 
     def run(
-        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+        self,
+        function: Callable[[Job], Result],
+        jobs: Sequence[Job],
+        lost: Callable[[Job, str], Result],
+        after: After | None = None,
     ) -> Iterator[tuple[int, Result]]:
         """Yield the number of each job and its result."""
 
@@ -46,7 +53,11 @@ class InProcess:
     """One job after another, here."""
 
     def run(
-        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+        self,
+        function: Callable[[Job], Result],
+        jobs: Sequence[Job],
+        lost: Callable[[Job, str], Result],
+        after: After | None = None,
     ) -> Iterator[tuple[int, Result]]:
         """Yield the number of each job and its result, in order."""
         for number, job in enumerate(jobs):
@@ -63,48 +74,116 @@ class OnCluster:
     """On the workers that a Dask client reaches.
 
     Each job is one task, given to a worker when it is free. The task of a worker that dies is given to
-    another; a task that has taken several workers with it is given up.
+    another; a task that has taken several workers with it is given up. Jobs that others wait for go first.
     """
 
     client: Any
 
     def run(
-        self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
+        self,
+        function: Callable[[Job], Result],
+        jobs: Sequence[Job],
+        lost: Callable[[Job, str], Result],
+        after: After | None = None,
     ) -> Iterator[tuple[int, Result]]:
         """Yield the number of each job and its result as they come."""
-        suspects = []
-        for number, reason, result in self._arriving(function, dict(enumerate(jobs))):
-            if reason == _KILLED:
-                suspects.append(number)
-                continue
-            yield number, result if reason is None else lost(jobs[number], reason)
-        # The cluster blames a death on all that waited at the worker; alone, each shows if it was the one.
-        for suspect in suspects:
-            for number, reason, result in self._arriving(function, {suspect: jobs[suspect]}):
-                yield number, result if reason is None else lost(jobs[number], reason)
+        order = _Order({number: (after or {}).get(number, ()) for number in range(len(jobs))})
+        while order.waiting:
+            suspects = []
+            for number, reason, result in self._arriving(function, jobs, order):
+                if reason == _KILLED:
+                    suspects.append(number)
+                else:
+                    yield from _ended(number, reason, result, jobs, lost, order)
+            # The cluster blames a death on all that waited at the worker; alone, each shows if it was it.
+            for suspect in suspects:
+                for number, reason, result in self._arriving(function, jobs, _Order({suspect: ()})):
+                    yield from _ended(number, reason, result, jobs, lost, order)
 
     def _arriving(
-        self, function: Callable[[Job], Result], jobs: Mapping[int, Job]
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], order: _Order
     ) -> Iterator[tuple[int, str | None, Any]]:
-        """Submit jobs and yield why each failed, or None, and its result, as they end."""
-        # Not pure: a job's key must not be taken for that of an earlier study that is still held.
-        futures = {number: self.client.submit(function, job, pure=False) for number, job in jobs.items()}
-        numbers = {future.key: number for number, future in futures.items()}
+        """Submit jobs as their turn comes; yield why each failed, or None, and its result, as they end."""
+        held: dict[Any, tuple[int, Any]] = {}
+        arriving = _dask().as_completed()
         try:
-            for future in _dask().as_completed(list(futures.values())):
-                number, reason = numbers[future.key], _failure(future)
-                result = future.result() if reason is None else None
+            while True:
+                for number in order.start():
+                    # Not pure: a job's key must not be taken for that of an earlier study that is still held.
+                    future = self.client.submit(
+                        function, jobs[number], pure=False, priority=order.priority[number]
+                    )
+                    held[future.key] = number, future
+                    arriving.add(future)
+                if not held:
+                    return
+                future = next(arriving)
                 # A result that is still asked for would be made again if its worker died.
-                del futures[number]
+                number, _ = held.pop(future.key)
+                reason = _failure(future)
+                result = future.result() if reason is None else None
                 future.release()
                 yield number, reason, result
         finally:
-            self.client.cancel(list(futures.values()))
+            self.client.cancel([future for _, future in held.values()])
 
     @property
     def workers(self) -> int:
         """Threads of all workers, as they are now."""
         return max(1, int(sum(self.client.nthreads().values())))
+
+
+class _Order:
+    """Which jobs may start.
+
+    Attributes
+    ----------
+    waiting : dict
+        The jobs that have not started, each with those that it waits for.
+    priority : dict
+        Of every job: what finishes something begun goes first, then what others wait for.
+    """
+
+    def __init__(self, after: After) -> None:
+        self.waiting = {number: set(others) for number, others in after.items()}
+        needed = set().union(*after.values())
+        self.priority = {n: 2 if others else int(n in needed) for n, others in after.items()}
+
+    def start(self) -> list[int]:
+        """Jobs that wait for nothing any more; they wait no longer."""
+        ready = [number for number, others in self.waiting.items() if not others]
+        for number in ready:
+            del self.waiting[number]
+        return ready
+
+    def end(self, number: int) -> None:
+        """Let go of those that waited for a job."""
+        for others in self.waiting.values():
+            others.discard(number)
+
+    def give_up(self, number: int) -> list[int]:
+        """Take out those that waited for a job, and those that waited for them."""
+        gone = [n for n, others in self.waiting.items() if number in others]
+        for each in gone:
+            del self.waiting[each]
+        return gone + [n for each in gone for n in self.give_up(each)]
+
+
+def _ended(
+    number: int,
+    reason: str | None,
+    result: Any,
+    jobs: Sequence[Job],
+    lost: Callable[[Job, str], Result],
+    order: _Order,
+) -> Iterator[tuple[int, Result]]:
+    """Results that the end of a job brings: its own, or if it was lost, those of all that come after it."""
+    if reason is None:
+        order.end(number)
+        yield number, result
+        return
+    for each in (number, *order.give_up(number)):
+        yield each, lost(jobs[each], reason)
 
 
 @contextmanager
@@ -156,17 +235,17 @@ def local_cluster(workers: int) -> Iterator[Any]:
         yield client
 
 
-def remaining_s(finished: Sequence[tuple[int, float]], left_frames: int, workers: int) -> float | None:
+def remaining_s(finished: Sequence[tuple[float, float]], left_frames: float, workers: int) -> float | None:
     """Time that is left, from the median time per frame of what is finished; None before anything is.
 
     Parameters
     ----------
     finished : sequence of (frames, seconds)
-        Of each finished sweep, on its worker.
+        Of each finished job, on its worker.
     left_frames : int
-        In the sweeps that are not finished.
+        In what is not finished.
     workers : int
-        How many sweeps run at a time.
+        How many jobs run at a time.
     """
     rates = [seconds / frames for frames, seconds in finished if frames > 0]
     if not rates:

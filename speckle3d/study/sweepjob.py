@@ -1,4 +1,8 @@
-"""One sweep of a study as a job: it travels to a worker, works in a folder of its own, never raises."""
+"""One sweep of a study as a job: it travels to a worker, works in a folder of its own, never raises.
+
+The blocks of a long sweep are jobs of their own, which need nothing of each other (`speckle3d.blocks`). What
+they leave, the sweep's own job takes; a block that is not there it does itself.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +17,20 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from speckle3d.config import config_from_toml
+from speckle3d.blocks import Block, blocks_of
+from speckle3d.config import Config, config_from_toml
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import one_line, sha256_of
 from speckle3d.io.load import companion_files, load_landmarks, load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.study.job import available_modes, find_reference, run_job
+from speckle3d.pipeline import match_ahead
+from speckle3d.study.blockfiles import BlockFiles
+from speckle3d.study.job import available_modes, find_reference, require_possible, run_job
 from speckle3d.study.scoring import drift_rows
+from speckle3d.study.strip import Strip
 from speckle3d.study.summary import plain
 
 DONE = "job.json"
@@ -41,6 +50,8 @@ class SweepJob:
         Beside `image`; None for all that the sweep has sensors for.
     key : str
         SHA-256 of the input's bytes, configuration, version, modes, reference, curves and calibrations.
+    stamp : tuple of int
+        Size and time of change of the input from before it was hashed: as long as they last, so do its bytes.
     """
 
     name: str
@@ -54,6 +65,15 @@ class SweepJob:
     sha256: str
     key: str
     frames: int
+    stamp: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class BlockJob:
+    """One block of a long sweep to match."""
+
+    sweep: SweepJob
+    block: Block
 
 
 @dataclass(frozen=True)
@@ -72,6 +92,17 @@ class SweepOutcome:
     skipped: bool = False
 
 
+@dataclass(frozen=True)
+class BlockOutcome:
+    """What became of one block; `reason` says why if it failed, and is empty if it did not."""
+
+    name: str
+    frames: int
+    reason: str = ""
+    seconds: float = 0.0
+    skipped: bool = False
+
+
 def plan_sweep(
     name: str,
     path: Path,
@@ -86,6 +117,7 @@ def plan_sweep(
     path = path.resolve()
     found = (curves or path.parent / "curves.h5").resolve()
     try:
+        stamp = _stamp(path)
         frames, sha256 = len(load_sweep(path)), sha256_of(path)
         used = [sha256_of(each) for each in (found, *calibrations, *companion_files(path))]
     except Exception as error:  # noqa: BLE001 - one row that says why
@@ -94,22 +126,63 @@ def plan_sweep(
     key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
     folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
     mounted = tuple(each.resolve() for each in calibrations)
-    return SweepJob(name, path, folder, found, settings_toml, modes, reference, mounted, sha256, key, frames)
+    return SweepJob(
+        name, path, folder, found, settings_toml, modes, reference, mounted, sha256, key, frames, stamp
+    )
+
+
+def plan_blocks(job: SweepJob) -> list[BlockJob]:
+    """Blocks to match before a long sweep's own job; none of a sweep that is one block, or finished."""
+    blocks = blocks_of(job.frames, config_from_toml(job.settings_toml).trajectory.block_frames)
+    return [BlockJob(job, block) for block in blocks] if len(blocks) > 1 and finished(job) is None else []
+
+
+def run_block(job: BlockJob) -> BlockOutcome:
+    """Match a block into its file unless it is there; whatever is wrong becomes the outcome's reason."""
+    files, frames, began = block_files(job.sweep), job.block.stop - job.block.first, time.perf_counter()
+    if files.has(job.block):
+        return BlockOutcome(job.sweep.name, frames, skipped=True)
+    try:
+        _require_unchanged(job.sweep)
+        settings = config_from_toml(job.sweep.settings_toml)
+        sweep, _ = apply_calibrations(load_sweep(job.sweep.path), job.sweep.calibrations)
+        require_possible(sweep, _modes(job.sweep, sweep, settings), job.sweep.reference, settings)
+        strip = Strip(sweep, settings)
+        matched = match_ahead(sweep, read_curves(job.sweep.curves), job.block, settings, strip.keep)
+        _require_unchanged(job.sweep)
+        seconds = time.perf_counter() - began
+        files.write(job.block, matched, strip, seconds)
+    except Exception as error:  # noqa: BLE001 - the sweep's own job will find the same, and say so
+        return lost_block(job, _reason(error))
+    return BlockOutcome(job.sweep.name, frames, seconds=seconds)
+
+
+def lost_block(job: BlockJob, reason: str) -> BlockOutcome:
+    """Outcome of a block that has none of its own."""
+    return BlockOutcome(job.sweep.name, job.block.stop - job.block.first, reason)
+
+
+def block_files(job: SweepJob) -> BlockFiles:
+    """Where a sweep's blocks are."""
+    return BlockFiles(job.folder.parents[1] / "blocks" / job.folder.name, job.key)
 
 
 def run_sweep(job: SweepJob) -> SweepOutcome:
     """Do a job unless it is done; whatever is wrong with the sweep becomes the outcome's reason."""
+    files = block_files(job)
     held = finished(job)
     if held is not None:
+        files.clear()
         return held
     # A folder of its own: another worker may be at the same sweep, if this one was thought dead.
     part = job.folder.with_name(f".part-{secrets.token_hex(4)}-{job.folder.name}")
     began = time.perf_counter()
     try:
-        _reconstruct(job, part)
-        seconds = time.perf_counter() - began
+        _reconstruct(job, part, files)
+        seconds = time.perf_counter() - began + files.spent_s
         (part / DONE).write_text(json.dumps({"key": job.key, "seconds": seconds}), encoding="utf-8")
         _move(part, job)
+        files.clear()
     except Exception as error:  # noqa: BLE001
         # One broken sweep, or one bug that it brings to light, must not cost the others.
         return lost(job, _reason(error))
@@ -118,17 +191,21 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
     return _done(job, seconds)
 
 
-def _reconstruct(job: SweepJob, part: Path) -> None:
-    if sha256_of(job.path) != job.sha256:
-        raise InvalidInputError(f"{job.path}: expected the file that the study began with, got another")
-    settings = config_from_toml(job.settings_toml)
-    sweep = load_sweep(job.path)
+def _reconstruct(job: SweepJob, part: Path, files: BlockFiles) -> None:
+    _require_same(job)
+    settings, sweep = config_from_toml(job.settings_toml), load_sweep(job.path)
     mounted, _ = apply_calibrations(sweep, job.calibrations)
-    modes = available_modes(mounted, settings) if job.modes is None else job.modes
-    # `image` is there in any case.
-    modes = [mode for mode in modes if mode != "image"]
     run_job(
-        sweep, job.path, read_curves(job.curves), part, modes, job.reference, settings, None, job.calibrations
+        sweep,
+        job.path,
+        read_curves(job.curves),
+        part,
+        _modes(job, mounted, settings),
+        job.reference,
+        settings,
+        None,
+        job.calibrations,
+        files,
     )
     reference = find_reference(mounted, job.reference)
     rows = []
@@ -136,6 +213,28 @@ def _reconstruct(job: SweepJob, part: Path) -> None:
         poses = read_reconstruction(part / "reconstruction.h5", with_pairs=False).poses
         rows = drift_rows(mounted, poses, reference, load_landmarks(job.path))
     (part / "drift.json").write_text(json.dumps(plain(rows), allow_nan=False), encoding="utf-8")
+
+
+def _modes(job: SweepJob, sweep: Sweep, settings: Config) -> list[str]:
+    """Modes beside `image`, which is there in any case."""
+    modes = available_modes(sweep, settings) if job.modes is None else job.modes
+    return [mode for mode in modes if mode != "image"]
+
+
+def _require_unchanged(job: SweepJob) -> None:
+    """Refuse an input of other bytes, without reading them all where nothing speaks for it."""
+    if _stamp(job.path) != job.stamp:
+        _require_same(job)
+
+
+def _require_same(job: SweepJob) -> None:
+    if sha256_of(job.path) != job.sha256:
+        raise InvalidInputError(f"{job.path}: expected the file that the study began with, got another")
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def finished(job: SweepJob) -> SweepOutcome | None:

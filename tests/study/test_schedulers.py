@@ -6,7 +6,14 @@ import pytest
 from cluster_jobs import double, lost, noted, suicide
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.study.schedulers import InProcess, OnCluster, local_cluster, remaining_s, scheduler_for
+from speckle3d.study.schedulers import (
+    InProcess,
+    OnCluster,
+    _Order,
+    local_cluster,
+    remaining_s,
+    scheduler_for,
+)
 
 # Dask's processes leave sockets to the garbage collector when one is killed.
 pytestmark = pytest.mark.filterwarnings(
@@ -29,10 +36,10 @@ def test_a_cluster_gives_the_same_results(client):
     assert OnCluster(client).workers == 2
 
 
-def test_a_job_that_kills_every_worker_is_lost_and_the_others_are_not(client):
-    found = dict(OnCluster(client).run(suicide, [0, 1, 2], lost))
-    assert (found[0], found[2]) == (0, 2)
-    assert "every worker that tried it died" in found[1]
+def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_others_are_not(client):
+    found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
+    assert (found[0], found[3]) == (0, 3)
+    assert all("every worker that tried it died" in found[number] for number in (1, 2))
 
 
 def test_a_killed_worker_costs_only_the_job_it_was_at(client, tmp_path):
@@ -50,6 +57,29 @@ def test_a_killed_worker_costs_only_the_job_it_was_at(client, tmp_path):
     assert sorted(number for _, number in results) == [2, 3]
     runs = {number: len((tmp_path / f"{number}.runs").read_text().split()) for number in range(4)}
     assert runs == {0: 1, 1: 1, 2: 2, 3: 1}
+
+
+def test_jobs_come_after_those_they_wait_for(client, tmp_path):
+    after = {2: [0, 1], 3: [2]}
+    for number in (0, 2, 3):
+        (tmp_path / f"{number}.go").touch()
+    results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost, after)
+    assert next(results)[0] == 0
+    time.sleep(0.3)
+    # The second has not ended: nothing that waits for it has begun.
+    assert {path.name for path in tmp_path.glob("*.runs")} == {"0.runs", "1.runs"}
+    (tmp_path / "1.go").touch()
+    assert [number for number, _ in results] == [1, 2, 3]
+
+
+def test_jobs_are_given_up_with_those_they_wait_for_and_begun_ones_are_finished_first():
+    order = _Order({0: (), 1: (), 2: [0, 1], 3: [2], 4: [1], 5: ()})
+    assert order.start() == [0, 1, 5]
+    order.end(1)
+    assert order.start() == [4]
+    assert sorted(order.give_up(0)) == [2, 3]
+    assert order.waiting == {}
+    assert order.priority == {0: 1, 1: 1, 2: 2, 3: 2, 4: 2, 5: 0}
 
 
 def test_an_address_without_a_scheduler_is_one_line(monkeypatch):
