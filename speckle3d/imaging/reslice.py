@@ -6,6 +6,8 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 
 from __future__ import annotations
 
+import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,19 @@ MAX_PIXELS = 100_000_000
 
 DEFAULT_PIXEL_MM = 0.2
 """Between the axial and the lateral resolution of a 5-10 MHz probe."""
+
+_THREADS = 2
+_BATCH = 16
+"""Images read at a time, so that a thread has milliseconds to do; memory for them does not grow."""
+
+
+class _Band:
+    """Some rows of a plane: of each pixel the nearest images' distances and levels, behind and in front."""
+
+    def __init__(self, first: int, last: int, columns: int, max_distance_mm: float) -> None:
+        self.first = first
+        self.distance_mm = np.full((2, last - first, columns), max_distance_mm, dtype=np.float32)
+        self.grey = np.full((2, last - first, columns), np.nan, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -85,8 +100,8 @@ def reslice_frames(
 ) -> GreyArray:
     """Cut a plane through a sweep's images.
 
-    One pass over the images, in any order, with memory for the plane alone; images too far from the plane
-    are not even read. A pixel between two images is interpolated linearly by its distances to their planes;
+    One pass over the images, in any order, with memory for the plane and a few images; images too far from
+    the plane are not even read. A pixel between two images is interpolated linearly by its distances to their planes;
     with support on one side only it takes that image's level.
 
     Parameters
@@ -120,11 +135,22 @@ def reslice_frames(
         raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {max_distance_mm}")
     source = PosedImages(images, grid, world_from_image)
     maps = _index_from_pixel(source, plane)
-    distance_mm = np.full((2, *plane.shape), max_distance_mm, dtype=np.float32)
-    grey = np.full((2, *plane.shape), np.nan, dtype=np.float32)
-    for index in np.flatnonzero(_touches(maps, grid, plane, max_distance_mm)):
-        keep_nearest(source.read(int(index)), maps[index], max_distance_mm, distance_mm, grey)
-    return _blend(distance_mm, grey)
+    near = np.flatnonzero(_touches(maps, grid, plane, max_distance_mm))
+    cuts = np.linspace(0, plane.shape[0], _THREADS + 1).astype(int)
+    bands = [_Band(first, last, plane.shape[1], max_distance_mm) for first, last in itertools.pairwise(cuts)]
+
+    def fill(band: _Band) -> None:
+        for image, index in zip(images_read, batch, strict=True):
+            shifted = maps[index].copy()
+            shifted[:, 2] += band.first * shifted[:, 1]
+            keep_nearest(image, shifted, max_distance_mm, band.distance_mm, band.grey)
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        for start in range(0, len(near), _BATCH):
+            batch = near[start : start + _BATCH]
+            images_read = [source.read(int(index)) for index in batch]
+            list(pool.map(fill, bands))
+    return np.concatenate([_blend(band.distance_mm, band.grey) for band in bands])
 
 
 def reslice_volume(volume: Volume, plane: ReslicePlane) -> GreyArray:
