@@ -101,8 +101,8 @@ def reslice_frames(
     """Cut a plane through a sweep's images.
 
     One pass over the images, in any order, with memory for the plane and a few images; images too far from
-    the plane are not even read. A pixel between two images is interpolated linearly by its distances to their planes;
-    with support on one side only it takes that image's level.
+    the plane are not even read. A pixel between two images is interpolated linearly by its distances to
+    their planes; with support on one side only it takes that image's level.
 
     Parameters
     ----------
