@@ -1,7 +1,7 @@
 """Calibration from two crossing sweeps: the published method beside Gauss-Newton on the same starts.
 
 Run: ``pytest tests/benchmarks/bench_image_calibration.py --benchmark-only -s``. STARTS=183 in the environment
-repeats the published study's number of starts; the default is a few. The published method takes three of them.
+repeats the published study's number of starts; the default is a few, three for the published method.
 """
 
 import os
