@@ -45,7 +45,7 @@ class TrajectorySettings(BaseModel):
         "those of its way there; 0: never.",
     )
     block_frames: int = Field(
-        400,
+        500,
         ge=10,
         description="Most frames of a sweep that are matched in one go; longer sweeps are matched in blocks, "
         "which may run at the same time.",
