@@ -207,8 +207,11 @@ def _clear(jobs: Sequence[SweepJob]) -> None:
     for job in jobs:
         for part in job.folder.parent.glob(f".part-*-{job.folder.name}"):
             shutil.rmtree(part, ignore_errors=True)
+        blocks = block_files(job).folder
+        for part in blocks.glob(".part-*"):
+            part.unlink(missing_ok=True)
         with suppress(OSError):
-            block_files(job).folder.parent.rmdir()
+            blocks.parent.rmdir()
 
 
 def _write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:

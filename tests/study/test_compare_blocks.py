@@ -199,6 +199,18 @@ def test_what_is_wrong_with_a_sweep_is_found_before_its_blocks_are_matched(path,
     assert "expected a tracker" in found.outcomes[0].reason
 
 
+def test_a_sweep_whose_block_is_lost_is_one_row_that_says_why(path, tmp_path):
+    class Losing(InProcess):
+        def run(self, function, jobs, lost, after=None):
+            (last,) = [number for number, before in after.items() if before]
+            assert list(after[last]) == [0, 1, 2]
+            yield from ((number, lost(jobs[number], "every worker died")) for number in (1, last))
+
+    found = compare_sweeps([path], tmp_path, config=CONFIG, scheduler=Losing())
+    assert [(each.status, each.reason) for each in found.outcomes] == [("failed", "every worker died")]
+    assert "long  failed: every worker died" in found.table
+
+
 def test_a_file_that_changed_under_its_blocks_is_refused(path, tmp_path):
     mine = tmp_path / "mine.h5"
     shutil.copy(path, mine)
