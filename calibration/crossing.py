@@ -15,7 +15,6 @@ from calibration.imagestacks import (
     Stack,
     TrackedImages,
     read_stack,
-    travelled,
 )
 from calibration.similarity import Comparison, spread_patches, whole_images
 from speckle3d.core.errors import MismatchError
@@ -195,8 +194,7 @@ def evenly(count: int, wanted: int) -> IntArray:
 
 def frame_spacing(stack: Stack, sensor_from_image: RigidTransform) -> float:
     """Usual distance between neighbouring images, mm, pauses aside."""
-    centre = stack.world_from_sensor * sensor_from_image * RigidTransform.from_translation(stack.centre_mm)
-    way = travelled(centre)
+    way = stack.travelled(sensor_from_image)
     return float(way[-1] / max(len(way) - 1, 1))
 
 

@@ -23,7 +23,10 @@ _GLANCES = 1024
 """Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
 once, but slopes that lead to it start much farther out."""
 
-_FOLLOWED, _COMPARED, _DECIDED = 20, 5, 3
+_BESIDE = 256
+"""Places looked at about each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
+
+_FOLLOWED, _COMPARED, _HOPPED, _DECIDED = 20, 5, 3, 3
 
 _STEPS = 12
 
@@ -55,7 +58,7 @@ def search(
     """
     say = progress or _silent
     first = start.sensor_from_image
-    places = _spread(first, crossing.centre_mm, capture_mm, capture_rad)
+    places = _spread(first, capture_mm, capture_rad, _GLANCES)
     glance = crossing.level(GLANCE, first)
     scores = np.empty(len(places))
     for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
@@ -70,26 +73,52 @@ def search(
     followed = [
         one
         for one in _refined(crossing, FOLLOWED, best, pool, say, "following up")
-        if _within(first, one.estimate.sensor_from_image, capture_mm, capture_rad)
+        if _within(first, one.estimate, capture_mm, capture_rad)
     ]
     if not followed:
         raise InsufficientDataError(
             f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
             "of the start, got none but farther off"
         )
-    apart = _distinct([one.estimate for one in followed], crossing.centre_mm)[:_COMPARED]
-    compared = _refined(crossing, COMPARED, apart, pool, say, "comparing")
-    left = _distinct([one.estimate for one in compared], crossing.centre_mm)[:_DECIDED]
+    compared = _refined(crossing, COMPARED, _distinct(followed, crossing)[:_COMPARED], pool, say, "comparing")
+    # Where the tissue is layered, or repeats itself, the best place so far is often beside the right one.
+    hopped = _beside(crossing, compared[:_HOPPED], capture_mm, capture_rad, pool, say)
+    hopped = [one for one in hopped if _within(first, one.estimate, capture_mm, capture_rad)]
+    again = _refined(crossing, COMPARED, _distinct(hopped, crossing)[:_COMPARED], pool, say, "comparing")
+    best_first = sorted(compared + again, key=lambda one: -one.likeness.score)
+    left = _distinct(best_first, crossing)[:_DECIDED]
     decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
-    looks = len(places) + sum(one.evaluations for one in followed + compared + decided)
+    looks = len(places) + _BESIDE * len(compared[:_HOPPED])
+    looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
     return Found(decided[0].estimate, looks)
 
 
-def _spread(
-    first: RigidTransform, pivot_mm: FloatArray, capture_mm: float, capture_rad: float
-) -> list[RigidTransform]:
+def _beside(
+    crossing: Crossing,
+    about: list[Refined],
+    capture_mm: float,
+    capture_rad: float,
+    pool: ThreadPoolExecutor,
+    say: Progress,
+) -> list[Refined]:
+    """Look around the best places, in a box of half the capture, and follow up the best of what is there."""
+    best: list[Estimate] = []
+    for number, one in enumerate(about):
+        estimate = one.estimate
+        comparison = crossing.level(FOLLOWED, estimate.sensor_from_image)
+        places = _spread(estimate.sensor_from_image, 0.5 * capture_mm, 0.5 * capture_rad, _BESIDE)
+        found = list(
+            pool.map(lambda place, at=comparison, by=estimate: at.at(place, by.scales).score, places)
+        )
+        chosen = np.argsort(-np.array(found))[: _FOLLOWED // len(about)]
+        best += [Estimate(places[int(n)], estimate.scales) for n in chosen if found[int(n)] > -1]
+        say("looking beside", number + 1, len(about))
+    return _refined(crossing, FOLLOWED, best, pool, say, "following up") if best else []
+
+
+def _spread(first: RigidTransform, capture_mm: float, capture_rad: float, count: int) -> list[RigidTransform]:
     """The start, and places spread evenly from which an increment within the box leads to it."""
-    places = 2.0 * qmc.Sobol(6, rng=1).random(_GLANCES) - 1.0
+    places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
     places[0] = 0.0
     turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
     away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
@@ -113,20 +142,20 @@ def _refined(
     return sorted(done, key=lambda one: -one.likeness.score)
 
 
-def _within(first: RigidTransform, found: RigidTransform, capture_mm: float, capture_rad: float) -> bool:
+def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_rad: float) -> bool:
     """Whether a place is no farther from the start than a corner of the box, and a fifth."""
-    step = found.inv() * first
+    step = found.sensor_from_image.inv() * first
     far = np.sqrt(3.0) * 1.2
     length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
     return bool(length <= far * capture_mm + 1.0 and angle <= far * capture_rad + 0.02)
 
 
-def _distinct(estimates: list[Estimate], centre_mm: FloatArray) -> list[Estimate]:
-    """Leave out those that came to the same place as a better one."""
+def _distinct(found: list[Refined], crossing: Crossing) -> list[Estimate]:
+    """Estimates, less those that came to the same place as a better one."""
     kept: list[Estimate] = []
-    for one in estimates:
-        if all(_apart(one, other, centre_mm) > _SAME_MM for other in kept):
-            kept.append(one)
+    for one in found:
+        if all(_apart(one.estimate, other, crossing.centre_mm) > _SAME_MM for other in kept):
+            kept.append(one.estimate)
     return kept
 
 

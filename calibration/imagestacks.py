@@ -107,6 +107,13 @@ class Stack:
         last = np.array(self.images.shape[1:]) - 1.0
         return np.append(self.pixels[2:] + last * self.pixels[:2] / 2.0, 0.0)
 
+    @property
+    def corners_mm(self) -> FloatArray:
+        """The corner pixels' centres in the image's frame, shape (4, 3)."""
+        last = np.array(self.images.shape[1:]) - 1.0
+        share = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        return np.column_stack([self.pixels[2:] + share * last * self.pixels[:2], np.zeros(4)])
+
     def blurred(self, sigma_mm: float, least_weight: float = WHOLE) -> Stack:
         """The same images with a Gaussian over them, on as few pixels as it needs.
 
@@ -129,6 +136,19 @@ class Stack:
         few = np.ascontiguousarray(level[:, :: steps[0], :: steps[1]], dtype=np.float32)
         return replace(self, images=few, pixels=pixels)
 
+    def travelled(self, sensor_from_image: RigidTransform) -> FloatArray:
+        """Distance along the normals up to each image, mm, mean of the corners; a tracker's jitter taken out.
+
+        The corners, since the centre of a fan stays where it is if the start puts it on the fan's axis.
+        """
+        poses = self.world_from_sensor * sensor_from_image
+        normal = poses.rotation.apply([0.0, 0.0, 1.0])[1:]
+        steps = np.zeros(len(normal))
+        for corner in self.corners_mm:
+            place = gaussian_filter1d(poses.apply(corner), _SMOOTHED_FRAMES, axis=0, mode="nearest")
+            steps += 0.25 * np.abs(np.einsum("ij,ij->i", np.diff(place, axis=0), normal))
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
     def thinned(self, sensor_from_image: RigidTransform, spacing_mm: float, sigma_mm: float) -> Stack:
         """Gaussian means of neighbouring images and their poses, at equal distances along the sweep.
 
@@ -139,7 +159,7 @@ class Stack:
         """
         to_centre = sensor_from_image * RigidTransform.from_translation(self.centre_mm)
         centre = self.world_from_sensor * to_centre
-        way = travelled(centre)
+        way = self.travelled(sensor_from_image)
         count = max(2, int(way[-1] / spacing_mm) + 1)
         knots = np.linspace(way[0], way[-1], count)
         weight = np.exp(-0.5 * ((way - knots[:, None]) / sigma_mm) ** 2) + 1e-12
@@ -149,14 +169,6 @@ class Stack:
         turn = Rotation.concatenate([centre.rotation.mean(row) for row in weight])
         held = RigidTransform.from_components(weight @ centre.translation, turn)
         return Stack(_weighted(self.images, weight), self.pixels, held * to_centre.inv())
-
-
-def travelled(centre: RigidTransform) -> FloatArray:
-    """Distance travelled along the images' normals up to each image, mm, a tracker's jitter taken out."""
-    place = gaussian_filter1d(centre.translation, _SMOOTHED_FRAMES, axis=0, mode="nearest")
-    normal = centre.rotation.apply([0.0, 0.0, 1.0])
-    steps = np.abs(np.einsum("ij,ij->i", np.diff(place, axis=0), normal[1:]))
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def read_stack(
