@@ -1,7 +1,8 @@
 """What worker processes gain a study: two against one, and two of which one is killed.
 
 Run: ``python tests/benchmarks/bench_compare.py [SWEEPS] [FRAMES]`` (16 and 60; minutes; sweeps are cached);
-``... --long [SWEEPS] [FRAMES]`` for all of them as one long sweep, matched in blocks.
+``... --long [REPEATS]`` (10) for one long sweep in blocks: full frames, sixty repeated, which at every
+repetition have nothing in common with those before, so that the sweep seems to go on.
 
 Each study runs on workers that are there already and have each done one sweep, as on an existing cluster. A
 ratio on two cores that are busy with something else says little: the load is printed beside it.
@@ -70,7 +71,17 @@ def joined(paths, path):
     return number + 1
 
 
-def main(sweeps=16, frames=60, long=False):
+def long_study(repeats=10, folder=None):
+    """One sweep of 127 x 3818 samples a frame, as long as asked for, in blocks."""
+    source = simulated(SimulationSettings(preset="phantom", seed=2001, length_mm=7.5, frames=60))
+    path = folder / "long.h5"
+    count = joined([source] * repeats, path)
+    sys.stdout.write(f"one sweep of {count} frames, {BLOCKS} blocks\n")
+    return [path], source, Config.model_validate({"trajectory": {"block_frames": -(-count // BLOCKS)}})
+
+
+def short_study(sweeps=16, frames=60):
+    """Many small sweeps."""
     paths = [
         simulated(
             SimulationSettings(
@@ -79,24 +90,24 @@ def main(sweeps=16, frames=60, long=False):
         )
         for i in range(sweeps)
     ]
-    seconds, config, studied = {}, None, paths
+    return paths, paths[0], None
+
+
+def main(long, *counts):
+    seconds = {}
     with tempfile.TemporaryDirectory() as made:
-        if long:
-            studied = [Path(made) / "long.h5"]
-            count = joined(paths, studied[0])
-            config = Config.model_validate({"trajectory": {"block_frames": -(-count // BLOCKS)}})
-            sys.stdout.write(f"one sweep of {count} frames, {BLOCKS} blocks\n")
+        inputs = Path(made)
+        paths, warm, config = long_study(*counts, folder=inputs) if long else short_study(*counts)
         for name, workers, kill in WAYS:
-            folder = Path(tempfile.mkdtemp())
-            seconds[name], done = timed(studied, paths[0], config, folder, workers, kill)
+            folder = inputs / name.replace(" ", "-")
+            seconds[name], done = timed(paths, warm, config, folder, workers, kill)
             shutil.rmtree(folder)
             ratio = seconds[name] / seconds["one worker"]
             sys.stdout.write(
-                f"{name:16s} {seconds[name]:7.1f} s  ratio {ratio:.2f}  {done} of {len(studied)} done  "
+                f"{name:16s} {seconds[name]:7.1f} s  ratio {ratio:.2f}  {done} of {len(paths)} done  "
                 f"load {os.getloadavg()[0]:.1f}\n"
             )
 
 
 if __name__ == "__main__":
-    counts = [each for each in sys.argv[1:] if each != "--long"]
-    main(*map(int, counts), long="--long" in sys.argv)
+    main("--long" in sys.argv, *(int(each) for each in sys.argv[1:] if each != "--long"))
