@@ -44,7 +44,7 @@ from speckle3d.study.sweepjob import (
 FORMAT = "speckle3d.study"
 VERSION = 1
 MATCHING_SHARE = 0.5
-"""Of a sweep's time: half with frames of 127 x 3818 samples, less with small ones; the rest is the own job's."""
+"""Of a sweep's time: half with frames of 127 x 3818 samples, less with small ones."""
 Task = SweepJob | BlockJob
 TaskOutcome = SweepOutcome | BlockOutcome
 KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
