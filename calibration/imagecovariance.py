@@ -17,6 +17,12 @@ the same reflections and so err alike."""
 STRETCH = 3
 """Images compared that are left out together: a tracker's error lasts from one to the next."""
 
+SHARED_RAD = np.deg2rad(0.1)
+SHARED_MM = (0.03, 0.1, 0.04)
+"""Standard deviations, turns and displacements of the image's centre across, along the beam and out of plane,
+of what all of the tissue shares and no part of it can show: root mean squares of what was left over six
+simulated pairs of sweeps, whatever the start. A thick beam shows what is beside it deeper than it is."""
+
 NAMES = ("tilt", "yaw", "roll", "x", "y", "z", "lateral pixel size", "axial pixel size")
 
 
@@ -34,6 +40,7 @@ def covariance_at_origin(refined: Refined, unit: float) -> Spread:
 
     What differs from block to block of tissue (speckle, reflections) and from image to image (poses) adds up.
     Poses count twice: those of the images compared, and those of the images cut, of which there are as many.
+    What all of the tissue shares is added (`SHARED_MM`).
 
     Parameters
     ----------
@@ -57,8 +64,15 @@ def covariance_at_origin(refined: Refined, unit: float) -> Spread:
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
     tissue = _jackknife(normal, gradient, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
     poses = _jackknife(normal, gradient, _numbered(np.column_stack(_stretches(refined))))
-    covariance = base @ (tissue + 2.0 * poses) @ base.T
+    covariance = base @ (tissue + 2.0 * poses) @ base.T + _shared(refined.pivot_mm, unit)
     return Spread(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]])
+
+
+def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
+    """Covariance at the origin of what no part of the tissue can show; pixel sizes have none."""
+    variance = np.concatenate([np.full(3, SHARED_RAD), unit * np.array(SHARED_MM), np.zeros(2)]) ** 2
+    base = about_pivot(pivot_mm)
+    return np.asarray(base @ np.diag(variance) @ base.T)
 
 
 def _jackknife(normal: FloatArray, gradient: FloatArray, cluster: IntArray) -> FloatArray:

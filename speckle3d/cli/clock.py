@@ -55,6 +55,8 @@ def calibrate_clock(
     if by is By.line and calibration is not None and out is None:
         raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     known = None if calibration is None else read_calibration(calibration)
+    if by is By.images and sensor != "tracker":
+        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
     if by is By.images:
         found, frames = _by_images(images, poses, pixel_mm, known, search_s)
         told = f"images of the two ways correlate by {found.followed:.2f}"

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from speckle3d.core.calibration import Calibration
 
 
+MOST_OFFSET_S = 1e6
+"""No clock offset is larger: not even one between seconds since switching on and since some midnight."""
+
+
 class ImageMethod(StrEnum):
     """How the answer is looked for."""
 
@@ -81,6 +85,8 @@ def calibrate_images(
     """Calibrate a position sensor from two crossing sweeps of anything with visible structure."""
     from calibration.images import ImageSettings
 
+    if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
+        raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
     settings = ImageSettings(method.value, scales, capture_mm, capture_deg)
@@ -149,6 +155,9 @@ def _start(
     if by_ruler:
         if start_mm is None or start_deg is None:
             raise InvalidInputError("expected --start-mm and --start-deg together, got one of them")
+        for option, given in (("--start-mm", start_mm), ("--start-deg", start_deg)):
+            if not np.isfinite(given).all():
+                raise InvalidInputError(f"{option}: expected three finite numbers, got {given}")
         roll, yaw, tilt = np.deg2rad(start_deg)
         return RigidTransform.from_components(start_mm, rotation_from_fixed_angles(roll, yaw, tilt))
     if known is not None:

@@ -114,4 +114,7 @@ def _readings_of(path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, 
     if sniff(path) == "hdf5":
         return _readings(load_sweep(path), path, sensor)
     tracker = read_poses(path)
+    if sensor == "orientation":
+        turned = tracker.readings.world_from_sensor.rotation
+        return TimedRotations(tracker.readings.time_s, turned), tracker.time_offset_s
     return tracker.readings, tracker.time_offset_s

@@ -26,6 +26,17 @@ def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
     return path
 
 
+def simulated_pair(settings: SimulationSettings, folder: Path = DEFAULT) -> tuple[Path, Path]:
+    """The two sweeps of a ``crossed`` preset as files."""
+    stem = f"{settings.preset}-{settings.seed}-{_key(settings.model_dump_json())}"
+    paths = folder / f"{stem}.h5", folder / f"{stem}-crossing.h5"
+    if not all(path.is_file() for path in paths):
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, made in zip(paths, simulate(settings), strict=True):
+            write_sweep(path, made.sweep)
+    return paths
+
+
 def to_and_fro(source: Path, frames: int, folder: Path = DEFAULT) -> Path:
     """A long sweep made of a short one run forward and back, so that neighbours always share speckle."""
     path = folder / f"{source.stem}-{frames}.h5"

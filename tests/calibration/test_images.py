@@ -191,7 +191,7 @@ def test_progress_is_told(scene, others):
     calibrate_images(*others[:2], start, progress=lambda *step: told.append(step))
     stages = [stage for stage, *_ in told]
     order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
-    order += ["deciding", "refining"]
+    order += ["looking beside", "deciding", "refining"]
     assert list(dict.fromkeys(stages)) == order
     assert all(1 <= done <= total for _, done, total in told)
 
