@@ -5,8 +5,11 @@ import json
 import re
 
 import pytest
+from imu_logs import samples
 
 import speckle3d
+from xsens.logs import write_csv
+from xsens.samples import ImuLog
 
 HEAVY = ("numba", "llvmlite", "h5py", "numpy", "scipy", "SimpleITK", "matplotlib", "pydantic")
 
@@ -57,13 +60,26 @@ def test_the_version_is_the_distributions_and_a_misspelt_name_an_attribute_error
         _ = speckle3d.trak
 
 
-def test_the_readmes_python_example_runs(project, monkeypatch, capsys):
+def examples(project):
     readme = (project / "README.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    return re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+
+
+def test_the_readmes_python_example_runs(project, monkeypatch, capsys):
+    example, _ = examples(project)
     assert len([line for line in example.splitlines() if line.strip()]) <= 8
     monkeypatch.chdir(project)
     exec(compile(example, "README.md", "exec"), {})
     assert "mm" in capsys.readouterr().out
+
+
+def test_the_readmes_example_of_the_orientation_sensor_runs(project, monkeypatch, tmp_path, capsys):
+    _, example = examples(project)
+    write_csv(tmp_path / "log.bin", ImuLog(**{**samples(300), "source": "turning"}))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "README.md", "exec"), {})
+    # As many orientations as samples; level and pointing north.
+    assert capsys.readouterr().out.startswith("300 [")
 
 
 def test_the_readmes_test_command_is_what_ci_runs(project):
