@@ -43,6 +43,9 @@ _IRON_PRIOR = 0.01
 _UNEVEN = 0.15
 """What a reference may leave of the field's norm: that of a room with iron in it."""
 
+_STEEPEST = 0.05
+"""A field with less of its strength across shows no heading: a room's iron turns it any way."""
+
 _BETTER = 2.0
 """A new reference must leave so much less variance than the one it replaces."""
 
@@ -217,8 +220,10 @@ class FieldMonitor:
             learnt = self._learn()
             restart = None if self.confirmed else learnt
             self.confirmed = self.confirmed or learnt is not None or self._turned_s > _PROVED_AFTER_S
-        disturbed = self._fitting_s < _UNDISTURBED_AFTER_S
-        return FieldReading(clean, disturbed, off / (2.0 * reference.horizontal_au**2), restart)
+        steep = reference.horizontal_au <= _STEEPEST * reference.norm_au
+        disturbed = steep or self._fitting_s < _UNDISTURBED_AFTER_S
+        variance = math.inf if steep else off / (2.0 * reference.horizontal_au**2)
+        return FieldReading(clean, disturbed, variance, restart)
 
     def _smooth(self, clean: FloatArray, duration_s: float) -> None:
         horizontal, vertical = math.hypot(clean[0], clean[1]), float(clean[2])

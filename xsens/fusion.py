@@ -17,14 +17,19 @@ from xsens.errorstate import ErrorStateFilter
 from xsens.forward import Pass, forward, within_steps
 from xsens.fusion_settings import BRIDGED_S, FusionSettings
 from xsens.increments import Samples
+from xsens.plausible import (
+    UNKNOWN_HEADING_RAD,
+    contradiction,
+    real_field,
+    require_metres,
+    require_radians,
+    require_rising_in_seconds,
+)
 from xsens.samples import ImuLog, IntArray
 from xsens.smoothing import Smoothed, smooth
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: they hold little more than the filter's start."""
-
-_FORCE_M_S2 = (4.0, 25.0)
-"""Between which the median of the accelerometer's norm lies if it is in m/s^2."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +91,14 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     InsufficientDataError
         If the log lacks a gyroscope or an accelerometer, or has fewer than two samples of them.
     InvalidInputError
-        If the accelerometer cannot be in m/s^2.
+        If the times cannot be in s, the accelerometer in m/s^2 or the gyroscope in rad/s.
 
     Notes
     -----
     After a pause of more than 0.1 s nothing is known of how the sensor turned: up and north are found
     again, the bias and the field's reference are kept.
     """
+    _require_log(log)
     settings = settings or FusionSettings()
     used, samples, notes = _usable(log)
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
@@ -103,6 +109,9 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, smooth)
     joined = _Result(*(np.concatenate(parts) for parts in zip(*map(_fields, results), strict=True)))
+    heading_sd = float(np.median(joined.sd_rad[:, 2]))
+    if heading_sd > UNKNOWN_HEADING_RAD:
+        notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
     rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.wxyz, scalar_first=True))
     return Orientation(
         rotations, joined.sd_rad, joined.bias_rad_s, joined.disturbed, joined.resting, smooth, tuple(notes)
@@ -112,11 +121,19 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
 # -- samples
 
 
+def _require_log(log: object) -> None:
+    """A path is a mistake soon made."""
+    if not isinstance(log, ImuLog):
+        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
+
+
 def _usable(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     """Indices of samples with a gyroscope reading, the samples, and what had to be done to them."""
     source = log.source or "log"
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got not both")
+        lacking = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
+        none = " and ".join(f"no {name}" for name, values in lacking.items() if values is None)
+        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {none}")
     used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
     force = log.accelerometer_m_s2[used]
     there = np.isfinite(force).all(axis=1)
@@ -124,8 +141,11 @@ def _usable(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         raise InsufficientDataError(
             f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
         )
-    _require_metres(force[there], source)
     time_s, notes = log.time_s[used], []
+    steps = np.diff(time_s)
+    require_rising_in_seconds(steps, source)
+    require_metres(force[there], source)
+    require_radians(log.gyroscope_rad_s[used], source)
     if used.size < len(log):
         notes.append(f"{len(log) - used.size} samples without gyroscope left out")
     if not there.all():
@@ -133,19 +153,14 @@ def _usable(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
     field = np.full((used.size, 3), np.nan)
     if log.magnetometer_au is not None:
-        field = log.magnetometer_au[used]
-    steps = np.diff(time_s)
+        field, zeros = real_field(log.magnetometer_au[used])
+        if zeros:
+            notes.append(f"magnetometer reads zero in {zeros} of {used.size} samples: left out")
+    against = contradiction(time_s, log.gyroscope_rad_s[used], force)
+    if against is not None:
+        notes.append(against)
     step_s = np.concatenate([[np.median(steps)], steps])
     return used, Samples(step_s, log.gyroscope_rad_s[used], force, field), notes
-
-
-def _require_metres(force: FloatArray, source: str) -> None:
-    median = float(np.median(np.linalg.norm(force, axis=1)))
-    low, high = _FORCE_M_S2
-    if not low < median < high:
-        raise InvalidInputError(
-            f"{source}: expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}"
-        )
 
 
 # -- stretches

@@ -10,7 +10,7 @@ from threading import Lock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.geometry import FloatArray
 from xsens.bytelogs import parse_stream
 from xsens.device import DeviceInfo
@@ -220,7 +220,12 @@ class _Attitude:
         if not np.isfinite(self._step_s):
             return
         first = self._step_s * (1 + lost_before)
-        self._filter.push([first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)
+        try:
+            self._filter.push(
+                [first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
+            )
+        except InvalidInputError:  # damage: what is recorded stays, and the display begins anew
+            self._filter = OnlineFilter()
         state = self._filter.state
         self.latest = None if state is None else state.world_from_sensor
 

@@ -13,7 +13,11 @@ from speckle3d.core.geometry import FloatArray
 from xsens.errorstate import ErrorStateFilter
 from xsens.fusion_settings import BRIDGED_S, FusionSettings
 from xsens.increments import Samples, blocks_of
+from xsens.plausible import FASTEST_RAD_S, real_field, require_metres
 from xsens.quaternions import turn_matrix
+
+_JUDGED_S = 0.99
+"""The accelerometer's unit is judged by the median of the first second; less rounding."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,8 @@ class OnlineFilter:
         self._pending: list[Samples] = []
         self._pending_s = self._skipped_s = self._pause_s = 0.0
         self._force = np.full(3, np.nan)
+        self._first: list[FloatArray] = []
+        self._judged_s = 0.0
 
     def push(
         self,
@@ -77,18 +83,19 @@ class OnlineFilter:
         gyroscope_rad_s, accelerometer_m_s2 : array_like, shape (3,) or (m, 3)
             A sample without gyroscope (NaN) is left out, one without accelerometer takes the last there was.
         magnetometer_au : array_like, shape (3,) or (m, 3), optional
-            Rows may be NaN.
+            Rows may be NaN; rows of zeros count as such.
 
         Raises
         ------
         MismatchError
             If the shapes do not fit together.
         InvalidInputError
-            If a step is not positive and finite.
+            If a step is not positive and finite, the gyroscope cannot be in rad/s or, by its median over the
+            first second, the accelerometer in m/s^2.
         """
-        for step, rate, force, field in zip(
-            *_checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au), strict=True
-        ):
+        steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
+        for step, rate, force, field in zip(steps, rates, forces, fields, strict=True):
+            self._judge(float(step), force)
             self._take(float(step), rate, force, field)
 
     @property
@@ -110,6 +117,21 @@ class OnlineFilter:
             snapshot.resting,
             kalman.started,
         )
+
+    def _judge(self, step_s: float, force: FloatArray) -> None:
+        """Refuse an accelerometer in other units when there is a second of it."""
+        if self._judged_s >= _JUDGED_S or not np.isfinite(force).all():
+            return
+        self._first.append(force)
+        self._judged_s += min(step_s, BRIDGED_S)
+        if self._judged_s >= _JUDGED_S:
+            try:
+                require_metres(np.array(self._first), "accelerometer_m_s2")
+            except InvalidInputError:
+                self._judged_s = 0.0  # nor may what comes next pass unjudged
+                raise
+            finally:
+                self._first = []
 
     def _take(self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
         if np.isfinite(force).all():
@@ -165,6 +187,10 @@ def _checked(
         if rows.shape != (step.size, 3):
             raise MismatchError(f"{name}: expected shape {(step.size, 3)}, got {rows.shape}")
         vectors.append(rows)
+    fast = np.linalg.norm(np.where(np.isfinite(vectors[0]), vectors[0], 0.0), axis=1).max(initial=0.0)
+    if fast > FASTEST_RAD_S:
+        raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
+    vectors[2], _ = real_field(vectors[2])
     return step, vectors[0], vectors[1], vectors[2]
 
 

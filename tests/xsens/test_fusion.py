@@ -111,3 +111,63 @@ def test_broad_trials_beside_vqf(realdata):
             # Measured 1.63 against 3.47; the filter alone is at 0.56 of VQF.
             assert ours[1] <= 0.5 * vqf
     assert np.mean(gains) >= 0.2
+
+
+def with_field(log, field):
+    return ImuLog(log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s, field)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_magnetometer_that_reads_zero_is_none(smooth):
+    truth, log = static(20.0)
+    found = orient(with_field(log, np.zeros((len(log), 3))), smooth=smooth)
+    assert "magnetometer reads zero in 2000 of 2000 samples: left out" in found.notes
+    assert "no magnetometer: the heading is relative to the start" in found.notes
+    some = log.magnetometer_au.copy()
+    some[::3] = 0.0
+    found = orient(with_field(log, some), smooth=smooth)
+    assert "magnetometer reads zero in 667 of 2000 samples: left out" in found.notes
+    assert abs(heading_deg(truth, found)[-1]) < 3.0
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 0.004])
+def test_a_field_straight_down_tells_no_heading(smooth, noise):
+    turn, log = static(20.0)
+    off = noise * np.random.default_rng(4).standard_normal((len(log), 3))
+    found = orient(
+        with_field(log, np.tile(turn.inv().apply([0.0, 0.0, -1.0]), (len(log), 1)) + off), smooth=smooth
+    )
+    assert np.rad2deg(np.median(found.standard_deviation_rad[:, 2])) > 45.0
+    assert any(note.startswith("the heading is not known") for note in found.notes)
+    assert np.isfinite(found.rotations.world_from_sensor.as_quat()).all()
+
+
+def test_times_in_milliseconds_are_refused():
+    _, log = static(5.0)
+    with pytest.raises(InvalidInputError, match="got a median of 10 s: times in milliseconds"):
+        orient(ImuLog(1e3 * log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s))
+
+
+def test_a_gyroscope_in_degrees_is_refused_or_told():
+    time_s = np.arange(0.0, 20.0, 1 / RATE_HZ)
+    truth = Rotation.from_rotvec(np.outer(0.5 * np.sin(time_s), [1.0, 0.0, 0.0]))
+    rate = np.outer(0.5 * np.cos(time_s), [1.0, 0.0, 0.0])
+    force = truth.inv().apply([0.0, 0.0, 9.80665])
+    assert not any("contradict" in note for note in orient(ImuLog(time_s, force, rate)).notes)
+    # 28 degrees per second are no reading that no sensor gives, but gravity follows a 57th of it.
+    told = [note for note in orient(ImuLog(time_s, force, np.rad2deg(rate))).notes if "contradict" in note]
+    assert len(told) == 1
+    assert "shows 2 %" in told[0]
+    with pytest.raises(InvalidInputError, match="expected a gyroscope in rad/s"):
+        orient(ImuLog(time_s, force, 5.0 * np.rad2deg(rate)))
+
+
+def test_what_is_missing_is_named():
+    _, log = static(5.0)
+    with pytest.raises(InsufficientDataError, match=r"got no gyroscope$"):
+        orient(ImuLog(log.time_s, log.accelerometer_m_s2))
+    with pytest.raises(InsufficientDataError, match=r"got no accelerometer$"):
+        orient(ImuLog(log.time_s, None, log.gyroscope_rad_s))
+    with pytest.raises(InvalidInputError, match=r"expected an ImuLog, as read_log\(path\) gives, got str"):
+        orient("log.csv")

@@ -102,3 +102,24 @@ def test_missing_readings_are_bridged_and_bad_ones_refused():
         online.push(0.01, [0.0, 0.0], [0.0, 0.0, 9.8])
     with pytest.raises(InvalidInputError, match="step_s"):
         online.push(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
+
+
+def resting(samples, **changed):
+    readings = {"gyroscope": [0.0, 0.0, 0.0], "force": [0.0, 0.0, 9.80665], "field": [0.5, 0.0, -0.86]}
+    readings |= changed
+    return [np.full(samples, 0.01), *(np.tile(each, (samples, 1)) for each in readings.values())]
+
+
+def test_other_units_are_refused_as_over_a_whole_log():
+    with pytest.raises(InvalidInputError, match=r"expected an accelerometer in m/s\^2"):
+        OnlineFilter().push(*resting(120, force=[0.0, 0.0, 1.0]))
+    with pytest.raises(InvalidInputError, match="expected rad/s"):
+        OnlineFilter().push(*resting(1, gyroscope=[0.0, 90.0, 0.0]))
+
+
+@pytest.mark.parametrize("field", [[0.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+def test_a_field_that_is_none_tells_no_heading(field):
+    online = OnlineFilter()
+    online.push(*resting(300, field=field))
+    assert np.rad2deg(online.state.standard_deviation_rad[2]) > 45.0
+    assert apart_deg(online.state.world_from_sensor, Rotation.identity()) < 1e-6
