@@ -50,6 +50,8 @@ class Orientation:
     smoothed : bool
     notes : tuple of str
         What was missing or bridged.
+    magnetic : bool
+        Whether the heading is by the magnetic field; else it is relative to the start.
     """
 
     rotations: TimedRotations
@@ -59,6 +61,7 @@ class Orientation:
     resting: BoolArray
     smoothed: bool
     notes: tuple[str, ...] = ()
+    magnetic: bool = True
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -114,7 +117,14 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
     rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.wxyz, scalar_first=True))
     return Orientation(
-        rotations, joined.sd_rad, joined.bias_rad_s, joined.disturbed, joined.resting, smooth, tuple(notes)
+        rotations,
+        joined.sd_rad,
+        joined.bias_rad_s,
+        joined.disturbed,
+        joined.resting,
+        smooth,
+        tuple(notes),
+        settings.use_magnetometer,
     )
 
 

@@ -72,7 +72,7 @@ def real_field(field_au: FloatArray) -> tuple[FloatArray, int]:
 def contradiction(time_s: FloatArray, rate_rad_s: FloatArray, force_m_s2: FloatArray) -> str | None:
     """A note if gravity does not turn as the gyroscope says, None if it does or nothing can be told.
 
-    Seen from the sensor gravity's direction u changes by u x w. Compared are the RMS of both over short means,
+    Seen from the sensor gravity's direction u changes by u x w. Compared are the RMS of both over short means
     near rest only; movement makes the accelerometer show more, never less, but for a free pendulum's.
     """
     width = max(1, round(_COMPARED_S / float(np.median(np.diff(time_s)))))

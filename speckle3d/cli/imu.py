@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -16,14 +18,23 @@ from speckle3d.core.errors import InvalidInputError, naming
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+    from speckle3d.core.geometry import FloatArray
     from speckle3d.core.streams import TimedRotations
+    from speckle3d.core.sweep import OrientationSensor
     from xsens.fusion import Orientation
     from xsens.samples import ImuLog
 
 imu = typer.Typer(help="The orientation sensor: logs, live data, orientation.", no_args_is_help=True)
 app.add_typer(imu, name="imu")
 
-Log = Annotated[Path, typer.Argument(metavar="LOG", help="A log of the sensor, of any kind that is known.")]
+Log = Annotated[
+    Path,
+    typer.Argument(
+        metavar="LOG",
+        help="A log of the sensor, of any kind that is known. A plain CSV has the columns time_s, "
+        "accelerometer_x_m_s2, gyroscope_x_rad_s, magnetometer_x_au (y and z likewise), quaternion_w to _z.",
+    ),
+]
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs that do not say.")]
 
 
@@ -55,7 +66,7 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> No
     rows = [
         ("samples", str(len(log)), ""),
         ("duration", f"{log.duration_s:.3f}", "s"),
-        ("rate", f"{log.rate_hz:.2f}", "samples/s"),
+        ("rate", *((f"{log.rate_hz:.2f}", "samples/s") if math.isfinite(log.rate_hz) else ("unknown", ""))),
         ("lost", str(log.lost), "samples"),
         ("gaps", str(len(log.gaps)), ""),
         ("longest gap", f"{max((gap.duration_s for gap in log.gaps), default=0.0):.3f}", "s"),
@@ -92,6 +103,7 @@ def imu_convert(
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
     from xsens.logs import write_csv
 
+    _require_another(out, log_file)
     log = read(log_file, rate_hz)
     write_csv(out, log)
     tell(log)
@@ -123,13 +135,16 @@ def imu_orient(
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
+    require_finite_offset(time_offset_s)
+    if out is not None:
+        _require_another(out, log_file)
     log = read(log_file, rate_hz)
     with naming(str(log_file)):
         rotations, found = orientation_of(log, method, magnetometer)
-    if out is not None:
-        write_csv(out, _with(log, rotations))
     if into is not None:
         _attach(into, log, rotations, time_offset_s, calibration, replace_stream)
+    if out is not None:
+        write_csv(out, _with(log, rotations))
     tell(log)
     rows = _orientation_rows(log, rotations, found)
     if as_json:
@@ -176,6 +191,18 @@ def imu_record(
         )
 
 
+def require_finite_offset(time_offset_s: float) -> None:
+    """Refuse what no clock can be off by."""
+    if not math.isfinite(time_offset_s):
+        raise InvalidInputError(f"--time-offset-s: expected a finite number, got {time_offset_s}")
+
+
+def _require_another(out: Path, log_file: Path) -> None:
+    """A log is never written over by what is made of it."""
+    if out.exists() and log_file.exists() and os.path.samefile(out, log_file):
+        raise InvalidInputError(f"{out}: expected another file than the log that is read, got the same")
+
+
 def read(path: Path, rate_hz: float | None) -> ImuLog:
     """Read a log of any kind."""
     from xsens.logs import Hints, read_log
@@ -203,6 +230,8 @@ def orientation_of(
     from xsens.fusion_settings import FusionSettings
 
     found = orient(log, FusionSettings(use_magnetometer=magnetometer), smooth=method is Method.smoother)
+    for text in found.notes:
+        note(text)
     return found.rotations, found
 
 
@@ -231,12 +260,14 @@ def _attach(
     from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.sweep_writer import attach_orientation
 
+    frame_time_s = _frame_times(sweep_file, replace_stream)
     mounting: Rotation | None = None
     if calibration is not None:
         known = read_calibration(calibration)
         mounting = known.rotation
         if known.time_offset_s is not None and time_offset_s == 0.0:
             time_offset_s = known.time_offset_s
+            require_finite_offset(time_offset_s)
     kept = np.isin(log.time_s, rotations.time_s)
     vectors = {}
     for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
@@ -244,8 +275,41 @@ def _attach(
         whole = values is not None and bool(np.isfinite(values[kept]).all())
         vectors[name] = values[kept] if whole and kept.sum() == len(rotations) else None
     sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
+    covered = _require_cover(sweep_file, sensor, frame_time_s)
     attach_orientation(sweep_file, sensor, replace_stream)
-    note(f"orientation of {len(rotations)} samples in {sweep_file}")
+    note(f"orientation of {len(rotations)} samples in {sweep_file}{covered}")
+
+
+def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
+    """When the frames of the sweep were taken; None if its own stream, to be replaced, cannot be read."""
+    from speckle3d.io.load import load_sweep
+
+    try:
+        sweep = load_sweep(sweep_file)
+    except InvalidInputError:
+        if replace_stream:
+            return None
+        raise
+    if sweep.orientation is not None and not replace_stream:
+        raise InvalidInputError(
+            f"{sweep_file}: expected a sweep without an orientation sensor's stream, got one: "
+            "--replace replaces it"
+        )
+    return sweep.frame_time_s
+
+
+def _require_cover(sweep_file: Path, sensor: OrientationSensor, frame_time_s: FloatArray | None) -> str:
+    """How many frames the stream covers, in words; refused if none."""
+    if frame_time_s is None:
+        return ""
+    covered, frames = int(sensor.covers(frame_time_s).sum()), frame_time_s.size
+    if not covered:
+        first, last = sensor.readings.time_s[[0, -1]] + sensor.time_offset_s
+        raise InvalidInputError(
+            f"{sweep_file}: expected a stream that covers frames of the sweep, {frame_time_s[0]:.3f} to "
+            f"{frame_time_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s: covers 0 of {frames} frames"
+        )
+    return f": covers {covered} of {frames} frames"
 
 
 def _orientation_rows(
@@ -257,11 +321,14 @@ def _orientation_rows(
     if found is not None:
         heading = found.standard_deviation_rad[:, 2]
         inclination = np.linalg.norm(found.standard_deviation_rad[:, :2], axis=1) / np.sqrt(2.0)
+        of = "heading" if found.magnetic else "heading relative to the start"
         rows += [
             ("inclination, standard deviation, median", float(np.rad2deg(np.median(inclination))), "deg"),
-            ("heading, standard deviation, median", float(np.rad2deg(np.median(heading))), "deg"),
-            ("magnetic field disturbed", 100.0 * float(np.mean(found.disturbed)), "% of samples"),
+            (f"{of}, standard deviation, median", float(np.rad2deg(np.median(heading))), "deg"),
         ]
+        if found.magnetic:
+            disturbed = 100.0 * float(np.mean(found.disturbed))
+            rows.append(("magnetic field disturbed", disturbed, "% of samples"))
         if log.oriented.any():
             rows += _beside_own(log, rotations)
     return rows

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, emit, note
-from speckle3d.cli.imu import Log, Magnetometer, Method, MethodOption, RateHz, imu, orientation_of, read
+from speckle3d.cli.imu import (
+    Log,
+    Magnetometer,
+    Method,
+    MethodOption,
+    RateHz,
+    imu,
+    orientation_of,
+    read,
+    require_finite_offset,
+)
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -24,7 +34,9 @@ def imu_accuracy(
     log_file: Log,
     reference: Annotated[
         Path | None,
-        typer.Option(help="Settings of a mechanism: CSV with tilt, yaw, roll in degrees [time_s, until_s]."),
+        typer.Option(
+            help="Settings of a mechanism: CSV with tilt, yaw, roll in degrees, perhaps time_s and until_s."
+        ),
     ] = None,
     optical: Annotated[
         Path | None,
@@ -60,6 +72,7 @@ def imu_accuracy(
 
     if (reference is None) == (optical is None):
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
+    require_finite_offset(time_offset_s)
     log = read(log_file, rate_hz)
     mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
     if not mountings:

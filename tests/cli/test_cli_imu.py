@@ -1,6 +1,7 @@
 """The orientation sensor on the command line: logs told, converted, oriented, put into sweeps, judged."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, 
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
     assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
-    assert "say to replace it" in refused("imu", "orient", log_file, "--into", sweep_file)
+    assert "--replace replaces it" in refused("imu", "orient", log_file, "--into", sweep_file)
     assert "neither" in refused("imu", "orient", log_file)
 
 
@@ -149,3 +150,66 @@ def test_what_is_no_log_is_refused_in_one_line(refused, tmp_path):
     (tmp_path / "noise.bin").write_bytes(bytes(range(256)) * 4)
     assert "noise.bin" in refused("imu", "info", tmp_path / "noise.bin")
     assert "absent.bin" in refused("imu", "info", tmp_path / "absent.bin")
+
+
+@pytest.fixture
+def sweep_file(tmp_path):
+    path = tmp_path / "sweep.h5"
+    write_sweep(path, sweep_examples.rf_sweep())
+    return path
+
+
+@pytest.mark.parametrize("offset", ["nan", "inf", "-inf"])
+def test_an_offset_that_is_no_number_is_refused(refused, log_file, sweep_file, tmp_path, offset):
+    before = sweep_file.read_bytes()
+    said = refused("imu", "orient", log_file, "--into", sweep_file, "--replace", "--time-offset-s", offset)
+    assert "--time-offset-s: expected a finite number" in said
+    assert sweep_file.read_bytes() == before
+    optical(tmp_path / "target.txt", turning()[0], turning()[1].time_s)
+    arguments = ("--optical", tmp_path / "target.txt", "--time-offset-s", offset)
+    assert "expected a finite number" in refused("imu", "accuracy", log_file, *arguments)
+
+
+def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_file):
+    before = sweep_file.read_bytes()
+    orient = ("imu", "orient", log_file, "--into", sweep_file, "--replace", "--time-offset-s")
+    said = refused(*orient, "1e9")
+    assert re.search(r"covers 0 of \d+ frames", said)
+    assert sweep_file.read_bytes() == before
+    code, _, err = run(*orient, "0")
+    assert code == 0
+    assert re.search(r"covers (\d+) of \1 frames", err)
+
+
+def test_a_log_is_not_written_over(refused, log_file):
+    before = log_file.read_bytes()
+    assert "expected another file" in refused("imu", "convert", log_file, log_file)
+    beside = log_file.parent / ".." / log_file.parent.name / log_file.name
+    assert "expected another file" in refused("imu", "orient", log_file, "-o", beside)
+    assert log_file.read_bytes() == before
+
+
+def test_without_a_magnetometer_the_heading_is_said_to_be_relative(run, tmp_path):
+    _, log = turning()
+    write_csv(tmp_path / "log.csv", ImuLog(log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s))
+    code, out, err = run("imu", "orient", tmp_path / "log.csv", "-o", tmp_path / "o.csv")
+    assert code == 0, err
+    assert "no magnetometer: the heading is relative to the start" in err
+    assert "heading relative to the start, standard deviation" in out
+    assert "magnetic field" not in out
+
+
+def test_one_sample_has_no_rate(run, tmp_path):
+    write_csv(tmp_path / "log.csv", ImuLog(np.zeros(1), np.array([[0.0, 0.0, 9.8]])))
+    code, out, _ = run("imu", "info", tmp_path / "log.csv")
+    assert code == 0
+    assert re.search(r"rate +unknown$", out, re.MULTILINE)
+    assert "nan" not in out
+
+
+def test_help_names_the_columns_of_a_plain_log(run):
+    for command in ("info", "orient"):
+        told = re.sub(r"[\s│]+", "", run("imu", command, "--help")[1])
+        for name in ("time_s", "accelerometer_x_m_s2", "gyroscope_x_rad_s", "magnetometer_x_au"):
+            assert name in told
+    assert "time_sanduntil_s" in re.sub(r"[\s│]+", "", run("imu", "accuracy", "--help")[1])
