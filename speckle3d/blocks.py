@@ -11,7 +11,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -32,6 +33,19 @@ AHEAD = 3
 """Frames made ready before they are asked for."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
+
+
+_READS_AHEAD: ContextVar[bool] = ContextVar("reads_ahead", default=True)
+
+
+@contextmanager
+def on_one_thread() -> Iterator[None]:
+    """Do not read ahead on a second thread: for a cluster's workers, who are given a core each."""
+    token = _READS_AHEAD.set(False)
+    try:
+        yield
+    finally:
+        _READS_AHEAD.reset(token)
 
 
 @dataclass
@@ -232,6 +246,9 @@ class _BlockMatcher:
             self._times.add("intensity", then)
             return index, ready, features
 
+        if not _READS_AHEAD.get():
+            yield from map(make, numbers)
+            return
         with ThreadPoolExecutor(1) as worker:
             waiting: list[Future[tuple[int, ReadyFrame, FrameFeatures | None]]] = []
             try:

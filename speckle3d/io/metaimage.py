@@ -112,7 +112,9 @@ def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Track
     header = read_header(path)
     tracker = _tracker(header, overrides or ImportSettings())
     if tracker is None:
-        raise InvalidInputError(f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got none")
+        raise InvalidInputError(
+            f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got none"
+        )
     return tracker
 
 

@@ -95,6 +95,7 @@ class SignResolver:
         """Go on with the best paths that differ."""
         recent = max(0, frame - OPEN_FRAMES)
         kept: list[tuple[int, FloatArray]] = []
+        paths: list[FloatArray] = []
         costs: list[float] = []
         for flat in np.argsort(cost, axis=None)[: 4 * HYPOTHESES]:
             parent, which = np.unravel_index(flat, cost.shape)
@@ -102,9 +103,10 @@ class SignResolver:
                 break
             place = _refined(candidates[parent, which], here[parent], moved, weight)
             seen = np.vstack([here[parent], place])
-            others = (np.abs(np.vstack([here[p], x]) - seen).max(axis=0) for p, x in kept)
+            others = (np.abs(path - seen).max(axis=0) for path in paths)
             if not any(o[0] < SAME_MM and o[1] < SAME_SLOPE for o in others):
                 kept.append((int(parent), place))
+                paths.append(seen)
                 costs.append(float(cost[parent, which]))
         parents = np.array([p for p, _ in kept])
         places = np.array([x for _, x in kept])

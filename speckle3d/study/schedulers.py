@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from speckle3d.blocks import on_one_thread
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.hdf5 import one_line
 
@@ -28,6 +30,10 @@ After = Mapping[int, Collection[int]]
 CONNECT_S = 20
 """How long a cluster may take to answer; one on the same network takes far below a second."""
 
+DESERTED_S = 60
+"""How long a cluster may be without any worker; a killed one is started again within seconds."""
+
+_DESERTED = "the cluster has had no worker for a minute"
 _KILLED = "every worker that tried it died: killed, crashed or out of memory"
 
 
@@ -111,11 +117,15 @@ class OnCluster:
                 for number in order.start():
                     # Not pure: a job's key must not be taken for that of an earlier study that is still held.
                     future = self.client.submit(
-                        function, jobs[number], pure=False, priority=order.priority[number]
+                        _on_one_thread, function, jobs[number], pure=False, priority=order.priority[number]
                     )
                     held[future.key] = number, future
                     arriving.add(future)
                 if not held:
+                    return
+                if not self._one_has_ended(arriving):
+                    for number, _ in held.values():
+                        yield number, _DESERTED, None
                     return
                 future = next(arriving)
                 # A result that is still asked for would be made again if its worker died.
@@ -126,6 +136,19 @@ class OnCluster:
                 yield number, reason, result
         finally:
             self.client.cancel([future for _, future in held.values()])
+
+    def _one_has_ended(self, arriving: Any) -> bool:
+        """Wait for a job to end; False if there has been no worker for long."""
+        looked = deserted_since = time.monotonic()
+        while not arriving.has_ready():
+            time.sleep(0.01)
+            now = time.monotonic()
+            if now - looked > 1.0:
+                looked = now
+                deserted_since = now if self.client.nthreads() else deserted_since
+                if now - deserted_since > DESERTED_S:
+                    return False
+        return True
 
     @property
     def workers(self) -> int:
@@ -216,7 +239,7 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
 def local_cluster(workers: int) -> Iterator[Any]:
     """Client of so many worker processes of one thread each on this machine, ended with the block."""
     dask = _dask()
-    # One job already reads and extracts on a second thread: more in the kernels would only get in the way.
+    # A worker has one thread: more in the kernels would only get in the way.
     env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     with (
         dask.LocalCluster(
@@ -264,6 +287,12 @@ def _connected(address: str) -> Iterator[Any]:
         if not client.nthreads():
             raise FileError(f"{address}: expected workers on the cluster, got none")
         yield client
+
+
+def _on_one_thread(function: Callable[[Job], Result], job: Job) -> Result:
+    """What a worker runs: it was given one thread, and its neighbours need theirs."""
+    with on_one_thread():
+        return function(job)
 
 
 def _failure(future: Any) -> str | None:

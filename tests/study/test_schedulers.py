@@ -6,6 +6,7 @@ import pytest
 from cluster_jobs import double, lost, noted, suicide
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.study import schedulers
 from speckle3d.study.schedulers import (
     InProcess,
     OnCluster,
@@ -40,6 +41,17 @@ def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_ot
     found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
     assert (found[0], found[3]) == (0, 3)
     assert all("every worker that tried it died" in found[number] for number in (1, 2))
+
+
+def test_a_cluster_without_workers_does_not_hold_a_study_for_ever(monkeypatch):
+    monkeypatch.setattr(schedulers, "DESERTED_S", 2)
+    with local_cluster(1) as alone:
+        alone.cluster.scale(0)
+        while alone.nthreads():
+            time.sleep(0.05)
+        found = dict(OnCluster(alone).run(double, [1, 2], lost))
+    assert all("no worker" in reason for reason in found.values())
+    assert len(found) == 2
 
 
 def test_a_killed_worker_costs_only_the_job_it_was_at(client, tmp_path):
