@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from speckle3d.core.streams import TimedRotations
     from xsens.accuracy import AccuracyTable, PairErrors, common_readings, mounting_from_motion, pair_errors
     from xsens.accuracy_figures import figure_turns
     from xsens.bytelogs import parse_stream
@@ -42,6 +43,7 @@ _HOME = {
     "Orientation": "fusion",
     "PairErrors": "accuracy",
     "Recorder": "recording",
+    "TimedRotations": "speckle3d.core.streams",
     "common_readings": "accuracy",
     "compare_orientations": "comparison",
     "decode": "framing",
@@ -76,6 +78,7 @@ __all__ = [
     "Orientation",
     "PairErrors",
     "Recorder",
+    "TimedRotations",
     "common_readings",
     "compare_orientations",
     "decode",
@@ -99,7 +102,8 @@ if not TYPE_CHECKING:  # or every misspelt name would pass as an object
         """Load a public name on first use."""
         if name not in _HOME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+        home = _HOME[name]
+        value = getattr(import_module(home if "." in home else f"{__name__}.{home}"), name)
         globals()[name] = value
         return value
 

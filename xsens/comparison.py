@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedRotations
+
+if TYPE_CHECKING:
+    from xsens.fusion import Orientation
 
 
 @dataclass(frozen=True)
@@ -55,24 +59,29 @@ class Comparison:
         return _rms(self.inclination_rad)
 
 
-def compare_orientations(one: TimedRotations, other: TimedRotations) -> Comparison:
+def compare_orientations(
+    one: TimedRotations | Orientation, other: TimedRotations | Orientation
+) -> Comparison:
     """Compare two streams on one clock, the sensor's own orientation with the filter's, say.
 
     Parameters
     ----------
-    one, other : TimedRotations
+    one, other : TimedRotations or Orientation
         In worlds whose z is up; `other` is interpolated at the samples of `one`.
 
     Raises
     ------
     InsufficientDataError
         If they have no time in common.
+    InvalidInputError
+        If one is no stream of orientation.
 
     References
     ----------
     .. [1] D. Laidig et al., "BROAD - A benchmark for robust inertial orientation estimation", Data 6(7),
     2021.
     """
+    one, other = _stream(one), _stream(other)
     common = other.covers(one.time_s)
     if not common.any():
         raise InsufficientDataError(
@@ -87,6 +96,16 @@ def compare_orientations(one: TimedRotations, other: TimedRotations) -> Comparis
     total = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
     offset = float(np.angle(np.exp(1j * heading).mean()))
     return Comparison(time_s, total, heading, inclination, offset)
+
+
+def _stream(given: object) -> TimedRotations:
+    given = getattr(given, "rotations", given)
+    if not isinstance(given, TimedRotations):
+        raise InvalidInputError(
+            f"expected TimedRotations or an Orientation, as orient(log) gives, got {type(given).__name__}: "
+            "a log's own orientation is log.rotations()"
+        )
+    return given
 
 
 def _difference(one: Rotation, other: Rotation) -> FloatArray:

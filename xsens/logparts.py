@@ -104,7 +104,7 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
         None if turned is None or not turned.there.any() else _kept(turned.world_from_sensor, line.kept),
         line.counter,
         line.gaps,
-        (*parts.notes, *lacking, *line.notes),
+        (*parts.notes, *_out_of_range(parts, line.kept), *lacking, *line.notes),
         parts.source,
         np.zeros(0, dtype=bool) if turned is None or not turned.there.any() else turned.there[line.kept],
     )
@@ -112,6 +112,16 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
 
 def _kept(rotations: Rotation, kept: BoolArray) -> Rotation:
     return rotations if kept.all() else rotations[kept]
+
+
+def _out_of_range(parts: Parts, kept: BoolArray) -> tuple[str, ...]:
+    """What `_sane` leaves out, for other reasons than that it was missing."""
+    notes = []
+    for name in ("accelerometer", "gyroscope", "magnetometer"):
+        vectors = next(value for key, value in vars(parts).items() if key.startswith(name))
+        if vectors is not None and (count := int((np.abs(vectors[kept]) >= _ABSURD).any(axis=1).sum())):
+            notes.append(f"{count} {name} readings out of range were left out")
+    return tuple(notes)
 
 
 def _sane(vectors: FloatArray | None, kept: BoolArray) -> FloatArray | None:

@@ -13,6 +13,7 @@ import numpy as np
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from xsens.bytelogs import parse_stream
+from xsens.filekinds import other_kind
 from xsens.framing import find_frames
 from xsens.logparts import Hints
 from xsens.samples import ImuLog, IntArray
@@ -61,6 +62,8 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     data = _content(path)
     if not data:
         raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
+    if (other := other_kind(data)) is not None:
+        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
     if _is_text(data):
         return parse_text(_text(data), hints, str(path))
     return parse_stream(data, hints, str(path))

@@ -15,6 +15,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import BoolArray
 from xsens.clocks import Stamps, timeline_of_times
+from xsens.columnnames import PLAIN_VECTORS, Names, incomplete, not_understood
 from xsens.logparts import TRANSPOSED, Hints, Parts, assembled, on_clock
 from xsens.samples import Gap, ImuLog, IntArray
 from xsens.texttables import TextTable, read_table
@@ -27,12 +28,6 @@ from xsens.worlds import (
     rows_or_columns,
 )
 
-Names = tuple[str, ...]
-
-_PLAIN_VECTORS: tuple[Names, ...] = tuple(
-    tuple(f"{sensor}_{axis}_{unit}" for axis in "xyz")
-    for sensor, unit in (("accelerometer", "m_s2"), ("gyroscope", "rad_s"), ("magnetometer", "au"))
-)
 _VENDOR_VECTORS: tuple[Names, ...] = tuple(
     tuple(f"{sensor}_{axis}" for axis in "xyz") for sensor in ("acc", "gyr", "mag")
 )
@@ -46,7 +41,7 @@ _MATRIX: Names = tuple(f"mat[{row}][{column}]" for row in (1, 2, 3) for column i
 _TIME, _TICKS = "time_s", "sampletimefine"
 _COUNTERS = ("packetcounter", "counter")
 
-_ALL = (*_PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS, *_ANGLES, _MATRIX, _COUNTERS, (_TIME, _TICKS))
+_ALL = (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS, *_ANGLES, _MATRIX, _COUNTERS, (_TIME, _TICKS))
 _KNOWN = frozenset(name for names in _ALL for name in names)
 
 _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.]+)\s*hz", re.IGNORECASE)
@@ -166,13 +161,17 @@ def _whole(column: FloatArray | None) -> IntArray | None:
 def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -> Parts:
     found = [
         next((v for names in both if (v := table.columns(*names)) is not None), None)
-        for both in zip(_PLAIN_VECTORS, _VENDOR_VECTORS, strict=True)
+        for both in zip(PLAIN_VECTORS, _VENDOR_VECTORS, strict=True)
     ]
     orientations, notes = _orientations(table, found[0], hints.world or dialect.world)
+    odd = not_understood(table.names, _KNOWN, dialect is _PLAIN)
+    odd = (*odd, *incomplete(table.names, (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS[:1])))
     if all(vectors is None for vectors in (*found, orientations)):
+        got = "; ".join(odd) or "got none"
         raise InvalidInputError(
-            "expected columns of acceleration, rate of turn, field or orientation, got none"
+            f"expected columns of acceleration, rate of turn, field or orientation, {got}"
         )
+    notes = (*odd, *notes)
     if orientations is not None and hints.world is None:
         notes = (*notes, *dialect.notes)
     if found[0] is None and "freeacc_x" in table.names:
@@ -228,6 +227,7 @@ def _seconds(text: str) -> float:
 def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     """The MT9 software's exports, told apart by how many columns they have."""
     count = table.values.shape[1]
+    _require_unnamed(table, count)
     if count not in _MT9_COLUMNS:
         raise InvalidInputError(f"expected 4, 10 or 11 columns where none has a name, got {count}")
     timed = np.isfinite(table.values[:, 0])
@@ -235,6 +235,15 @@ def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
         raise InvalidInputError("expected times in the first column, got none")
     time_s, values = table.values[timed, 0], table.values[timed, 1:]
     return assembled(timeline_of_times(time_s), _mt9(values, parts, hints.world or "NWU"))
+
+
+def _require_unnamed(table: TextTable, count: int) -> None:
+    """Refuse columns that have names, but none that is known besides the time."""
+    for line in table.header[-1:]:
+        for separator in ",;\t":
+            names = tuple(cell.strip().strip('"').lower() for cell in line.lstrip("# ").split(separator))
+            if len(names) == count and any(name in _KNOWN or name.startswith("time") for name in names):
+                raise InvalidInputError("; ".join(not_understood(names, _KNOWN, plain=True)))
 
 
 def _mt9(values: FloatArray, parts: Parts, world: str) -> Parts:

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.comparison import compare_orientations
+from xsens.fusion import orient
+from xsens.samples import ImuLog
 
 TIME_S = np.arange(0.0, 5.0, 0.05)
 
@@ -43,3 +45,21 @@ def test_the_other_stream_is_interpolated_and_must_overlap():
     assert len(compare_orientations(one, later).time_s) == len(TIME_S) - 10
     with pytest.raises(InsufficientDataError, match="expected streams that overlap"):
         compare_orientations(one, TimedRotations(TIME_S + 100.0, other.world_from_sensor))
+
+
+def test_what_orient_gives_is_taken_and_a_log_is_not():
+    one, _ = streams(Rotation.from_rotvec([0.0, 0.0, 0.2]))
+    n = len(TIME_S)
+    level = np.tile([0.0, 0.0, 9.80665], (n, 1))
+    log = ImuLog(TIME_S, level, np.zeros((n, 3)), np.tile([0.5, 0.0, -0.86], (n, 1)), one.world_from_sensor)
+    found = orient(log)
+    assert compare_orientations(found, found).total_rms_rad == 0.0
+    assert compare_orientations(log.rotations(), found).total_rms_rad > 0.1
+    for wrong in (log, "log.csv"):
+        with pytest.raises(InvalidInputError, match="expected TimedRotations or an Orientation"):
+            compare_orientations(found, wrong)
+
+
+def test_the_type_of_a_stream_is_a_public_name(python):
+    code = "import sys, xsens; assert 'numpy' not in sys.modules; print(xsens.TimedRotations.__module__)"
+    assert python(code).strip() == TimedRotations.__module__

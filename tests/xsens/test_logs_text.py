@@ -278,3 +278,45 @@ def test_cells_that_are_no_plain_decimals_are_left_to_others(cell):
     assert read_decimals(f"1.5,2.5\n{cell},3.5\n0.5,1.5".encode(), ",", 2) is None
     assert read_decimals(b"12345678901234567,2", ",", 2) is None
     assert read_decimals(b"1.5,2.5\n1.5\n1.5,2.5,1.0", ",", 2) is None
+
+
+# Columns that are not understood, and readings that are none
+
+
+def test_columns_that_are_not_understood_are_named_with_what_was_expected():
+    text = (
+        "time_s,gyroscope_x_rad_s,gyroscope_y_rad_s,gyroscope_z_rad_s,accelerometer_x_g,remark\n0,0,0,0,1,7\n"
+    )
+    notes = parse_text(text).notes
+    assert notes == ("columns not understood: accelerometer_x_g (expected accelerometer_x_m_s2), remark",)
+    with pytest.raises(InvalidInputError, match=r"gyr_y_deg_s \(expected gyroscope_y_rad_s\)"):
+        parse_text("time_s,counter,gyr_x_deg_s,gyr_y_deg_s\n0,1,2,3\n")
+    # Four or ten columns are no unnamed export of the MT9 software if they have names.
+    with pytest.raises(InvalidInputError, match="columns not understood: acc_x_g"):
+        parse_text("time_s,acc_x_g,acc_y_g,acc_z_g\n0,0,0,1\n1,0,0,1\n")
+
+
+def test_an_axis_that_is_missing_is_told():
+    text = "time_s,acc_x,acc_y,gyr_x,gyr_y,gyr_z\n0,0,0,0,0,0\n1,0,0,0,0,0\n"
+    assert parse_text(text).notes == ("acc_x, acc_y left out: expected acc_z beside",)
+
+
+def test_readings_out_of_range_are_counted():
+    rows = "".join(f"{i},{1e9 if i in (3, 5) else 0},0,9.8\n" for i in range(9))
+    log = parse_text("time_s,acc_x,acc_y,acc_z\n" + rows)
+    assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [3, 5]
+    assert log.notes == ("2 accelerometer readings out of range were left out",)
+
+
+@pytest.mark.parametrize(
+    ("data", "kind"),
+    [
+        (b"\x89HDF\r\n\x1a\n" + bytes(100), "an HDF5 file"),
+        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64" + bytes(100), "a MATLAB file"),
+        (bytes(1000), "nothing but zeros"),
+    ],
+)
+def test_files_of_other_kinds_are_named(tmp_path, data, kind):
+    (tmp_path / "log").write_bytes(data)
+    with pytest.raises(InvalidInputError, match=f"expected a sensor log .*, got {kind}$"):
+        read_log(tmp_path / "log")
