@@ -47,7 +47,10 @@ def compare(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Compare drift-correction modes over sweeps with a reference: tables, curves, a report."""
+    """Compare drift-correction modes over sweeps with a reference: tables, curves, a report.
+
+    A sweep that fails is a row that says why; the exit code is 2 only if all do.
+    """
     from speckle3d.config import Config, load_config
     from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study

@@ -57,14 +57,16 @@ def score(
     ],
     mode: Annotated[str, typer.Option(help="image, orientation, pose: of a reconstruction.")] = "image",
     reference: Annotated[str | None, typer.Option(help="tracker or truth: of a sweep.")] = None,
-    length_unit: Unit = "m",
+    length_unit: Annotated[
+        str | None, typer.Option(help="m or mm: of TUM text that does not say; else metres.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Score a trajectory: pose errors as evo has them, drift rates, displacement of pixels and landmarks."""
     from speckle3d.study.summary import plain
     from speckle3d.study.trajectories import compare_trajectories, load_estimate, load_reference
 
-    unit = cast("LengthUnit", length_unit)
+    unit = cast("LengthUnit | None", length_unit)
     estimate = load_estimate(estimate_file, mode, unit)
     found = compare_trajectories(estimate, load_reference(reference_file, reference, mode, unit))
     if as_json:

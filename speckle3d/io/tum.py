@@ -51,26 +51,46 @@ def write_tum(
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def read_tum(path: PathLike, length_unit: LengthUnit = "m") -> TimedPoses:
+def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPoses:
     """Read TUM text into poses in mm.
+
+    Parameters
+    ----------
+    length_unit : {"m", "mm"}, optional
+        By default what the file's own first comment says, else metres, as the format has it.
 
     Raises
     ------
     FileError
         If the file cannot be read.
     InvalidInputError
-        If a line is not eight finite numbers, a quaternion is not of unit length, or times do not increase.
+        If a line is not eight finite numbers, a quaternion is not of unit length, or times do not increase;
+        or the file says another unit.
     """
     rows = _read_rows(path)
+    said = _unit_said(path)
+    if length_unit is not None and said is not None and said != length_unit:
+        raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
+    mm_per_unit = _mm_per(length_unit or said or "m")
     norms = np.linalg.norm(rows[:, 4:], axis=1)
     if (wrong := np.flatnonzero(np.abs(norms - 1.0) > _UNIT_TOLERANCE)).size:
         where = f"{path}: pose {wrong[0]}"
         raise InvalidInputError(f"{where}: expected a unit quaternion, got norm {norms[wrong[0]]:.4g}")
-    poses = RigidTransform.from_components(
-        rows[:, 1:4] * _mm_per(length_unit), Rotation.from_quat(rows[:, 4:])
-    )
+    poses = RigidTransform.from_components(rows[:, 1:4] * mm_per_unit, Rotation.from_quat(rows[:, 4:]))
     with naming(str(path)):
         return TimedPoses(rows[:, 0].copy(), poses)
+
+
+def _unit_said(path: PathLike) -> LengthUnit | None:
+    """The unit that a comment like the one of `write_tum` gives."""
+    for line in Path(path).read_text(encoding="utf-8").splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
+            return None
+        words = line.split()
+        for unit in _MM_PER_UNIT:
+            if f"x_{unit}" in words:
+                return "mm" if unit == "mm" else "m"
+    return None
 
 
 def is_tum(path: PathLike) -> bool:

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.study.job import REFERENCES, SUBSET
 from speckle3d.study.metrics import ModeError
@@ -130,15 +131,22 @@ def compare_sweeps(
         raise InvalidInputError("expected at least one sweep, got none")
     chosen = None if modes is None else tuple(dict.fromkeys(modes))
     _require_known(chosen, reference)
-    make_folder(directory / "sweeps")
+    if curves is not None:
+        read_curves(curves)  # wrong for one sweep is wrong for all
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
     plan = [
         plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
         for name, path in _named(paths)
     ]
     jobs = [each for each in plan if isinstance(each, SweepJob)]
-    by_name = {job.name: job for job in jobs}
     outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
+    if not jobs:
+        why = next(iter(outcomes.values()))
+        raise InsufficientDataError(
+            f"expected a sweep that can be compared, got none of {len(plan)}; {why.name}: {why.reason}"
+        )
+    make_folder(directory / "sweeps")
+    by_name = {job.name: job for job in jobs}
     tasks, after = _tasks(jobs)
     so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
     if progress:

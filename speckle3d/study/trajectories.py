@@ -75,7 +75,7 @@ def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> Pos
     return _pose_error(relative_poses(reference).inv() * relative_poses(poses))
 
 
-def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit = "m") -> Trajectory:
+def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | None = None) -> Trajectory:
     """Read TUM text, or one mode of a reconstruction."""
     if _is_hdf5(path):
         return load_reconstructed(path, mode)
@@ -98,7 +98,7 @@ def load_reconstructed(path: Path, mode: str) -> Trajectory:
 
 
 def load_reference(
-    path: Path, wanted: str | None = None, mode: str = "image", length_unit: LengthUnit = "m"
+    path: Path, wanted: str | None = None, mode: str = "image", length_unit: LengthUnit | None = None
 ) -> Trajectory:
     """Read TUM text, a reconstruction, or the truth or tracker of a sweep.
 

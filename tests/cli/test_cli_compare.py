@@ -30,11 +30,16 @@ def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, t
     assert "1 of 2 sweeps were finished before" in err
 
 
-def test_a_study_of_broken_sweeps_alone_fails_after_saying_why(run, torn, tmp_path):
-    code, out, err = run("compare", torn, "-o", tmp_path / "study")
-    assert code == 2
-    assert "torn  failed: " in out
-    assert "expected a sweep that can be compared, got none" in err
+def test_a_study_of_broken_sweeps_alone_is_refused_with_the_first_reason(refused, torn, tmp_path):
+    line = refused("compare", torn, "-o", tmp_path / "study")
+    assert "expected a sweep that can be compared, got none of 1; torn: " in line
+    assert not (tmp_path / "study").exists()
+
+
+def test_curves_that_are_none_are_refused_before_any_work(refused, bench, tmp_path):
+    wrong = ("--curves", bench / "sweep.h5")
+    assert "sweep.h5" in refused("compare", bench / "sweep.h5", "-o", tmp_path / "study", *wrong)
+    assert not (tmp_path / "study").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from drifting import hand_sweep
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.io.tum import read_tum, write_tum
@@ -49,3 +50,12 @@ def test_missing_files_units_and_times_that_do_not_fit(tmp_path):
         write_tum(tmp_path / "a.tum", np.arange(4), poses)
     with pytest.raises(InvalidInputError, match="m or mm"):
         write_tum(tmp_path / "a.tum", np.arange(5), poses, "cm")
+
+
+def test_a_file_says_its_own_unit_and_is_not_overruled(tmp_path):
+    poses = RigidTransform.from_translation([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    write_tum(tmp_path / "mm.tum", [0.0, 1.0], poses, "mm")
+    back = read_tum(tmp_path / "mm.tum").world_from_sensor
+    np.testing.assert_array_equal(back.translation, poses.translation)
+    with pytest.raises(InvalidInputError, match="expected lengths in m, got a file that says mm"):
+        read_tum(tmp_path / "mm.tum", "m")
