@@ -23,8 +23,11 @@ UNKNOWN_PAUSE_S = 1.0
 
 _TICK_SPAN = 1 << 32
 _RARE = 0.01
-_LONGER = 1.5
-"""A step of the clock longer than this many periods is a gap."""
+_LONGER = 1.6
+"""A step of the clock longer than this many periods is a gap, unless the clock is irregular."""
+
+_LONGER_STILL = (2.5, 10.0, float("inf"))
+"""...and what else may be the shortest gap, where that agrees better with the mean rate."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +112,12 @@ def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Ti
     seconds = np.diff(time_s)
     period_s = float(np.median(seconds)) if seconds.size else float("nan")
     samples = None if counter is None else _samples(np.diff(counter), None, np.zeros(seconds.size, bool))
-    missing = _missing(seconds, samples, period_s, 1 << 62)
     never = np.zeros(seconds.size, dtype=bool)
-    gaps = _gaps(_Steps(seconds, missing, never, never, period_s, None))
+    missing, irregular = _missing(seconds, samples, period_s, 1 << 62, never)
+    steps = _Steps(seconds, missing, never, never, period_s, None, irregular)
     late = int((~kept).sum())
     notes = (f"{late} samples whose time did not rise were left out",) if late else ()
-    return Timeline(kept, time_s, counter, gaps, notes)
+    return Timeline(kept, time_s, counter, _gaps(steps), (*notes, *_notes(0, steps)))
 
 
 def _first_of_repeats(stamps: Stamps) -> BoolArray:
@@ -136,7 +139,8 @@ def _only(stamps: Stamps, kept: BoolArray) -> Stamps:
 class _Steps:
     """From each kept sample to the next: seconds, samples missing between, and new starts.
 
-    `counts` is how far the counter rose; `unknown` marks the new starts that no clock tells of.
+    `counts` is how far the counter rose; `unknown` marks the new starts that no clock tells of; `irregular`
+    that the clock's steps vary too much to tell single losses.
     """
 
     seconds: FloatArray
@@ -145,6 +149,7 @@ class _Steps:
     unknown: BoolArray
     period_s: float
     counts: IntArray | None
+    irregular: bool = False
 
 
 def _steps(stamps: Stamps) -> _Steps:
@@ -156,13 +161,14 @@ def _steps(stamps: Stamps) -> _Steps:
     if ticks is not None and not (period_s > 0.0 or anew.all()):
         period_s = float(np.median(ticks[~anew])) * stamps.tick_s
     seconds = _seconds(ticks, stamps.tick_s, samples, period_s)
-    missing = _missing(seconds, samples, period_s, span)
+    samples = _unlike_stride(samples, counts, seconds[~anew], period_s, anew)
+    missing, irregular = _missing(seconds, samples, period_s, span, anew)
     if counts is not None and samples is not None:
         counts = counts + np.round((missing + 1 - samples) / span).astype(np.int64) * span
     pauses = _pauses(stamps, anew, seconds)
     unknown = anew & np.isnan(pauses)
     seconds = np.where(anew, np.where(unknown, UNKNOWN_PAUSE_S, pauses), seconds)
-    return _Steps(seconds, np.where(anew, 0, missing), anew, unknown, period_s, counts)
+    return _Steps(seconds, np.where(anew, 0, missing), anew, unknown, period_s, counts, irregular)
 
 
 def _seconds(
@@ -205,14 +211,54 @@ def _stride(steps: IntArray) -> int:
     return int(np.gcd.reduce(values[often >= _RARE * steps.size])) or 1
 
 
-def _missing(seconds: FloatArray, samples: FloatArray | None, period_s: float, span: int) -> IntArray:
-    """Samples taken between two, by the counter; by the clock where the counter wrapped or is not there."""
+def _unlike_stride(
+    samples: FloatArray | None, counts: IntArray | None, seconds: FloatArray, period_s: float, anew: BoolArray
+) -> FloatArray | None:
+    """Periods of each step where every other sample is lost, say, which only the known period tells."""
+    if samples is None or counts is None or not period_s > 0.0 or not seconds.size:
+        return samples
+    times = float(np.median(seconds / (period_s * samples[~anew])))
+    whole = round(times)
+    divides = whole > 1 and not (counts[~anew] % whole).any()
+    return samples * whole if divides and abs(times - whole) < 0.1 else samples
+
+
+def _missing(
+    seconds: FloatArray, samples: FloatArray | None, period_s: float, span: int, anew: BoolArray
+) -> tuple[IntArray, bool]:
+    """Samples taken between two, by the counter; by the clock where the counter wrapped or is not there.
+
+    Also whether that is a clock too irregular to tell all.
+    """
     by_clock = seconds / period_s if period_s > 0.0 else np.ones(seconds.size)
     if samples is None:
-        taken = np.where(by_clock > _LONGER, by_clock, 1.0)
+        taken, irregular = _by_clock(np.where(anew, 1.0, by_clock))
     else:
         taken = samples + np.maximum(np.round((by_clock - samples) / span), 0) * span
-    return np.round(taken).astype(np.int64) - 1
+        irregular = False
+    return np.round(taken).astype(np.int64) - 1, irregular
+
+
+def _by_clock(periods: FloatArray) -> tuple[FloatArray, bool]:
+    """Periods of each step, whole, and whether the clock is irregular.
+
+    A clock that trembles has long steps without a loss, but short ones after them: then time is nearer to a
+    straight line over the samples if the long steps are not counted as several.
+    """
+    counted = [np.where(periods > limit, np.round(periods), 1.0) for limit in (_LONGER, *_LONGER_STILL)]
+    if np.array_equal(counted[0], counted[-1]):
+        return counted[0], False
+    time = np.concatenate(([0.0], np.cumsum(periods)))
+    off = [_off_line(np.concatenate(([0.0], np.cumsum(each))), time) for each in counted]
+    best = int(np.argmin(np.array(off) + 1e-6 * np.arange(len(off))))  # of equals the first
+    return counted[best], not np.array_equal(counted[best], counted[0])
+
+
+def _off_line(index: FloatArray, time: FloatArray) -> float:
+    """RMS distance of times from a straight line over an index."""
+    across, along = index - index.mean(), time - time.mean()
+    slope = float(across @ along) / max(float(across @ across), 1e-300)
+    return float(np.sqrt(np.mean((along - slope * across) ** 2)))
 
 
 def _pauses(stamps: Stamps, anew: BoolArray, seconds: FloatArray) -> FloatArray:
@@ -236,7 +282,8 @@ def _risen(stamps: Stamps, steps: _Steps) -> IntArray | None:
 
 
 def _gaps(steps: _Steps) -> tuple[Gap, ...]:
-    at = np.flatnonzero((steps.missing > 0) | steps.anew | (steps.seconds > _LONGER * steps.period_s))
+    long = (steps.seconds > _LONGER * steps.period_s) & (not steps.irregular)
+    at = np.flatnonzero((steps.missing > 0) | steps.anew | long)
     return tuple(Gap(int(i), int(steps.missing[i]), float(steps.seconds[i])) for i in at)
 
 
@@ -244,6 +291,11 @@ def _notes(repeats: int, steps: _Steps) -> tuple[str, ...]:
     notes = []
     if repeats:
         notes.append(f"{repeats} samples came twice; the second was left out")
+    if steps.irregular:
+        shortest, longest = 1e3 * steps.seconds.min(), 1e3 * steps.seconds.max()
+        notes.append(
+            f"irregular clock, steps of {shortest:.3g} to {longest:.3g} ms: single losses cannot be told"
+        )
     if steps.anew.any():
         told = int((steps.anew & ~steps.unknown).sum())
         notes.append(

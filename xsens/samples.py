@@ -21,6 +21,9 @@ IntArray = npt.NDArray[np.int64]
 
 _VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 
+_PAUSE = 2.5
+"""A step of so many periods is no trembling of a clock."""
+
 
 @dataclass(frozen=True)
 class Gap:
@@ -109,8 +112,20 @@ class ImuLog:
 
     @cached_property
     def rate_hz(self) -> float:
-        """Samples per second, by the median step of the clock; NaN for a single sample."""
-        return float(1.0 / np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
+        """Samples per second, lost ones included, as the sensor took them; NaN for a single sample."""
+        steps = np.diff(self.time_s)
+        if not steps.size:
+            return float("nan")
+        taken = np.ones(steps.size)
+        for gap in self.gaps:
+            if 0 <= gap.after_index < steps.size:
+                taken[gap.after_index] = gap.lost + 1 if gap.lost else np.inf
+        known = np.isfinite(taken)
+        if not known.any():
+            return float(1.0 / np.median(steps))
+        period_s = np.median(steps[known] / taken[known])
+        regular = known & (steps < _PAUSE * period_s * taken)  # without pauses that nobody told of
+        return float(taken[regular].sum() / steps[regular].sum())
 
     @property
     def duration_s(self) -> float:

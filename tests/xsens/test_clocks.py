@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError
 from xsens.clocks import UNKNOWN_PAUSE_S, Stamps, timeline, timeline_of_times
-from xsens.samples import Gap
+from xsens.samples import Gap, ImuLog
 
 PERIOD_S = 1 / 256
 
@@ -122,3 +122,49 @@ def test_whatever_the_stamps_the_clock_rises(rows, which):
     assert (np.diff(line.time_s) > 0).all()
     assert all(gap.lost >= 0 and gap.duration_s > 0 for gap in line.gaps)
     assert line.counter is None or (np.diff(line.counter) >= 0).all()
+
+
+def trembling(samples=2000, lost=()):
+    """Times at 100 Hz that are off by up to 4 ms, some samples lost."""
+    taken = np.setdiff1d(np.arange(samples), lost)
+    return 0.01 * taken + np.random.default_rng(2).uniform(-0.004, 0.004, taken.size)
+
+
+@pytest.mark.parametrize(
+    "read", [timeline_of_times, lambda t: timeline(Stamps(ticks=np.round(1e4 * t + 50)))]
+)
+def test_a_clock_that_trembles_much_is_irregular_and_has_lost_nothing(read):
+    times = trembling()
+    assert (np.diff(times) > 0.016).sum() > 20  # or nothing is tried
+    line = read(times)
+    assert line.gaps == ()
+    assert "irregular clock" in line.notes[0]
+    log = ImuLog(line.time_s, gaps=line.gaps, accelerometer_m_s2=np.ones((2000, 3)))
+    # As many samples as the rate and the duration make.
+    assert (len(log) + log.lost - 1) / log.duration_s == pytest.approx(log.rate_hz, rel=1e-9)
+    assert log.rate_hz == pytest.approx(100.0, rel=1e-3)
+
+
+def test_a_pause_is_found_even_by_a_clock_that_trembles():
+    line = timeline_of_times(trembling(lost=np.arange(700, 760)))
+    assert [gap.after_index for gap in line.gaps] == [699]
+    assert abs(line.gaps[0].lost - 60) <= 1
+
+
+def test_the_rate_is_the_sensors_whatever_was_lost():
+    # More than half of the samples lost: the step that is most common is of two periods.
+    taken = np.cumsum(np.random.default_rng(5).choice([1, 2, 3], p=[0.3, 0.6, 0.1], size=500))
+    line = timeline(
+        Stamps(counter=taken, ticks=np.round(1e6 * taken / 60), tick_s=1e-6, counter_span=1 << 32)
+    )
+    log = ImuLog(line.time_s, gaps=line.gaps, counter=line.counter)
+    assert log.rate_hz == pytest.approx(60.0, rel=1e-4)
+    assert len(log) + log.lost == taken[-1] - taken[0] + 1
+
+
+def test_every_other_sample_lost_is_told_by_the_configured_rate():
+    taken = 2 * np.arange(100)
+    stamps = Stamps(taken, np.round(1e6 * taken / 60).astype(int), 1 << 32, 1e-6, period_s=1 / 60)
+    line = timeline(stamps)
+    assert sum(gap.lost for gap in line.gaps) == 99
+    assert ImuLog(line.time_s, gaps=line.gaps).rate_hz == pytest.approx(60.0, rel=1e-4)
