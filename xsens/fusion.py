@@ -143,7 +143,8 @@ def _usable(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
         lacking = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
         none = " and ".join(f"no {name}" for name, values in lacking.items() if values is None)
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {none}")
+        why = "".join(f"; {note}" for note in log.notes if note.startswith("columns not understood"))
+        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {none}{why}")
     used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
     force = log.accelerometer_m_s2[used]
     there = np.isfinite(force).all(axis=1)

@@ -136,8 +136,7 @@ def imu_orient(
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
     require_finite_offset(time_offset_s)
-    if out is not None:
-        _require_another(out, log_file)
+    _require_another(out, log_file)
     log = read(log_file, rate_hz)
     with naming(str(log_file)):
         rotations, found = orientation_of(log, method, magnetometer)
@@ -197,9 +196,9 @@ def require_finite_offset(time_offset_s: float) -> None:
         raise InvalidInputError(f"--time-offset-s: expected a finite number, got {time_offset_s}")
 
 
-def _require_another(out: Path, log_file: Path) -> None:
+def _require_another(out: Path | None, log_file: Path) -> None:
     """A log is never written over by what is made of it."""
-    if out.exists() and log_file.exists() and os.path.samefile(out, log_file):
+    if out is not None and out.exists() and log_file.exists() and os.path.samefile(out, log_file):
         raise InvalidInputError(f"{out}: expected another file than the log that is read, got the same")
 
 
@@ -292,8 +291,7 @@ def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
         raise
     if sweep.orientation is not None and not replace_stream:
         raise InvalidInputError(
-            f"{sweep_file}: expected a sweep without an orientation sensor's stream, got one: "
-            "--replace replaces it"
+            f"{sweep_file}: expected no orientation sensor's stream, got one: --replace replaces it"
         )
     return sweep.frame_time_s
 
@@ -302,14 +300,14 @@ def _require_cover(sweep_file: Path, sensor: OrientationSensor, frame_time_s: Fl
     """How many frames the stream covers, in words; refused if none."""
     if frame_time_s is None:
         return ""
-    covered, frames = int(sensor.covers(frame_time_s).sum()), frame_time_s.size
-    if not covered:
+    covered = f"covers {int(sensor.covers(frame_time_s).sum())} of {frame_time_s.size} frames"
+    if not sensor.covers(frame_time_s).any():
         first, last = sensor.readings.time_s[[0, -1]] + sensor.time_offset_s
         raise InvalidInputError(
             f"{sweep_file}: expected a stream that covers frames of the sweep, {frame_time_s[0]:.3f} to "
-            f"{frame_time_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s: covers 0 of {frames} frames"
+            f"{frame_time_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s: {covered}"
         )
-    return f": covers {covered} of {frames} frames"
+    return f": {covered}"
 
 
 def _orientation_rows(

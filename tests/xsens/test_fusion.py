@@ -10,6 +10,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion import orient
 from xsens.fusion_settings import FusionSettings
 from xsens.samples import ImuLog
+from xsens.textlogs import parse_text
 
 RATE_HZ = 100.0
 FIELD = np.array([0.5, 0.0, -0.86])
@@ -171,3 +172,9 @@ def test_what_is_missing_is_named():
         orient(ImuLog(log.time_s, None, log.gyroscope_rad_s))
     with pytest.raises(InvalidInputError, match=r"expected an ImuLog, as read_log\(path\) gives, got str"):
         orient("log.csv")
+
+
+def test_columns_that_were_not_understood_are_named_where_they_are_missed():
+    text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_g\n0,0,0,0,1\n0.01,0,0,0,1\n"
+    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_g \(expected accelerometer_x_m_s2\)$"):
+        orient(parse_text(text))
