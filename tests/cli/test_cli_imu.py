@@ -3,6 +3,7 @@
 import json
 import re
 
+import h5py
 import numpy as np
 import pytest
 import sweep_examples
@@ -213,3 +214,12 @@ def test_help_names_the_columns_of_a_plain_log(run):
         for name in ("time_s", "accelerometer_x_m_s2", "gyroscope_x_rad_s", "magnetometer_x_au"):
             assert name in told
     assert "time_sanduntil_s" in re.sub(r"[\s│]+", "", run("imu", "accuracy", "--help")[1])
+
+
+def test_a_stream_that_cannot_be_read_can_be_replaced(run, refused, log_file, sweep_file):
+    assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
+    with h5py.File(sweep_file, "r+") as file:
+        file["orientation"].attrs["time_offset_s"] = np.nan
+    code, _, err = run("imu", "orient", log_file, "--into", sweep_file, "--replace")
+    assert code == 0, err
+    assert load_sweep(sweep_file).orientation.time_offset_s == 0.0

@@ -5,10 +5,11 @@ import pytest
 import simulated_device as simulated
 
 from xsens.device import DeviceInfo
-from xsens.live import LiveState, Monitor
+from xsens.live import LiveState, Monitor, _Attitude
 from xsens.messages import Configuration, Message, MessageId, UnitConfiguration, encode
 from xsens.mtdata import DataLayout, OutputMode
 from xsens.rawcounts import RawCalibration
+from xsens.samples import ImuLog
 
 RATE_HZ = 100.0
 MODE = OutputMode.CALIBRATED | OutputMode.ORIENTATION
@@ -150,3 +151,14 @@ class TestLine:
     def test_says_whether_the_field_is_disturbed(self, field, dip_deg, verdict):
         line = self.state(field=field, dip_change_rad=np.deg2rad(dip_deg)).line()
         assert line.endswith(f" | field {field:.2f} dip {dip_deg:+d} {verdict}")
+
+
+def test_readings_that_the_filter_refuses_do_not_end_the_display():
+    time_s = np.arange(0.0, 2.0, 0.01)
+    up, turning, still = (
+        np.tile(each, (time_s.size, 1)) for each in ([0, 0, 9.8], [0, 0, 100.0], [0, 0, 0.0])
+    )
+    attitude = _Attitude(100.0)
+    attitude.follow(ImuLog(time_s, up, turning), 0)
+    attitude.follow(ImuLog(time_s, up, still), 0)
+    assert attitude.latest.magnitude() < 1e-6
