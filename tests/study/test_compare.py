@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
@@ -184,8 +184,14 @@ def test_sweeps_of_one_name_are_told_apart_and_one_given_twice_is_one(sweeps, tm
     (tmp_path / "other").mkdir()
     twin = tmp_path / "other" / "broken.h5"
     twin.write_bytes(b"nothing")
-    found = compare_sweeps([sweeps[1], twin, sweeps[1]], tmp_path)
-    assert [each.name for each in found.outcomes] == ["broken", "other-broken"]
+    found = compare_sweeps([sweeps[1], twin, sweeps[1], sweeps[0]], tmp_path, ["pose"])
+    assert [each.name for each in found.outcomes] == ["broken", "other-broken", "s5"]
+
+
+def test_broken_sweeps_alone_are_refused_and_nothing_is_written(sweeps, tmp_path):
+    with pytest.raises(InsufficientDataError, match="got none of 1; broken: "):
+        compare_sweeps([sweeps[1]], tmp_path / "study")
+    assert not (tmp_path / "study").exists()
 
 
 def test_no_sweeps_are_refused(tmp_path):
