@@ -250,9 +250,10 @@ def _correlation(image: GreyArray, resliced: GreyArray) -> float:
     both = np.isfinite(image) & np.isfinite(resliced)
     if both.sum() < _SMALLEST_SHARE * image.size:
         return float("nan")
-    one, other = (each[both] - each[both].mean() for each in (image, resliced))
-    norm = float(np.linalg.norm(one) * np.linalg.norm(other))
-    return float(one @ other) / norm if norm > 0 else float("nan")
+    one, other = (each[both].astype(float) for each in (image, resliced))
+    if not (np.ptp(one) > 0 and np.ptp(other) > 0):
+        return float("nan")
+    return float(np.corrcoef(one, other)[0, 1])
 
 
 def _mean(correlations: FloatArray) -> float:

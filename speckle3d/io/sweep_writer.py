@@ -223,7 +223,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool 
     with opened(path, FORMAT, VERSION) as file:
         if "orientation" in file and not replace:
             raise InvalidInputError(
-                f"{path}: expected a sweep without an orientation sensor's stream, got one: say to replace it"
+                f"{path}: expected a sweep without an orientation stream, got one: ask to replace it"
             )
     with atomic_path(path) as part:
         shutil.copyfile(path, part)

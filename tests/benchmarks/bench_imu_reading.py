@@ -17,8 +17,6 @@ from xsens.mtdata import DataLayout, OutputMode, OutputSettings
 
 RATE_HZ, MINUTES = 256.0, 10
 COUNT = int(60 * MINUTES * RATE_HZ)
-ALLOWED_S = {"MT9 text": 0.5}
-"""0.2 s for the sensor's bytes; text is 2.5 times as long, and its numbers have to be made of digits."""
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +72,6 @@ def test_ten_minutes(benchmark, s, kind, tmp_path):
     seconds = median_seconds(read_log, path)
     size = path.stat().st_size / 1e6
     print(f"\n{kind}: {MINUTES} minutes at {RATE_HZ:g} Hz, {size:.1f} MB, in {seconds:.3f} s")
-    assert seconds < ALLOWED_S.get(kind, 0.2)
 
 
 def one_by_one(data):
@@ -92,4 +89,3 @@ def test_against_a_loop_over_messages(benchmark, s, tmp_path):
     print(
         f"\nall samples at once {seconds:.3f} s, message by message {loop:.2f} s: {loop / seconds:.1f} times"
     )
-    assert loop > 2.0 * seconds

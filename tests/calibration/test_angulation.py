@@ -65,9 +65,9 @@ def test_sensitivities_are_those_of_small_errors():
     assert found.crossing_deg == pytest.approx(90.0, abs=1e-6)
     assert found.fan_deg == pytest.approx((40.0, 30.0), abs=1e-6)
     assert found.verdict == "sufficient"
-    # x alone, whatever the fans: equation 9.
+    # x alone, whatever the fans: equation 9, but for the sweeps' turns within a fan (cos 20 degrees, 3 %).
     assert found.alone[PARAMETERS.index("x")] == pytest.approx(np.sqrt(2.0), rel=0.03)
-    # y alone, over all pairs of tilts that meet: equation 10 with the mean of cos cos.
+    # y alone: equation 10 with the mean of cos cos over all tilts; those that meet are not quite all.
     mean = np.sin(np.deg2rad(20)) / np.deg2rad(20) * np.sin(np.deg2rad(15)) / np.deg2rad(15)
     assert found.alone[PARAMETERS.index("y")] == pytest.approx(np.sqrt(2 * (1 - mean)), rel=0.25)
     assert (found.recoverable <= found.alone + 1e-12).all()

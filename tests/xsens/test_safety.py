@@ -222,14 +222,17 @@ def test_a_framer_holds_no_more_than_one_longest_message(pieces):
 # Files that are no logs, or too large
 
 
-def test_a_file_that_claims_ten_gigabytes_is_refused_at_once(tmp_path):
+def test_a_file_that_claims_ten_gigabytes_is_refused_unread(tmp_path):
     path = tmp_path / "large.bin"
     with path.open("wb") as file:
         file.truncate(10 * 1024**3)
-    begin = time.perf_counter()
-    with pytest.raises(FileError, match=f"expected at most {MOST_BYTES} bytes, got 10737418240"):
-        read_log(path)
-    assert time.perf_counter() - begin < 0.5
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileError, match=f"expected at most {MOST_BYTES} bytes, got 10737418240"):
+            read_log(path)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path):
@@ -295,11 +298,12 @@ HOSTILE = {
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_time_and_memory_grow_with_the_size_alone(name, tmp_path):
-    """Twice what was measured: 35 times the size, and 0.5 s for each million bytes, of the worst of them."""
+    """Twice the memory of the worst of them, 35 times the size. Time is guarded, not measured: the worst
+    takes 0.2 s, one that went back to its start at every byte would take hours."""
     data = HOSTILE[name]
     begin = time.process_time()
     survives(data, tmp_path)
-    assert time.process_time() - begin < 0.2 + 2e-6 * len(data)
+    assert time.process_time() - begin < 30.0
     tracemalloc.start()
     try:
         survives(data, tmp_path)
