@@ -43,6 +43,10 @@ _IRON_PRIOR = 0.01
 _UNEVEN = 0.15
 """What a reference may leave of the field's norm: that of a room with iron in it."""
 
+_FIRST_AFTER_S, _FIRST_UNEVEN = 5.0, 0.5
+"""The same for a first reference that has not proved itself, which was perhaps learnt beside iron (5 s: VQF's
+default): what would be a poor reference is better than none."""
+
 _STEEPEST = 0.05
 """A field with less of its strength across shows no heading: a room's iron turns it any way."""
 
@@ -135,15 +139,16 @@ class _Candidate:
         square = self._square / self.weight_s - 2.0 * iron @ body + iron @ iron
         return room, max(float(square - room @ room), 0.0)
 
-    def better_than(self, reference: Reference) -> tuple[FloatArray, FloatArray] | None:
+    def better_than(self, reference: Reference, proved: bool) -> tuple[FloatArray, FloatArray] | None:
         """Room and iron if known well enough and clearly better than the reference in use.
 
         The iron stays what it was if another room alone explains nearly as much.
         """
-        if self.weight_s < _LEARNT_AFTER_S:
+        after_s, uneven = (_LEARNT_AFTER_S, _UNEVEN) if proved else (_FIRST_AFTER_S, _FIRST_UNEVEN)
+        if self.weight_s < after_s:
             return None
         room, iron, left = self.solve()
-        if left > (_UNEVEN * np.linalg.norm(room)) ** 2:
+        if left > (uneven * np.linalg.norm(room)) ** 2:
             return None
         if 1.5 * self._misfit / self.weight_s < _BETTER * left:  # it is of two components of three
             return None
@@ -219,7 +224,7 @@ class FieldMonitor:
                 self._refine()
             learnt = self._learn()
             restart = None if self.confirmed else learnt
-            self.confirmed = self.confirmed or learnt is not None or self._turned_s > _PROVED_AFTER_S
+            self.confirmed = self.confirmed or self._turned_s > _PROVED_AFTER_S
         steep = reference.horizontal_au <= _STEEPEST * reference.norm_au
         disturbed = steep or self._fitting_s < _UNDISTURBED_AFTER_S
         variance = math.inf if steep else off / (2.0 * reference.horizontal_au**2)
@@ -244,7 +249,7 @@ class FieldMonitor:
     def _learn(self) -> FloatArray | None:
         """The room's field, if turning showed another reference to fit clearly better."""
         assert self.reference is not None
-        better = self._candidate.better_than(self.reference)
+        better = self._candidate.better_than(self.reference, self.confirmed)
         if better is None:
             return None
         room, iron = better
@@ -253,7 +258,7 @@ class FieldMonitor:
             self._known.memory_s = _IRON_MEMORY_S
         self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)
         self._candidate.clear()
-        self._fitting_s = 0.0
+        self._fitting_s = self._turned_s = 0.0
         return room
 
     def _refine(self) -> None:

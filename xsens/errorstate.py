@@ -250,10 +250,11 @@ class ErrorStateFilter:
 
     def _doubt_heading(self, room_au: FloatArray) -> None:
         """The field known from turning replaces the first one: a heading far from it was iron's."""
-        residual = _wrapped(-math.atan2(room_au[1], room_au[0]) - self._heading)
-        variance = self.kalman.P[HEADING, HEADING] + self.settings.field_sd_rad**2
-        if residual**2 > 9.0 * variance:
+        place = self.settings.field_sd_rad**2
+        residual = _wrapped(-math.atan2(room_au[1], room_au[0]) - self._heading - self._stray)
+        if residual**2 > 9.0 * (self.kalman.P[HEADING, HEADING] + place):
             self.kalman.P[HEADING, HEADING] += residual**2
+            self._masked_update(_OBSERVES_NORTH, np.array([residual]), np.array([[place]]), _HEADING_ONLY)
 
     def _masked_update(
         self, shows: FloatArray, residual: FloatArray, variance: FloatArray, mask: FloatArray
@@ -291,6 +292,8 @@ def _observer(states: slice) -> FloatArray:
 
 _OBSERVES_SPEED, _OBSERVES_BIAS = _observer(SPEED), _observer(BIAS)
 _OBSERVES_HEADING_BIAS = _observer(HEADING_BIAS)
+_OBSERVES_NORTH = np.zeros((1, SIZE))
+_OBSERVES_NORTH[0, [HEADING, STRAY]] = 1.0
 _HEADING_ONLY = np.zeros(SIZE)
 _HEADING_ONLY[[HEADING, 9, 10, 11, STRAY]] = 1.0
 _INCLINATION = 1.0 - _HEADING_ONLY

@@ -12,7 +12,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from broad import TRIALS, errors_deg, read_trial
+from broad import TRIALS, east_first, errors_deg, read_trial
 from vqf import VQF
 
 from xsens.fusion import orient
@@ -25,18 +25,22 @@ def main():
         log, true, moving = read_trial(folder, name)
         peer = VQF(1.0 / log.rate_hz)
         theirs = peer.updateBatch(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)["quat9D"]
-        print(f"{name}: total, heading, inclination, degrees")
-        print(f"  VQF       {errors_deg(theirs, true, moving).round(2)}")
+        print(f"{name}: total, heading, inclination, degrees; the same without a constant heading")
+        print(f"  VQF       {both_ways(theirs, true, moving)}")
         for smooth in (False, True):
             start = time.process_time()
-            found = orient(log, smooth=smooth).rotations.world_from_sensor.as_quat(scalar_first=True)
+            found = east_first(orient(log, smooth=smooth).rotations.world_from_sensor)
             pace = log.duration_s / (time.process_time() - start)
             label = "smoother" if smooth else "filter"
-            print(f"  {label:9} {errors_deg(found, true, moving).round(2)}, {pace:.0f} times real time")
+            print(f"  {label:9} {both_ways(found, true, moving)}, {pace:.0f} times real time")
+
+
+def both_ways(found, true, moving):
+    return " ".join(str(errors_deg(found, true, moving, steady).round(2)) for steady in (False, True))
 
 
 def sensitivity():
-    """Total error of filter | smoother on each trial, degrees."""
+    """Total error of filter | smoother on each trial, degrees, without a constant heading."""
     trials = [read_trial(Path(sys.argv[1]), name) for name in TRIALS]
     print(f"{'':32} " + " ".join(f"{name[:13]:^13}" for name in TRIALS))
     row("as it is", FusionSettings(), trials)
@@ -53,8 +57,8 @@ def row(label, settings, trials):
     for log, true, moving in trials:
         both = []
         for smooth in (False, True):
-            found = orient(log, settings, smooth).rotations.world_from_sensor.as_quat(scalar_first=True)
-            both.append(errors_deg(found, true, moving)[0])
+            found = east_first(orient(log, settings, smooth).rotations.world_from_sensor)
+            both.append(errors_deg(found, true, moving, steady=True)[0])
         cells.append(f"{both[0]:5.2f} | {both[1]:5.2f}")
     print(f"{label:32} " + " ".join(cells), flush=True)
 

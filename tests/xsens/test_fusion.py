@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from broad import TRIALS, errors_deg, read_trial
+from broad import TRIALS, east_first, errors_deg, read_trial
 from scipy.spatial.transform import Rotation
 from vqf import VQF
 
@@ -93,23 +93,54 @@ def test_a_log_without_gyroscope_or_in_other_units_is_refused():
         orient(ImuLog(log.time_s, log.accelerometer_m_s2 / 9.81, log.gyroscope_rad_s))
 
 
+def beside_iron(seconds=60.0, seed=4):
+    """A sensor at rest beside a magnet for 5 s, then carried away and turned to and fro about all axes."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
+    moved = np.clip(time_s - 5.0, 0.0, None)
+    swing = (
+        0.8 * np.column_stack([np.sin(f * moved) for f in (1.1, 1.7, 1.3)]) * (1 - np.exp(-moved))[:, None]
+    )
+    truth = Rotation.from_euler("ZYX", swing)
+    turns = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
+    gyroscope = np.vstack([turns[:1], turns]) + np.deg2rad(0.2) * rng.standard_normal((time_s.size, 3))
+    force = truth.inv().apply([0.0, 0.0, 9.80665]) + 0.05 * rng.standard_normal((time_s.size, 3))
+    # From 8 cm to 35 cm off it: the field of a dipole falls with the third power.
+    distance = 0.08 + 0.27 * (1.0 - np.exp(-moved))
+    magnet = np.outer((0.08 / distance) ** 3, [-0.8, 0.6, 0.4])
+    field = truth.inv().apply(FIELD + magnet) + 0.004 * rng.standard_normal((time_s.size, 3))
+    return truth, ImuLog(time_s, force, gyroscope, field)
+
+
+def test_a_start_beside_iron_is_taken_back():
+    truth, log = beside_iron()
+    filtered, smoothed = (heading_deg(truth, orient(log, smooth=smooth)) for smooth in (False, True))
+    # The magnet turns the first heading by 117 degrees. After 5 s of turning the filter knows another field
+    # to be the room's; what is left of the magnet at 35 cm turns that by 0.8 degrees. Measured 1.4 and 1.2.
+    assert np.abs(filtered[log.time_s < 5.0]).min() > 100.0
+    assert np.abs(filtered[log.time_s > 13.0]).max() < 2.5
+    assert np.abs(smoothed).max() < 2.5
+
+
 @pytest.mark.realdata
-def test_broad_trials_beside_vqf(realdata):
+@pytest.mark.parametrize("steady", [False, True])
+def test_broad_trials_beside_vqf(realdata, steady):
     gains = []
     for name in TRIALS:
         log, true, moving = read_trial(realdata / "broad", name)
         peer = VQF(1.0 / log.rate_hz)
         theirs = peer.updateBatch(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)["quat9D"]
-        vqf = errors_deg(theirs, true, moving)[0]
+        vqf = errors_deg(theirs, true, moving, steady)[0]
         ours = []
         for smooth in (False, True):
-            found = orient(log, smooth=smooth).rotations.world_from_sensor.as_quat(scalar_first=True)
-            ours.append(errors_deg(found, true, moving)[0])
-        # The filter is no worse than VQF on any trial; measured 1.15, 0.80 and 1.93 against 1.16, 1.24, 3.47.
+            found = east_first(orient(log, smooth=smooth).rotations.world_from_sensor)
+            ours.append(errors_deg(found, true, moving, steady)[0])
+        # The filter is no worse than VQF on any trial; measured 3.1, 0.8 and 2.2 against 4.0, 2.3 and 4.0,
+        # and without a constant heading 1.12, 0.76 and 1.93 against 1.16, 1.24 and 3.47.
         assert ours[0] <= vqf, name
         gains.append(1.0 - ours[1] / vqf)
         if "magnet" in name:
-            # Measured 1.63 against 3.47; the filter alone is at 0.56 of VQF.
+            # Measured 1.70 against 4.04, or 1.63 against 3.47; the filter alone is at 0.53 and 0.56 of VQF.
             assert ours[1] <= 0.5 * vqf
     assert np.mean(gains) >= 0.2
 
