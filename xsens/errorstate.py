@@ -79,13 +79,12 @@ class ErrorStateFilter:
     def __init__(self, settings: FusionSettings, first: Increment) -> None:
         """Start at the beginning of `first`, which is still to be given to `advance`; its bias is taken."""
         self.settings = settings
-        self._level = upright(first.velocity_m_s)
+        self._magnetic = settings.use_magnetometer
         self._start: Start | None = Start()
-        self._heading = 0.0
+        self._point(first)
         self.velocity = np.zeros(3)
         self.bias = first.bias_rad_s.copy()
         self._heading_bias = self.bias.copy()
-        self._magnetic = settings.use_magnetometer
         self.resting = self.disturbed = False
         self._rest = RestDetector(settings)
         self._monitor = FieldMonitor(settings)
@@ -110,8 +109,15 @@ class ErrorStateFilter:
         fresh[HEADING_BIAS, HEADING_BIAS] += walk * np.eye(3)
         self.kalman.P = fresh
         self._start, self._stray = Start(), 0.0
-        self._level, self._heading = upright(increment.velocity_m_s), 0.0
+        self._point(increment)
         self._rest = RestDetector(self.settings)
+
+    def _point(self, first: Increment) -> None:
+        """Up and north by one increment alone."""
+        self._level, self._heading = upright(first.velocity_m_s), 0.0
+        if first.field_au is not None and self._magnetic:
+            field = self._level @ first.field_au
+            self._heading = -math.atan2(field[1], field[0])
 
     @property
     def matrix(self) -> FloatArray:
