@@ -113,7 +113,8 @@ def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Track
     tracker = _tracker(header, overrides or ImportSettings())
     if tracker is None:
         raise InvalidInputError(
-            f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got none"
+            f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), "
+            f"got {', '.join(header.transforms) or 'none'}"
         )
     return tracker
 
