@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from speckle3d.cli.common import Json, app, emit, note
+from speckle3d.cli.outputs import require_own_place
 
 if TYPE_CHECKING:
     from speckle3d.io.tum import LengthUnit
@@ -41,10 +42,11 @@ def export(
     length_unit: Unit = "m",
 ) -> None:
     """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""
-    from speckle3d.io.tum import write_tum
+    from speckle3d.io.tum import is_tum, write_tum
     from speckle3d.study.trajectories import load_reconstructed
 
     unit = cast("LengthUnit", length_unit)
+    require_own_place(out, "TUM text", is_tum, reconstruction_file)
     held = load_reconstructed(reconstruction_file, mode)
     write_tum(out, held.time_s, held.poses, unit)
 

@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import challenge_examples as examples
 import numpy as np
@@ -21,6 +22,25 @@ def test_what_is_exported_is_read_back(run, reconstructed, tmp_path):
         np.testing.assert_array_equal(back.time_s, held.frame_time_s)
         expected = held.poses["pose"].as_matrix()
         np.testing.assert_allclose(back.world_from_sensor.as_matrix(), expected, rtol=0, atol=1e-9)
+
+
+def test_an_export_takes_the_place_of_text_alone(run, refused, bench, reconstructed, tmp_path):
+    held, link, other = tmp_path / "reconstruction.h5", tmp_path / "link.tum", tmp_path / "notes.txt"
+    shutil.copy(reconstructed / "reconstruction.h5", held)
+    link.symlink_to(held)
+    other.write_text("not to be lost")
+    before = held.read_bytes()
+    for out, message in (
+        (held, "is an input and would be overwritten"),
+        (link, "is an input and would be overwritten"),
+        (other, "expected a new name or TUM text to replace"),
+    ):
+        assert message in refused("trajectory", "export", held, "-o", out)
+    assert held.read_bytes() == before
+    assert other.read_text() == "not to be lost"
+    for _ in range(2):
+        code, _, err = run("trajectory", "export", held, "-o", tmp_path / "a.tum")
+        assert code == 0, err
 
 
 def test_a_reconstruction_is_scored_as_its_exported_text_is(run, bench, reconstructed, tmp_path):
