@@ -10,6 +10,7 @@ import typer
 
 from speckle3d.cli.common import Json, app, emit, note
 from speckle3d.cli.outputs import require_own_place
+from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.io.tum import LengthUnit
@@ -57,7 +58,9 @@ def score(
     reference_file: Annotated[
         Path, typer.Argument(metavar="REFERENCE", help="TUM text, sweep, TUS-REC scan or reconstruction.")
     ],
-    mode: Annotated[str, typer.Option(help="image, orientation, pose: of a reconstruction.")] = "image",
+    mode: Annotated[
+        str | None, typer.Option(help="image (by default), orientation, pose: of a reconstruction.")
+    ] = None,
     reference: Annotated[str | None, typer.Option(help="tracker or truth: of a sweep.")] = None,
     length_unit: Annotated[
         str | None, typer.Option(help="m or mm: of TUM text that does not say; else metres.")
@@ -68,9 +71,15 @@ def score(
     from speckle3d.study.summary import plain
     from speckle3d.study.trajectories import compare_trajectories, load_estimate, load_reference
 
-    unit = cast("LengthUnit | None", length_unit)
-    estimate = load_estimate(estimate_file, mode, unit)
-    found = compare_trajectories(estimate, load_reference(reference_file, reference, mode, unit))
+    _require_meaning(estimate_file, reference_file, mode, reference, length_unit)
+    unit, chosen = cast("LengthUnit | None", length_unit), mode or "image"
+    estimate = load_estimate(estimate_file, chosen, unit)
+    found = compare_trajectories(estimate, load_reference(reference_file, reference, chosen, unit))
+    if found["same_sweep"] is False:
+        note(
+            f"warning: {estimate.name} was made from another file than {reference_file.name} (SHA-256): "
+            "the scores mean nothing unless both hold the same recording"
+        )
     if as_json:
         emit(json.dumps(plain(found), indent=2, allow_nan=False))
         return
@@ -80,6 +89,24 @@ def score(
         note(f"{found['left_out']} poses of {estimate.name} have no reference and were left out")
     if found["GPE_mm"] is None:
         note("neither file tells of images: drift is that of the poses' origin, and no pixels were scored")
+
+
+def _require_meaning(
+    estimate: Path, of: Path, mode: str | None, reference: str | None, length_unit: str | None
+) -> None:
+    """Refuse options that nothing would be done with."""
+    from speckle3d.study.trajectories import kind_of
+
+    kinds = kind_of(estimate), kind_of(of)
+    for name, value, kind, among in (
+        ("--mode", mode, "reconstruction", kinds),
+        ("--reference", reference, "sweep", kinds[1:]),
+        ("--length-unit", length_unit, "text", kinds),
+    ):
+        if value is not None and kind not in among:
+            where = " or ".join(among)
+            words = "TUM text" if kind == "text" else f"a {kind}"
+            raise InvalidInputError(f"{name} {value}: is of {words}, expected none with {where}")
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

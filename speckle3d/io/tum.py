@@ -23,6 +23,8 @@ LengthUnit = Literal["m", "mm"]
 
 _MM_PER_UNIT: dict[str, float] = {"m": 1000.0, "mm": 1.0}
 _COLUMNS = 8
+_ENCODING = "utf-8-sig"
+"""Editors on Windows begin a text with a byte order mark."""
 _UNIT_TOLERANCE = 1e-2
 """Of a quaternion's norm: files in the wild round to four digits."""
 
@@ -83,7 +85,7 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
 
 def _unit_said(path: PathLike) -> LengthUnit | None:
     """The unit that a comment like the one of `write_tum` gives."""
-    for line in Path(path).read_text(encoding="utf-8").splitlines():
+    for line in Path(path).read_text(encoding=_ENCODING).splitlines():
         if line.strip() and not line.lstrip().startswith("#"):
             return None
         words = line.split()
@@ -96,7 +98,7 @@ def _unit_said(path: PathLike) -> LengthUnit | None:
 def is_tum(path: PathLike) -> bool:
     """Whether a file's first line that is no comment is eight numbers."""
     try:
-        with Path(path).open(encoding="utf-8") as file:
+        with Path(path).open(encoding=_ENCODING) as file:
             first = next(line for line in file if line.strip() and not line.lstrip().startswith("#"))
         numbers(first, _COLUMNS, str(path))
     except (OSError, UnicodeDecodeError, StopIteration, InvalidInputError):
@@ -106,7 +108,7 @@ def is_tum(path: PathLike) -> bool:
 
 def _read_rows(path: PathLike) -> FloatArray:
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding=_ENCODING).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"{path}: cannot be read as text: {one_line(error)}") from error
     rows = [

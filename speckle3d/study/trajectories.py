@@ -17,13 +17,16 @@ from speckle3d.core.geometry import FloatArray, relative_poses
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import file_format, open_hdf5, reading
+from speckle3d.io.hdf5 import file_format, open_hdf5, reading, sha256_of
 from speckle3d.io.load import load_landmarks, load_sweep, sniff
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import LengthUnit, read_tum
 from speckle3d.study.job import find_reference
 from speckle3d.study.points import drift_rates
 from speckle3d.study.scoring import challenge_score, score_row
+
+_ROUNDING_S = 0.5e-6
+"""What six decimals, the fewest in common use, take from a time. A probe at 100 mm/s moves 50 nm in it."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Trajectory:
     grid : ImageGrid or None
         None where the file tells nothing of images; the poses' origin then stands for the image centre.
     landmarks : Landmarks or None
+    sweep_sha256 : str
+        Of the sweep that the poses are of; empty where the file does not tell.
     """
 
     name: str
@@ -45,6 +50,7 @@ class Trajectory:
     poses: RigidTransform
     grid: ImageGrid | None = None
     landmarks: Landmarks | None = None
+    sweep_sha256: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,8 @@ def load_reconstructed(path: Path, mode: str) -> Trajectory:
     found = read_reconstruction(path, with_pairs=False)
     if mode not in found.poses:
         raise InvalidInputError(f"--mode: expected one of {', '.join(found.poses)}, got {mode!r}")
-    return Trajectory(f"{path.name}, mode {mode}", found.frame_time_s, found.poses[mode], found.grid)
+    name, of = f"{path.name}, mode {mode}", found.provenance.input_sha256
+    return Trajectory(name, found.frame_time_s, found.poses[mode], found.grid, sweep_sha256=of)
 
 
 def load_reference(
@@ -115,7 +122,15 @@ def load_reference(
         raise InsufficientDataError(f"{path}: expected truth or a calibrated tracker, got neither")
     marks = load_landmarks(path) if held.covered.all() else None
     times = sweep.frame_time_s[held.covered]
-    return Trajectory(f"{path.name}, {held.name}", times, held.world_from_image, sweep.grid, marks)
+    name = f"{path.name}, {held.name}"
+    return Trajectory(name, times, held.world_from_image, sweep.grid, marks, sha256_of(path))
+
+
+def kind_of(path: Path) -> str:
+    """Whether a file is taken for a "reconstruction", another "sweep", or "text"."""
+    if not _is_known(path):
+        return "text"
+    return "reconstruction" if _is_reconstruction(path) else "sweep"
 
 
 def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
@@ -123,6 +138,7 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
 
     Poses belong together by time: the reference is interpolated at the estimate's times, and times it does
     not cover are left out. Metrics that need pixels or landmarks are None where the files tell of none.
+    ``same_sweep`` is whether both are of the same bytes, None where a file does not tell.
 
     Raises
     ------
@@ -133,22 +149,33 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     if estimate.grid and reference.grid and estimate.grid != reference.grid:
         raise MismatchError(f"{estimate.name} and {reference.name}: expected images of one size, got two")
     stream = TimedPoses(reference.time_s, reference.poses)
-    shared = stream.covers(estimate.time_s)
+    times = _snapped(estimate.time_s, reference.time_s)
+    shared = stream.covers(times)
     if (common := int(shared.sum())) < 2:
         both = f"{estimate.name} and {reference.name}"
         raise MismatchError(f"{both}: expected at least 2 times that both have, got {common}")
-    found, true = estimate.poses[shared], stream.at(estimate.time_s[shared])
+    found, true = estimate.poses[shared], stream.at(times[shared])
     whole = bool(shared.all()) and len(true) == len(reference.poses)
     marks = reference.landmarks if whole else None
+    of = estimate.sweep_sha256, reference.sweep_sha256
     return {
         "estimate": estimate.name,
         "reference": reference.name,
         "poses": len(found),
         "left_out": len(shared) - common,
+        "same_sweep": of[0] == of[1] if all(of) else None,
         "APE": absolute_pose_error(found, true),
         "RPE": relative_pose_error(found, true),
         **_scores(found, true, grid, marks),
     }
+
+
+def _snapped(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
+    """Times with those that are a time of `onto_s` but for rounding set to it: the ends count, too."""
+    right = np.clip(np.searchsorted(onto_s, time_s), 1, max(onto_s.size - 1, 1))
+    near = [onto_s[np.minimum(each, onto_s.size - 1)] for each in (right - 1, right)]
+    nearest = np.where(np.abs(near[0] - time_s) <= np.abs(near[1] - time_s), *near)
+    return np.where(np.abs(nearest - time_s) <= _ROUNDING_S + np.spacing(nearest), nearest, time_s)
 
 
 def _scores(

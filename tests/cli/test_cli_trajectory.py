@@ -5,6 +5,7 @@ import challenge_examples as examples
 import numpy as np
 import pytest
 from drifting import drifted
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
@@ -71,6 +72,15 @@ def test_scores_are_printed(run, bench, reconstructed, tmp_path):
     assert "GPE" not in out
 
 
+def test_a_sweep_that_was_not_reconstructed_is_said_to_be_another(run, changed, bench, reconstructed):
+    other = changed(lambda file: file.attrs.__setitem__("comment", "saved again"))
+    for sweep, same in ((bench / "sweep.h5", True), (other, False)):
+        code, out, err = run("trajectory", "score", reconstructed / "reconstruction.h5", sweep, "--json")
+        assert code == 0, err
+        assert json.loads(out)["same_sweep"] is same
+        assert ("was made from another file than sweep.h5" in err) is not same
+
+
 def test_a_scan_of_the_challenge_is_scored(run, tmp_path):
     path, *_ = examples.write_data_set(tmp_path)
     sweep = load_sweep(path)
@@ -91,6 +101,9 @@ def test_a_scan_of_the_challenge_is_scored(run, tmp_path):
         (("export", "RECONSTRUCTION", "-o", "OUT", "--length-unit", "km"), "expected m or mm, got 'km'"),
         (("export", "SWEEP", "-o", "OUT"), "expected format 'speckle3d.reconstruction'"),
         (("score", "SWEEP", "SWEEP"), "expected format 'speckle3d.reconstruction'"),
+        (("score", "TEXT", "SWEEP", "--mode", "pose"), "--mode pose: is of a reconstruction, expected none"),
+        (("score", "TEXT", "TEXT", "--reference", "truth"), "--reference truth: is of a sweep"),
+        (("score", "RECONSTRUCTION", "SWEEP", "--length-unit", "mm"), "--length-unit mm: is of TUM text"),
         (("score", "NONE", "SWEEP"), "expected a file, got none"),
         (("score", "RECONSTRUCTION", "SWEEP", "--reference", "guess"), "expected a reference among"),
     ],
@@ -101,5 +114,7 @@ def test_a_wrong_option_is_one_line(refused, bench, reconstructed, tmp_path, arg
         "SWEEP": bench / "sweep.h5",
         "OUT": tmp_path / "out.tum",
         "NONE": tmp_path / "none.tum",
+        "TEXT": tmp_path / "text.tum",
     }
+    write_tum(places["TEXT"], [0.0, 1.0], RigidTransform.identity(2))
     assert message in refused("trajectory", *(places.get(each, each) for each in arguments))

@@ -4,7 +4,7 @@ from drifting import hand_sweep
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
-from speckle3d.io.tum import read_tum, write_tum
+from speckle3d.io.tum import is_tum, read_tum, write_tum
 
 
 @pytest.mark.parametrize("unit", ["m", "mm"])
@@ -59,3 +59,14 @@ def test_a_file_says_its_own_unit_and_is_not_overruled(tmp_path):
     np.testing.assert_array_equal(back.translation, poses.translation)
     with pytest.raises(InvalidInputError, match="expected lengths in m, got a file that says mm"):
         read_tum(tmp_path / "mm.tum", "m")
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
+    path = tmp_path / "windows.tum"
+    path.write_bytes(
+        b"\xef\xbb\xbf# time_s x_mm y_mm z_mm qx qy qz qw\r\n0 1 0 0 0 0 0 1\r\n1 2 0 0 0 0 0 1\r\n"
+    )
+    assert is_tum(path)
+    np.testing.assert_array_equal(read_tum(path).world_from_sensor.translation[:, 0], [1.0, 2.0])
+    path.write_bytes(b"\xef\xbb\xbf0 1 0 0 0 0 0 1\n")
+    assert is_tum(path)

@@ -89,12 +89,15 @@ def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
     assert {key: found[key] for key in expected if expected[key] is not None} == pytest.approx(
         {key: value for key, value in expected.items() if value is not None}, abs=1e-9
     )
+    # Its provenance names other bytes.
+    assert found["same_sweep"] is False
     exact = compare_trajectories(load_estimate(tmp_path / "r.h5", "pose"), reference)
     assert (exact["GPE_mm"], exact["APE"].max_mm) == pytest.approx((0.0, 0.0), abs=1e-9)
     # A reconstruction may be the reference, too.
     twice = compare_trajectories(
         load_estimate(tmp_path / "r.h5"), load_reference(tmp_path / "r.h5", mode="pose")
     )
+    assert twice["same_sweep"] is True
     assert twice["GPE_mm"] == pytest.approx(found["GPE_mm"], abs=1e-9)
     with pytest.raises(InvalidInputError, match="expected one of image, pose, got 'orientation'"):
         load_estimate(tmp_path / "r.h5", "orientation")
@@ -122,6 +125,22 @@ def test_poses_meet_by_time_and_those_without_a_reference_are_left_out():
     found = compare_trajectories(Trajectory("e", times, line), reference)
     assert (found["poses"], found["left_out"]) == (81, 20)
     assert found["APE"].max_mm == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("digits", [6, 9])
+def test_times_rounded_in_text_lose_no_pose(tmp_path, digits):
+    rng = np.random.default_rng(4)
+    true = hand_sweep(rng, 40)
+    # Beginning and end are between decimals, and a pause that is not bridged has ends of its own.
+    times = 100.0 + np.arange(40) / 30.0 + 1e-7 / 3 + 5.0 * (np.arange(40) > 20)
+    reference = Trajectory("r", times, true)
+    estimate = Trajectory("e", np.round(times, digits), true)
+    found = compare_trajectories(estimate, reference)
+    assert (found["poses"], found["left_out"]) == (40, 0)
+    assert found["APE"].max_mm == pytest.approx(0.0, abs=1e-9)
+    # What is not rounding is no pose of the reference.
+    aside = compare_trajectories(Trajectory("e", times + np.linspace(-2e-6, 2e-6, 40), true), reference)
+    assert aside["left_out"] == 2
 
 
 def test_what_does_not_belong_together_is_refused(tmp_path):
