@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines, require_free
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, naming
 
 if TYPE_CHECKING:
     from calibration.clock import Delay
@@ -54,6 +54,8 @@ def calibrate_clock(
         raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
     if by is By.line and calibration is not None and out is None:
         raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
+    if out is not None:
+        _require_free(out, images, poses, calibration)
     known = None if calibration is None else read_calibration(calibration)
     if by is By.images and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
@@ -72,6 +74,21 @@ def calibrate_clock(
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)
+
+
+def _require_free(out: Path, *inputs: Path | None) -> None:
+    """Refuse an output that would take the place of an input, or of anything but a calibration."""
+    from speckle3d.io.calibrations import FORMAT
+    from speckle3d.io.hdf5 import opened
+
+    require_free(out, *inputs)
+    if not out.exists():
+        return
+    try:
+        with opened(out, FORMAT):
+            return
+    except (FileError, InvalidInputError):
+        raise InvalidInputError(f"{out}: is there and is not a calibration: give -o another name") from None
 
 
 def _by_line(
