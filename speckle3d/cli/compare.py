@@ -55,6 +55,7 @@ def compare(
     from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study
     from speckle3d.study.report import write_report
+    from speckle3d.study.results import copy_lines
     from speckle3d.study.schedulers import scheduler_for
 
     settings = load_config(config_file) if config_file else Config()
@@ -79,6 +80,9 @@ def compare(
     skipped = sum(each.skipped for each in study.outcomes)
     if skipped:
         note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
+    if as_json or table:
+        for line in copy_lines(study.copies):
+            note(line)
     for each in failed:
         note(f"{each.name}: failed: {each.reason}")
     note(f"results in {out}; the report is {out / 'report.html'}")

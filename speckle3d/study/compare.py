@@ -8,25 +8,19 @@ skips what they hold; a worker that is killed leaves nothing behind but the work
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.curves import read_curves
-from speckle3d.io.hdf5 import atomic_path, make_folder
+from speckle3d.io.hdf5 import make_folder
 from speckle3d.study.job import REFERENCES, SUBSET
-from speckle3d.study.metrics import ModeError
-from speckle3d.study.overall import over_sweeps, overall_text
+from speckle3d.study.results import Study, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
-from speckle3d.study.summary import Summary, csv_text, plain, table_text
 from speckle3d.study.sweepjob import (
     BlockJob,
     BlockOutcome,
@@ -42,24 +36,11 @@ from speckle3d.study.sweepjob import (
     run_sweep,
 )
 
-FORMAT = "speckle3d.study"
-VERSION = 1
 MATCHING_SHARE = 0.5
 """Of a sweep's time: half with frames of 127 x 3818 samples, less with small ones."""
 Task = SweepJob | BlockJob
 TaskOutcome = SweepOutcome | BlockOutcome
 KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
-
-
-@dataclass(frozen=True)
-class Study:
-    """What a study found, and where it is."""
-
-    directory: Path
-    outcomes: Sequence[SweepOutcome]
-    summaries: Sequence[Summary]
-    drift: Sequence[Mapping[str, Any]]
-    table: str
 
 
 @dataclass
@@ -160,7 +141,7 @@ def compare_sweeps(
         if progress:
             progress(so_far)
     _clear(jobs)
-    return _write_study(directory, [outcomes[each.name] for each in plan], settings)
+    return write_study(directory, [outcomes[each.name] for each in plan], settings)
 
 
 def run_task(task: Task) -> TaskOutcome:
@@ -220,73 +201,3 @@ def _clear(jobs: Sequence[SweepJob]) -> None:
             part.unlink(missing_ok=True)
         with suppress(OSError):
             blocks.parent.rmdir()
-
-
-def _write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
-    summaries: list[Summary] = []
-    drift: list[dict[str, Any]] = []
-    for outcome in outcomes:
-        if outcome.status == "done":
-            folder = directory / outcome.folder
-            summaries.append(_read_summary(folder, outcome.name))
-            rows = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
-            drift += [{"sweep": outcome.name} | row for row in rows]
-    rows = [{"sweep": each.sweep} | asdict(row) for each in summaries for row in each.rows]
-    intervals, paired = over_sweeps(rows, drift)
-    table = table_text(summaries) + "".join(
-        f"{each.name}  failed: {each.reason}\n" for each in outcomes if each.status == "failed"
-    )
-    if overall := overall_text(intervals, paired):
-        table += f"\n{overall}"
-    contents = {
-        "format": FORMAT,
-        "version": VERSION,
-        "settings_toml": settings_toml,
-        "modes": list(dict.fromkeys(row["mode"] for row in rows)),
-        "sweeps": [_entry(outcome) for outcome in outcomes],
-        "rows": rows,
-        "drift": drift,
-        "intervals": intervals,
-        "paired": paired,
-    }
-    texts = {
-        "study.json": json.dumps(plain(contents), indent=2, allow_nan=False) + "\n",
-        "table.txt": table,
-        "table.csv": _csv(summaries, outcomes),
-    }
-    for name, text in texts.items():
-        with atomic_path(directory / name) as part:
-            part.write_text(text, encoding="utf-8")
-    return Study(directory, outcomes, summaries, drift, table)
-
-
-def _entry(outcome: SweepOutcome) -> dict[str, Any]:
-    shown = asdict(outcome) | {"path": str(outcome.path)}
-    return {name: value for name, value in shown.items() if name != "skipped"}
-
-
-def _read_summary(folder: Path, name: str) -> Summary:
-    """Read a sweep's rows back; a number that was not finite is NaN again."""
-    held: dict[str, Any]
-    (held,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    names = [f.name for f in fields(ModeError)]
-    rows: list[dict[str, Any]] = [
-        {name: float("nan") if row[name] is None else row[name] for name in names} for row in held["rows"]
-    ]
-    return Summary(
-        name, held["reference"], held["frames"], held["coverage"], [ModeError(**row) for row in rows]
-    )
-
-
-def _csv(summaries: Sequence[Summary], outcomes: Sequence[SweepOutcome]) -> str:
-    """All rows, and one for each sweep that failed, with the reason in a column of its own."""
-    lines = list(csv.reader(io.StringIO(csv_text(summaries))))
-    width = len(lines[0])
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*lines[0], "reason"])
-    writer.writerows([*line, ""] for line in lines[1:])
-    for each in outcomes:
-        if each.status == "failed":
-            writer.writerow([each.name, *[""] * (width - 1), each.reason])
-    return text.getvalue()

@@ -1,15 +1,16 @@
 """What a study says over all its sweeps: mean errors by mode with intervals, and modes told apart or not.
 
 A sweep is the unit. Of the errors of its parts the mean magnitude counts; drift and displacement are one
-number per sweep anyhow. Two modes are told apart where the interval of their differences, sweep by sweep,
-leaves out zero, and a signed-rank test says so too (p <= `LEVEL`) after Holm's correction for all pairs of
-modes.
+number per sweep anyhow. A mode's mean is over the sweeps that have it; modes are ranked by their means over
+the sweeps that have all of them. Two modes are told apart where the interval of their differences, sweep by
+sweep, leaves out zero, and a signed-rank test says so too (p <= `LEVEL`) after Holm's correction for all
+pairs of modes.
 """
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -104,27 +105,113 @@ def beats(paired: Sequence[Row], quantity: str, mode: str, other: str) -> bool:
     )
 
 
-def overall_text(intervals: Sequence[Row], paired: Sequence[Row]) -> str:
-    """Compact table of means and intervals, then the modes that are told apart; empty without any sweep."""
+def shared_means(rows: Sequence[Row], drift: Sequence[Row] = ()) -> list[dict[str, Any]]:
+    """Means over the sweeps that have every mode, by which modes are ranked; none where no sweep has.
+
+    Parameters
+    ----------
+    rows, drift : sequence of mapping
+        As `over_sweeps` takes them.
+
+    Returns
+    -------
+    list of dict
+        ``quantity``, ``mode``, ``sweeps``, ``mean``.
+    """
+    found = []
+    for quantity in QUANTITIES:
+        values = _by_mode(quantity, rows, drift)
+        together = np.isfinite(np.array([*values.values()])).all(axis=0) if values else np.zeros(0, bool)
+        if together.any():
+            means = {mode: float(each[together].mean()) for mode, each in values.items()}
+            named = {"quantity": quantity.key, "sweeps": int(together.sum())}
+            found += [named | {"mode": mode, "mean": mean} for mode, mean in means.items()]
+    return found
+
+
+def are_uneven(intervals: Sequence[Row]) -> bool:
+    """Whether in some quantity the modes' means are of different sweeps."""
+    counts: dict[str, set[int]] = {}
+    for row in intervals:
+        counts.setdefault(row["quantity"], set()).add(row["sweeps"])
+    return any(len(each) > 1 for each in counts.values())
+
+
+def overall_text(
+    intervals: Sequence[Row],
+    paired: Sequence[Row],
+    shared: Sequence[Row] = (),
+    references: Mapping[str, str] | None = None,
+) -> str:
+    """Compact table of means and intervals, then the modes that are told apart; empty without any sweep.
+
+    Parameters
+    ----------
+    shared : sequence of mapping
+        As `shared_means` gives them, shown where the modes are not of the same sweeps.
+    references : mapping of str to str, optional
+        What each sweep was compared with.
+    """
     if not intervals:
         return ""
-    modes = list(dict.fromkeys(row["mode"] for row in intervals))
-    sweeps = max(row["sweeps"] for row in intervals)
-    lines = [[f"mean of {sweeps} sweep{'s' * (sweeps != 1)}", *modes]]
+    most = max(row["sweeps"] for row in intervals)
+    lines = _means_lines(f"mean of {most} sweep{'s' * (most != 1)}", intervals, most)
+    if any(row["sweeps"] != most for row in intervals):
+        lines.append("(n): of n sweeps only")
+    lines += _told(intervals, paired) + _reference_lines(references or {}, intervals)
+    if not are_uneven(intervals):
+        return "\n".join(lines) + "\n"
+    lines.append("these means are not all of the same sweeps: side by side they do not compare modes")
+    if not shared:
+        return "\n".join([*lines, "no sweep has every mode: modes compare in pairs alone"]) + "\n"
+    most = max(row["sweeps"] for row in shared)
+    title = f"{most} sweep{'s' * (most != 1)} with every mode"
+    return "\n".join([*lines, "", *_means_lines(title, shared, most)]) + "\n"
+
+
+def _means_lines(title: str, records: Sequence[Row], most: int) -> list[str]:
+    """Aligned table, a line for each quantity and a column for each mode."""
+    modes = list(dict.fromkeys(row["mode"] for row in records))
+    lines = [[title, *modes]]
     for quantity in QUANTITIES:
-        cells = {row["mode"]: _cell(quantity, row) for row in intervals if row["quantity"] == quantity.key}
+        mine = [row for row in records if row["quantity"] == quantity.key]
+        cells = {row["mode"]: _cell(quantity, row, most) for row in mine}
         if cells:
             lines.append([quantity.words, *(cells.get(mode, "-") for mode in modes)])
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     lines.insert(1, ["-" * width for width in widths])
-    table = [
+    return [
         "  ".join(
             cell.rjust(width) if i else cell.ljust(width)
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
         for line in lines
     ]
-    return "\n".join(table + _told(intervals, paired)) + "\n"
+
+
+def reference_words(references: Mapping[str, str]) -> str:
+    """What the sweeps were compared with, and which with what where they differ; empty without any."""
+    by_name: dict[str, list[str]] = {}
+    for sweep, name in references.items():
+        if name != "none":
+            by_name.setdefault(name, []).append(sweep)
+    if len(by_name) < 2:
+        return f"reference: {next(iter(by_name))}" if by_name else ""
+    which = "; ".join(f"{name} of {', '.join(sweeps)}" for name, sweeps in by_name.items())
+    return f"references differ: {which}; the means mix errors against both"
+
+
+def fitted_to_reference(modes: Collection[str], references: Mapping[str, str]) -> bool:
+    """Whether a mode was fitted to the very tracker that it is compared with."""
+    return "pose" in modes and "tracker" in references.values()
+
+
+def _reference_lines(references: Mapping[str, str], intervals: Sequence[Row]) -> list[str]:
+    words = reference_words(references)
+    lines = textwrap.wrap(words, 100, subsequent_indent="  ") if words else []
+    if fitted_to_reference({row["mode"] for row in intervals}, references):
+        lines.append("pose was fitted to this tracker: its errors say how well it fits, not how right it is")
+    return lines
 
 
 def _by_mode(quantity: Quantity, rows: Sequence[Row], drift: Sequence[Row]) -> dict[str, FloatArray]:
@@ -138,6 +225,13 @@ def _by_mode(quantity: Quantity, rows: Sequence[Row], drift: Sequence[Row]) -> d
         if np.isfinite(values).any():
             found[mode] = values
     return found
+
+
+def mean_over_sweeps(rows: Sequence[Row], key: str) -> float:
+    """Mean over sweeps of the mean magnitude of an error in their parts, of one mode's rows."""
+    quantity = next(each for each in QUANTITIES if each.key == key)
+    values = list(_by_mode(quantity, rows, rows).values())
+    return float(np.nanmean(values[0])) if values else float("nan")
 
 
 def _of_sweep(quantity: Quantity, rows: Sequence[Row]) -> float:
@@ -168,11 +262,11 @@ def _better(row: Row, holm_p: float | None) -> str | None:
     return str(row["mode"] if high < 0 else row["against"])
 
 
-def _cell(quantity: Quantity, row: Row) -> str:
+def _cell(quantity: Quantity, row: Row, most: int) -> str:
     mean = quantity.shown(row["mean"])
-    if row["low"] is None:
-        return mean
-    return f"{mean} [{quantity.shown(row['low'])}, {quantity.shown(row['high'])}]"
+    if row.get("low") is not None:
+        mean += f" [{quantity.shown(row['low'])}, {quantity.shown(row['high'])}]"
+    return mean if row["sweeps"] == most else f"{mean} ({row['sweeps']})"
 
 
 def _told(intervals: Sequence[Row], paired: Sequence[Row]) -> list[str]:

@@ -24,9 +24,10 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.pipeline import calibrate_curves
 from speckle3d.simulation.presets import SimulationSettings, simulate
-from speckle3d.study.compare import Study, StudyProgress, compare_sweeps
+from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.metrics import ModeError, compare_modes
 from speckle3d.study.published import json_beside, text_beside
+from speckle3d.study.results import Study
 from speckle3d.study.schedulers import InProcess, Scheduler
 
 _TISSUE = SimulationSettings(preset="tissue", vectors=48, length_mm=20.0)

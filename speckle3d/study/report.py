@@ -28,16 +28,10 @@ from speckle3d.study.report_statistics import (
     counted,
     intervals_table,
     paired_table,
+    scored_means,
     summary_lines,
 )
-
-_ERRORS = {
-    "length_error_mm": "length_mm",
-    "length_error_percent": "length_percent",
-    "tilt_error_deg": "tilt_deg",
-    "yaw_error_deg": "yaw_deg",
-    "roll_error_deg": "roll_deg",
-}
+from speckle3d.study.results import copy_lines
 
 _NOTHING = '<p class="quiet">There is nothing to compare.</p>'
 
@@ -52,7 +46,8 @@ _TABLES = {
     "intervals": (
         "Means over sweeps",
         "One number per sweep: of the errors of its parts, the mean magnitude. In brackets the 95 % interval "
-        "over sweeps, by bootstrap.",
+        "over sweeps, by bootstrap. Where modes are of different numbers of sweeps, they do not compare side "
+        "by side, but in pairs.",
     ),
     "paired": (
         "Modes compared in pairs",
@@ -97,8 +92,11 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
     done = [entry for entry in study["sweeps"] if entry.get("status") == "done"]
     broken = [entry for entry in study["sweeps"] if entry.get("status") != "done"]
     anchors = {entry["name"]: f"sweep-{i + 1}" for i, entry in enumerate(done)}
-    scored = [row for row in rows if row.get("length_error_mm") is not None]
-    means = _means(scored, modes)
+    copies = {entry["name"]: entry["copy_of"] for entry in done if entry.get("copy_of")}
+    single = [row for row in rows if row["sweep"] not in copies]
+    scored = [row for row in single if row.get("length_error_mm") is not None]
+    found = scored_means(single, modes)
+    references = {row["sweep"]: row["reference"] for row in single if row.get("reference")}
     figures: list[Figure] = []
     overview = _overview(directory, scored, modes, figures)
     sections = []
@@ -108,9 +106,14 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
             progress(i + 1, len(done))
     parts = {
         "title": f"Drift-correction modes compared on {counted(len(done) or len(broken), 'sweep')}",
-        "lead": paragraphs(summary_lines(means, scored, len(done), len(broken), study.get("paired") or [])),
+        "lead": paragraphs(
+            summary_lines(found, len(done), len(broken), study.get("paired") or [], references)
+            + [f"{line}." for line in copy_lines(copies)]
+        ),
         "broken": _broken(broken),
-        "modes": modes_table(means, best_of(means, "length_percent")) + overview or _NOTHING,
+        "modes": modes_table(found.means, best_of(found.means, "length_percent") if found.together else None)
+        + overview
+        or _NOTHING,
         "parts": parts_table(rows, anchors),
         "tables": _tables(study, anchors),
         "buttons": _buttons(done),
@@ -124,22 +127,6 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
     return target
 
 
-def _means(scored: Sequence[Mapping[str, Any]], modes: Sequence[str]) -> list[dict[str, Any]]:
-    """Mean magnitude of each error by mode, over all parts of all sweeps."""
-    found = []
-    for mode in modes:
-        mine = [row for row in scored if row["mode"] == mode]
-        if mine:
-            sizes = {short: _mean_size(mine, key) for key, short in _ERRORS.items()}
-            found.append({"mode": mode, "parts": len(mine), **sizes})
-    return found
-
-
-def _mean_size(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    values = [abs(row[key]) for row in rows if row.get(key) is not None]
-    return float(np.mean(values)) if values else None
-
-
 def _overview(
     directory: Path, scored: Sequence[Mapping[str, Any]], modes: Sequence[str], figures: list[Figure]
 ) -> str:
@@ -148,7 +135,7 @@ def _overview(
     shown = [mode for mode in modes if any(row["mode"] == mode for row in scored)]
     caption = (
         "Errors of length and tilt: a point for every part of every sweep, a bar from minus to plus the mean "
-        "magnitude."
+        "magnitude over the mode's sweeps."
     )
     plot = interactive.plot_overview(scored, shown)
     return _vector(directory, "overview", draw.figure_overview(scored, shown), caption, figures, plot)

@@ -23,6 +23,7 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.study.figures import DOTS_PER_INCH, MODE_COLOURS, MODE_LABELS
 from speckle3d.study.job import REFERENCES
+from speckle3d.study.overall import mean_over_sweeps
 from speckle3d.study.report_data import RejectedPatches, SweepCurves
 from speckle3d.study.report_images import Cut, Cuts
 
@@ -79,11 +80,12 @@ def figure_overview(rows: Sequence[Mapping[str, Any]], modes: Sequence[str]) -> 
     ):
         panel.axvline(0.0, color="0.6", linewidth=0.8)
         for level, mode in enumerate(modes):
-            values = [row[key] for row in rows if row["mode"] == mode and row.get(key) is not None]
+            mine = [row for row in rows if row["mode"] == mode and row.get(key) is not None]
+            values = [row[key] for row in mine]
             spread = level + 0.3 * (np.arange(len(values)) / max(len(values) - 1, 1) - 0.5)
             panel.plot(values, spread, "o", color=colour_of(mode, modes), markersize=4, alpha=0.7)
             if values:
-                size = float(np.mean(np.abs(values)))
+                size = mean_over_sweeps(mine, key)
                 panel.plot(
                     [-size, size], [level, level], color=colour_of(mode, modes), linewidth=6, alpha=0.25
                 )

@@ -24,6 +24,8 @@ _WORDS = (
     "sweep",
     "part",
     "mode",
+    "reference",
+    "remark",
     "name",
     "reason",
     "path",
@@ -36,7 +38,7 @@ _WORDS = (
 _LONG = ("reason", "path", "sha256", "key", "file")
 _ERRORS = ("length_error_mm", "length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
 
-_PART_COLUMNS = ("sweep", "part", "mode", "frames", "reference_mm", "estimate_mm", *_ERRORS)
+_PART_COLUMNS = ("sweep", "part", "mode", "reference", "frames", "reference_mm", "estimate_mm", *_ERRORS)
 
 
 @dataclass(frozen=True)
@@ -109,12 +111,13 @@ def parts_table(rows: Sequence[Mapping[str, Any]], anchors: Mapping[str, str]) -
         return '<p class="quiet">No sweep was compared.</p>'
     lines = []
     before = None
+    columns = [*_PART_COLUMNS, *(["remark"] if any(row.get("remark") for row in rows) else [])]
     for row in rows:
         here = (row.get("sweep"), row.get("part"))
-        cells = "".join(_cell(key, row.get(key), anchors, signed=key in _ERRORS) for key in _PART_COLUMNS)
+        cells = "".join(_cell(key, row.get(key), anchors, signed=key in _ERRORS) for key in columns)
         lines.append(f'<tr class="{"first" if here != before else ""}">{cells}</tr>')
         before = here
-    return _table(_PART_COLUMNS, lines)
+    return _table(columns, lines)
 
 
 def modes_table(means: Sequence[Mapping[str, Any]], best: str | None) -> str:

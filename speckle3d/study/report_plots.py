@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.study.job import REFERENCES
+from speckle3d.study.overall import mean_over_sweeps
 from speckle3d.study.report_data import QUANTITIES, RejectedPatches, SweepCurves
 from speckle3d.study.report_figures import CURVE_LABELS, colour_of, decimated, label_of, outline
 
@@ -27,7 +28,7 @@ def plot_overview(rows: Sequence[Mapping[str, Any]], modes: Sequence[str]) -> Pl
     for i, (key, unit) in enumerate((("length_error_percent", " %"), ("tilt_error_deg", " °"))):
         for mode in modes:
             mine = [row for row in rows if row["mode"] == mode and row.get(key) is not None]
-            size = float(np.mean([abs(row[key]) for row in mine])) if mine else 0.0
+            size = mean_over_sweeps(mine, key) if mine else 0.0
             traces.append(
                 {
                     "type": "scatter",

@@ -21,6 +21,7 @@ _COLUMNS = (
     ("sweep", "sweep", "{}"),
     ("part", "part", "{}"),
     ("mode", "mode", "{}"),
+    ("reference", "reference", "{}"),
     ("reference_mm", "reference mm", "{:.2f}"),
     ("estimate_mm", "estimate mm", "{:.2f}"),
     ("length_error_mm", "error mm", "{:+.2f}"),
@@ -28,7 +29,14 @@ _COLUMNS = (
     ("tilt_error_deg", "tilt deg", "{:+.2f}"),
     ("yaw_error_deg", "yaw deg", "{:+.2f}"),
     ("roll_error_deg", "roll deg", "{:+.2f}"),
+    ("remark", "remark", "{}"),
 )
+_TO_THE_LEFT = ("sweep", "part", "mode", "reference", "remark")
+_UNLIKE = (0.5, 2.0)
+"""Travel of tracker over that of images beyond which it is no drift: a wrong unit is a factor of ten."""
+
+_TRAVEL_MM = 1.0
+"""Below, jitter may be more than travel."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,28 @@ class Summary:
     coverage: float
     rows: Sequence[ModeError]
     details: dict[str, Any] = field(default_factory=dict)
+
+
+def remark_on(summary: Summary, row: ModeError) -> str:
+    """What a reader of a row must know beside its numbers; empty for nothing."""
+    words = []
+    images = next((r for r in summary.rows if r.mode == "image" and r.part == row.part), None)
+    fitted = any(each.mode == "pose" for each in summary.rows)
+    if row.mode == "pose" and summary.reference == "tracker":
+        words.append("fitted to this tracker")
+    if row.mode == "pose" and images is not None:
+        words.append(_unlike(row.estimate_mm, images.estimate_mm))
+    elif row.mode == "image" and summary.reference == "tracker" and not fitted:
+        words.append(_unlike(row.reference_mm, row.estimate_mm))
+    return "; ".join(each for each in words if each)
+
+
+def _unlike(tracker_mm: float, images_mm: float) -> str:
+    if not (abs(images_mm) >= _TRAVEL_MM and math.isfinite(tracker_mm)):
+        return ""
+    share = abs(tracker_mm / images_mm)
+    low, high = _UNLIKE
+    return "" if low <= share <= high else f"tracker travels {share:.2g} of what the images do: its unit?"
 
 
 def write_summary(directory: Path, summaries: Sequence[Summary]) -> list[Path]:
@@ -79,10 +109,11 @@ def csv_text(summaries: Sequence[Summary]) -> str:
     """One line per sweep, part and mode, with full precision, under the names of `ModeError`."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["sweep", "reference", *(f.name for f in fields(ModeError))])
+    writer.writerow(["sweep", "reference", *(f.name for f in fields(ModeError)), "remark"])
     for summary in summaries:
         for row in summary.rows:
-            writer.writerow([summary.sweep, summary.reference, *asdict(row).values()])
+            held = asdict(row).values()
+            writer.writerow([summary.sweep, summary.reference, *held, remark_on(summary, row)])
     return text.getvalue()
 
 
@@ -91,10 +122,12 @@ def table_text(summaries: Sequence[Summary]) -> str:
     lines = [[heading for _, heading, _ in _COLUMNS]]
     for summary in summaries:
         for row in summary.rows:
-            values = {"sweep": summary.sweep, **asdict(row)}
-            cells = [form.format(values[key]) for key, _, form in _COLUMNS]
-            lines.append(["-" if cell.endswith("nan") else cell for cell in cells])
-    widths = [max(len(line[i]) for line in lines) for i in range(len(_COLUMNS))]
+            values = {"sweep": summary.sweep, "reference": summary.reference, **asdict(row)}
+            values["remark"] = remark_on(summary, row)
+            lines.append([_cell(values[key], form) for key, _, form in _COLUMNS])
+    if not any(line[-1] for line in lines[1:]):
+        lines = [line[:-1] for line in lines]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     lines.insert(1, ["-" * width for width in widths])
     return "\n".join(_aligned(line, widths) for line in lines) + "\n"
 
@@ -116,10 +149,14 @@ def plain(value: Any) -> Any:
     raise InvalidInputError(f"summary: expected dataclasses, numbers, strings or arrays, got {type(value)}")
 
 
+def _cell(value: Any, form: str) -> str:
+    return "-" if isinstance(value, float) and math.isnan(value) else form.format(value)
+
+
 def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
     words = [
-        cell.ljust(width) if key in ("sweep", "part", "mode") else cell.rjust(width)
-        for cell, width, (key, _, _) in zip(cells, widths, _COLUMNS, strict=True)
+        cell.ljust(width) if key in _TO_THE_LEFT else cell.rjust(width)
+        for cell, width, (key, _, _) in zip(cells, widths, _COLUMNS, strict=False)
     ]
     return "  ".join(words).rstrip()
 

@@ -22,6 +22,7 @@ from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.job import Reference
 from speckle3d.study.points import landmark_errors
+from speckle3d.study.report import write_report
 from speckle3d.study.schedulers import OnCluster, local_cluster
 from speckle3d.study.scoring import drift_rows
 from speckle3d.study.sweepjob import SweepOutcome, plan_sweep, run_sweep
@@ -186,6 +187,30 @@ def test_sweeps_of_one_name_are_told_apart_and_one_given_twice_is_one(sweeps, tm
     twin.write_bytes(b"nothing")
     found = compare_sweeps([sweeps[1], twin, sweeps[1], sweeps[0]], tmp_path, ["pose"])
     assert [each.name for each in found.outcomes] == ["broken", "other-broken", "s5"]
+
+
+def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):
+    shutil.copytree(study.directory, tmp_path / "again")
+    for name in ("a.h5", "b.h5"):
+        shutil.copy(sweeps[0], tmp_path / name)
+    found = compare_sweeps(
+        [*sweeps, tmp_path / "a.h5", tmp_path / "b.h5"],
+        tmp_path / "again",
+        curves=sweeps[0].parent / "curves.h5",
+    )
+    assert found.copies == {"a": "s5", "b": "s5"}
+    assert "a is a copy of s5: counted once\nb is a copy of s5: counted once\n" in found.table
+    assert "mean of 2 sweeps" in found.table
+    once, thrice = held(study.directory), held(found.directory)
+    for key in ("intervals", "shared", "paired"):
+        assert thrice[key] == once[key]
+    assert len(thrice["rows"]) == 2 * len(once["rows"])
+    rows = list(csv.DictReader((found.directory / "table.csv").open()))
+    assert {(row["sweep"], row["copy_of"]) for row in rows if row["copy_of"]} == {("a", "s5"), ("b", "s5")}
+    assert {row["path"] for row in rows if row["sweep"] == "a"} == {str(tmp_path / "a.h5")}
+    words = write_report(found.directory).read_text(encoding="utf-8")
+    assert "a is a copy of s5: counted once." in words
+    assert "Over 2 sweeps (2 parts), " in words
 
 
 def test_broken_sweeps_alone_are_refused_and_nothing_is_written(sweeps, tmp_path):

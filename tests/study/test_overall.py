@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from speckle3d.study.overall import beats, over_sweeps, overall_text
+from speckle3d.study.overall import beats, over_sweeps, overall_text, shared_means
 from speckle3d.study.statistics import holm, mean_interval
 
 
@@ -100,10 +100,42 @@ def test_the_text_is_compact_and_says_who_is_better():
 
 def test_a_mode_that_only_some_sweeps_have_is_compared_on_those():
     rows, drift = study(8)
-    rows = [row for row in rows if not (row["mode"] == "pose" and row["sweep"] in ("s0", "s1"))]
+    rows, drift = (
+        [row for row in some if not (row["mode"] == "pose" and row["sweep"] in ("s0", "s1"))]
+        for some in (rows, drift)
+    )
     intervals, paired = over_sweeps(rows, drift)
     assert of(intervals, "length_error_percent", "pose")["sweeps"] == 6
     assert of(paired, "length_error_percent", "image", "pose")["sweeps"] == 6
+    # The text says which means are of fewer sweeps, and has those of the same sweeps beside them.
+    shared = shared_means(rows, drift)
+    text = overall_text(intervals, paired, shared)
+    assert text.startswith("mean of 8 sweeps")
+    (line,) = [each for each in text.splitlines()[:4] if each.startswith("length error %")]
+    assert line.endswith("(6)")
+    assert line.count("(") == 1
+    assert "side by side they do not compare modes" in text
+    assert "6 sweeps with every mode" in text
+    alike = over_sweeps([row for row in rows if row["sweep"] not in ("s0", "s1")], [])[0]
+    for mode in ("image", "twin", "pose"):
+        expected = of(alike, "length_error_percent", mode)["mean"]
+        found = of(shared, "length_error_percent", mode)
+        assert (found["mean"], found["sweeps"]) == (pytest.approx(expected), 6)
+
+
+def test_modes_that_no_sweep_has_together_are_not_ranked():
+    rows, _ = study(4)
+    rows = [row for row in rows if (row["mode"] == "pose") == (row["sweep"] == "s0")]
+    text = overall_text(*over_sweeps(rows, []), shared_means(rows))
+    assert "no sweep has every mode: modes compare in pairs alone" in text
+
+
+def test_the_text_says_what_the_reference_was():
+    found = over_sweeps(*study(2))
+    assert "reference: truth\n" in overall_text(*found, (), {"s0": "truth", "s1": "truth"})
+    mixed = overall_text(*found, (), {"s0": "truth", "s1": "tracker"})
+    assert "references differ: truth of s0; tracker of s1; the means mix errors against both" in mixed
+    assert "pose was fitted to this tracker" in mixed
 
 
 def test_holms_correction_by_hand():

@@ -11,13 +11,20 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.study.overall import over_sweeps
 from speckle3d.study.report import write_report
 from speckle3d.study.report_data import SweepCurves, load_view, read_study, rejected_patches
 from speckle3d.study.report_figures import MOST_POINTS, decimated, outline, patch_size
 from speckle3d.study.report_images import cut_modes
 from speckle3d.study.report_page import heading_of, records_table
 from speckle3d.study.report_plots import plot_curves, plot_rejected
-from speckle3d.study.report_statistics import intervals_table, paired_table, summary_lines
+from speckle3d.study.report_statistics import (
+    Scored,
+    intervals_table,
+    paired_table,
+    scored_means,
+    summary_lines,
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,16 +64,22 @@ def page(text):
     return Page(text)
 
 
-def means(**length_percent):
-    return [
-        {"mode": mode, "parts": 3, "length_mm": 0.1 * value, "length_percent": value, "tilt_deg": 0.3 / value,
-         "yaw_deg": 0.0, "roll_deg": 0.0}
+def scored(**length_percent):
+    means = [
+        {"mode": mode, "sweeps": 2, "length_mm": 0.1 * value, "length_percent": value,
+         "tilt_deg": 0.3 / value, "yaw_deg": 0.0, "roll_deg": 0.0}
         for mode, value in length_percent.items()
     ]  # fmt: skip
+    return Scored(means, 2)
 
 
-def scored(mode="image"):
-    return [{"sweep": name, "part": "f", "mode": mode} for name in ("a", "b")]
+def part_rows(**errors):
+    """Rows by sweep and mode from the errors of their parts; ``a_image=[1.0, 3.0]``."""
+    return [
+        {"sweep": name.split("_")[0], "mode": name.split("_")[1], "part": part, "length_error_percent": error,
+         "length_error_mm": 0.1 * error, "tilt_error_deg": 1.0, "yaw_error_deg": 0.0, "roll_error_deg": 0.0}
+        for name, values in errors.items() for part, error in zip("fr", values, strict=False)
+    ]  # fmt: skip
 
 
 def test_the_page_stands_alone(page, text):
@@ -82,14 +95,15 @@ def test_the_page_stands_alone(page, text):
 
 def test_the_summary_comes_first_and_says_what_the_rows_say(page, study):
     rows = read_study(study)["rows"]
+    assert {r["part"] for r in rows} == {"f"}
     mean = {m: np.mean([abs(r["length_error_percent"]) for r in rows if r["mode"] == m]) for m in MODES}
     best = min(mean, key=mean.get)
     words = " ".join(page.words)
-    lead = words[words.index("Over 2 parts of 2 sweeps") :]
+    lead = words[words.index("Over 2 sweeps (2 parts), ") :]
     named = {"image": "image-based", "orientation": "orientation correction", "pose": "six DOF correction"}
     assert lead.index(named[best]) < lead.index("smallest error")
     assert f"{mean[best]:.1f} % on average" in lead
-    assert words.index("Over 2 parts") < words.index("Errors by sweep and part")
+    assert words.index("Over 2 sweeps (2 parts)") < words.index("Errors by sweep and part")
     assert "1 of 3 sweeps could not be reconstructed" in words
 
 
@@ -158,23 +172,56 @@ def test_a_changed_sweep_is_not_taken_for_the_one_reconstructed(study, tmp_path)
 
 
 def test_without_a_reference_no_mode_is_called_right():
-    (line,) = summary_lines([], [], 2, 0)
+    (line,) = summary_lines(Scored([]), 2, 0)
     assert "no mode can be called right" in line
 
 
 def test_without_any_result_the_summary_says_so():
-    assert summary_lines([], [], 0, 2) == [
+    assert summary_lines(Scored([]), 0, 2) == [
         "Nothing could be reconstructed from 2 sweeps; the reasons are below."
     ]
 
 
 def test_the_best_in_length_and_the_best_in_tilt_may_differ():
-    length, tilt = summary_lines(means(image=4.0, pose=2.0), scored(), 2, 0)
+    length, tilt = summary_lines(scored(image=4.0, pose=2.0), 2, 0)
     assert length.startswith(
-        "Over 2 parts of 2 sweeps, six DOF correction has the smallest error of length: 2.0 %"
+        "Over 2 sweeps (2 parts), six DOF correction has the smallest error of length: 2.0 %"
     )
     assert "against 4.0 % with image-based" in length
     assert tilt.startswith("In tilt image-based is closest")
+
+
+def test_the_lead_means_over_sweeps_of_their_parts_as_the_tables_do():
+    rows = part_rows(a_image=[1.0, -3.0], b_image=[8.0])
+    found = scored_means(rows, ["image"])
+    # Pooled parts would give 4.
+    assert found.means[0]["length_percent"] == pytest.approx(5.0)
+    assert (found.means[0]["sweeps"], found.parts) == (2, 3)
+    intervals, _ = over_sweeps(rows, [])
+    assert intervals[0]["mean"] == pytest.approx(5.0)
+    assert "Over 2 sweeps (3 parts), image-based has the smallest" in summary_lines(found, 2, 0)[0]
+
+
+def test_modes_of_different_sweeps_are_ranked_on_those_that_have_all():
+    # On the hard sweep only images could be had; there they are wrong by 40 %.
+    rows = part_rows(a_image=[2.0], a_pose=[3.0], hard_image=[40.0])
+    found = scored_means(rows, ["image", "pose"])
+    assert [row["length_percent"] for row in found.means] == [2.0, 3.0]
+    line = summary_lines(found, 2, 0)[0]
+    assert line.startswith("Over 1 sweep that have every mode (1 part), image-based has the smallest error")
+    apart = scored_means(part_rows(a_image=[2.0], b_pose=[3.0]), ["image", "pose"])
+    assert not apart.together
+    assert summary_lines(apart, 2, 0)[0].startswith("No sweep was reconstructed in every mode")
+
+
+def test_the_lead_says_what_the_reference_was_and_what_was_fitted_to_it():
+    three = scored(image=4.0, pose=2.0)
+    lines = summary_lines(three, 2, 0, [], {"a": "truth", "b": "tracker"})
+    assert "References differ: truth of a; tracker of b; the means mix errors against both." in lines
+    assert any("Six DOF correction was fitted to the tracker that it is compared with" in x for x in lines)
+    lines = summary_lines(three, 2, 0, [], {"a": "truth", "b": "truth"})
+    assert "Reference: truth." in lines
+    assert not any("fitted" in line for line in lines)
 
 
 def pairs(quantity, *told):
@@ -188,20 +235,20 @@ def pairs(quantity, *told):
 
 
 def test_the_lead_says_where_the_best_is_not_told_apart():
-    three = means(image=4.0, orientation=3.0, pose=2.0)
-    unsure, _ = summary_lines(three, scored(), 2, 0, pairs("length_error_percent"))
+    three = scored(image=4.0, orientation=3.0, pose=2.0)
+    unsure, _ = summary_lines(three, 2, 0, pairs("length_error_percent"))
     assert "six DOF correction has the smallest error" in unsure
     assert unsure.endswith(
         "not told apart from the other modes by these sweeps: the difference may be chance."
     )
     some = pairs("length_error_percent", ("image", "pose"))
-    half, tilt = summary_lines(three, scored(), 2, 0, some)
+    half, tilt = summary_lines(three, 2, 0, some)
     assert half.endswith("It is not told apart from orientation correction: that difference may be chance.")
     assert "not told apart" in tilt
     every = pairs("length_error_percent", ("image", "pose"), ("orientation", "pose"))
-    sure, _ = summary_lines(three, scored(), 2, 0, every)
+    sure, _ = summary_lines(three, 2, 0, every)
     assert sure.endswith("The sweeps tell it apart from every other mode.")
-    two, _ = summary_lines(means(image=4.0, pose=2.0), scored(), 2, 0, [])
+    two, _ = summary_lines(scored(image=4.0, pose=2.0), 2, 0, [])
     assert "not told apart from image-based by these sweeps" in two
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.study.metrics import ModeError
-from speckle3d.study.summary import Summary, csv_text, json_text, plain, table_text, write_summary
+from speckle3d.study.summary import Summary, csv_text, json_text, plain, remark_on, table_text, write_summary
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,43 @@ def test_table_is_aligned_and_signed():
     assert len({len(line) for line in lines[1:]}) == 1
     assert "+15.0" in lines[2]
     assert "-1.25" in lines[2]
+
+
+def test_table_says_the_reference_and_a_name_may_end_in_nan():
+    lines = table_text([Summary("banan", "truth", 100, 1.0, [row(tilt_error_deg=float("nan"))])]).splitlines()
+    assert lines[2].split()[:5] == ["banan", "f", "image", "truth", "20.00"]
+    assert lines[2].split()[-3] == "-"
+
+
+UNIT = "tracker travels 0.1 of what the images do: its unit?"
+
+
+@pytest.mark.parametrize(
+    ("reference", "mode", "travel_mm", "words"),
+    [
+        ("tracker", "pose", 20.0, "fitted to this tracker"),
+        ("truth", "pose", 20.0, ""),
+        # A tracker in centimetres, read as millimetres.
+        ("truth", "pose", 2.3, UNIT),
+        ("tracker", "pose", 2.3, f"fitted to this tracker; {UNIT}"),
+        ("tracker", "orientation", 23.0, ""),
+    ],
+)  # fmt: skip
+def test_a_row_says_what_its_numbers_do_not(reference, mode, travel_mm, words):
+    rows = [row(), row(mode, estimate_mm=travel_mm)]
+    summary = Summary("s", reference, 100, 1.0, rows)
+    assert remark_on(summary, rows[1]) == words
+    assert (words in table_text([summary]).splitlines()[3]) is True
+    (line,) = [x for x in csv.DictReader(io.StringIO(csv_text([summary]))) if x["mode"] == mode]
+    assert line["remark"] == words
+
+
+def test_without_a_pose_mode_the_tracker_is_held_against_the_images():
+    rows = [row(reference_mm=230.0, estimate_mm=23.0)]
+    assert remark_on(Summary("s", "tracker", 9, 1.0, rows), rows[0]).startswith("tracker travels 10 of what")
+    # A probe at rest: jitter against jitter tells nothing of units.
+    still = [row(reference_mm=0.01, estimate_mm=0.3)]
+    assert remark_on(Summary("s", "tracker", 9, 1.0, still), still[0]) == ""
 
 
 def test_three_files_appear_and_nothing_else(tmp_path):
