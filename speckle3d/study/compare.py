@@ -19,6 +19,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.study.job import REFERENCES, SUBSET
+from speckle3d.study.lock import only_run
 from speckle3d.study.results import Study, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
 from speckle3d.study.sweepjob import (
@@ -107,6 +108,13 @@ def compare_sweeps(
         Decorrelation curves; by default curves.h5 beside each sweep.
     progress : callable, optional
         Called at the beginning and after each sweep, and each block of a long one.
+
+    Raises
+    ------
+    InvalidInputError, InsufficientDataError
+        If a setting is wrong for all sweeps, or none can be compared.
+    FileError
+        If the folder cannot be written, or another run is at work in it.
     """
     if not paths:
         raise InvalidInputError("expected at least one sweep, got none")
@@ -126,6 +134,19 @@ def compare_sweeps(
         raise InsufficientDataError(
             f"expected a sweep that can be compared, got none of {len(plan)}; {why.name}: {why.reason}"
         )
+    with only_run(directory):
+        outcomes |= _run(jobs, where, directory, progress)
+        return write_study(directory, [outcomes[each.name] for each in plan], settings)
+
+
+def _run(
+    jobs: Sequence[SweepJob],
+    where: Scheduler,
+    directory: Path,
+    progress: Callable[[StudyProgress], None] | None,
+) -> dict[str, SweepOutcome]:
+    """Do all jobs; outcomes by name."""
+    outcomes: dict[str, SweepOutcome] = {}
     make_folder(directory / "sweeps")
     by_name = {job.name: job for job in jobs}
     tasks, after = _tasks(jobs)
@@ -141,7 +162,7 @@ def compare_sweeps(
         if progress:
             progress(so_far)
     _clear(jobs)
-    return write_study(directory, [outcomes[each.name] for each in plan], settings)
+    return outcomes
 
 
 def run_task(task: Task) -> TaskOutcome:

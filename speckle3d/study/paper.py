@@ -25,6 +25,7 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.pipeline import calibrate_curves
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
+from speckle3d.study.lock import only_run
 from speckle3d.study.metrics import ModeError, compare_modes
 from speckle3d.study.published import json_beside, text_beside
 from speckle3d.study.results import Study
@@ -95,6 +96,17 @@ def paper_study(
         If a sweep cannot be simulated.
     """
     where = scheduler or InProcess()
+    with only_run(directory):
+        return _study(directory, curves, where, progress, simulated)
+
+
+def _study(
+    directory: Path,
+    curves: Path | None,
+    where: Scheduler,
+    progress: Callable[[StudyProgress], None] | None,
+    simulated: Callable[[int, int], None] | None,
+) -> PaperStudy:
     wanted = SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS}
     inputs = _inputs(directory, wanted)
     _simulate(inputs, where, simulated)

@@ -13,6 +13,7 @@ from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.study import report_figures as draw
 from speckle3d.study import report_plots as interactive
+from speckle3d.study.lock import only_run
 from speckle3d.study.report_data import SweepView, load_view, read_study
 from speckle3d.study.report_images import Cuts, cut_modes
 from speckle3d.study.report_page import (
@@ -84,9 +85,14 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
     InvalidInputError
         If there is no study in the folder.
     FileError
-        If the page cannot be written.
+        If the page cannot be written, or another run is at work in the folder.
     """
     study = read_study(directory)
+    with only_run(directory):
+        return _write(directory, study, progress)
+
+
+def _write(directory: Path, study: Mapping[str, Any], progress: Callable[[int, int], None] | None) -> Path:
     rows = [row for row in study.get("rows", []) if isinstance(row, dict)]
     modes = list(dict.fromkeys([*study.get("modes", []), *(row["mode"] for row in rows)]))
     done = [entry for entry in study["sweeps"] if entry.get("status") == "done"]

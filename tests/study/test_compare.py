@@ -3,6 +3,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -13,7 +15,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError
 from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
@@ -21,6 +23,7 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.job import Reference
+from speckle3d.study.lock import only_run
 from speckle3d.study.points import landmark_errors
 from speckle3d.study.report import write_report
 from speckle3d.study.schedulers import OnCluster, local_cluster
@@ -211,6 +214,40 @@ def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):
     words = write_report(found.directory).read_text(encoding="utf-8")
     assert "a is a copy of s5: counted once." in words
     assert "Over 2 sweeps (2 parts), " in words
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from speckle3d.study.lock import only_run
+with only_run(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_second_run_in_one_folder_is_refused_until_the_first_is_gone(sweeps, tmp_path):
+    command = [sys.executable, "-c", HOLDER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        # Of the first run's work nothing may be touched.
+        begun = tmp_path / "sweeps" / ".part-0123abcd-s5-00000000"
+        begun.mkdir(parents=True)
+        with pytest.raises(
+            FileError, match=f"no other run is at work in, got one held by process {holder.pid}"
+        ):
+            compare_sweeps(sweeps[:1], tmp_path)
+        assert begun.exists()
+        assert not (tmp_path / "study.json").exists()
+        holder.kill()
+    assert compare_sweeps(sweeps[:1], tmp_path, ["pose"]).outcomes[0].status == "done"
+
+
+def test_a_run_may_hold_its_folder_already(tmp_path):
+    with only_run(tmp_path), only_run(tmp_path):
+        pass
+    with only_run(tmp_path):
+        pass
 
 
 def test_broken_sweeps_alone_are_refused_and_nothing_is_written(sweeps, tmp_path):
