@@ -1,4 +1,4 @@
-"""How well two crossing sweeps determine the calibration: by leaving out one part after another."""
+"""How well two crossing sweeps determine the calibration, by how far their parts disagree."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.imagecurvature import Settled
 from calibration.imagefit import Refined, about_pivot
 from calibration.imagestacks import IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray, skew
 
 BLOCK_MM = 16.0
-"""Side of the blocks of tissue left out, in units of the images' size: some patches wide, as neighbours see
-the same reflections and so err alike."""
+"""Side of the blocks of tissue that err together, in units of the images' size: some patches wide, as
+neighbours see the same reflections."""
 
 STRETCH = 3
-"""Images compared that are left out together: a tracker's error lasts from one to the next."""
+"""Images compared that err together: a tracker's error lasts from one to the next."""
 
 SHARED_RAD = np.deg2rad(0.1)
 SHARED_MM = (0.03, 0.1, 0.04)
@@ -35,8 +37,8 @@ class Spread:
     weakest: str
 
 
-def covariance_at_origin(refined: Refined, unit: float) -> Spread:
-    """Jackknife over blocks of tissue and over stretches of the sweeps, left out by one Gauss-Newton step.
+def covariance_at_origin(settled: Settled, unit: float) -> Spread:
+    """Sandwich of the curvature and of how slopes differ between blocks of tissue and stretches of sweeps.
 
     What differs from block to block of tissue (speckle, reflections) and from image to image (poses) adds up.
     Poses count twice: those of the images compared, and those of the images cut, of which there are as many.
@@ -49,22 +51,20 @@ def covariance_at_origin(refined: Refined, unit: float) -> Spread:
 
     References
     ----------
-    .. [1] R. M. Bell and D. F. McCaffrey, "Bias reduction in standard errors for linear regression with
-       multi-stage samples", Survey Methodology, 2002 (leaving out a cluster at a time).
+    .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 5th
+       Berkeley Symposium on Mathematical Statistics and Probability, 1967.
     """
+    refined = settled.refined
     chosen = np.array(refined.free)
     base = about_pivot(refined.pivot_mm)[:, chosen]
-    normal = base.T @ (refined.weight[:, None, None] * refined.likeness.normal) @ base
-    gradient = (refined.weight[:, None] * refined.likeness.gradient) @ base
-    total = normal.sum(axis=0)
-    norms = np.sqrt(np.diag(total))
-    if not (norms > 0).all():
-        return Spread(_held(np.full(total.shape, np.inf), chosen), float("inf"), "all")
-    values, vectors = np.linalg.eigh(total / np.outer(norms, norms))
+    slopes = (refined.weight[:, None] * refined.likeness.gradient) @ base
+    norms = np.sqrt(np.diag(settled.curvature))
+    values, vectors = np.linalg.eigh(settled.curvature / np.outer(norms, norms))
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
-    tissue = _jackknife(normal, gradient, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
-    poses = _jackknife(normal, gradient, _numbered(np.column_stack(_stretches(refined))))
-    covariance = base @ (tissue + 2.0 * poses) @ base.T + _shared(refined.pivot_mm, unit)
+    tissue = _scatter(slopes, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
+    poses = _scatter(slopes, _numbered(np.column_stack(_stretches(refined))))
+    moved = base @ np.linalg.inv(settled.curvature)
+    covariance = moved @ (tissue + 2.0 * poses) @ moved.T + _shared(refined.pivot_mm, unit)
     return Spread(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]])
 
 
@@ -75,18 +75,17 @@ def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
     return np.asarray(base @ np.diag(variance) @ base.T)
 
 
-def _jackknife(normal: FloatArray, gradient: FloatArray, cluster: IntArray) -> FloatArray:
-    """Covariance from the Gauss-Newton steps that follow from leaving out each cluster of patches."""
-    total, slope, count = normal.sum(axis=0), gradient.sum(axis=0), int(cluster.max()) + 1
+def _scatter(slopes: FloatArray, cluster: IntArray) -> FloatArray:
+    """Covariance of the sum of patches' slopes, if those of one cluster err together."""
+    count = int(cluster.max()) + 1
     if count < 2:
-        return np.full(total.shape, np.inf)
-    steps = np.empty((count, len(total)))
-    for number in range(count):
-        out = cluster == number
-        left = total - normal[out].sum(axis=0)
-        steps[number] = np.linalg.lstsq(left, slope - gradient[out].sum(axis=0), rcond=None)[0]
-    steps -= steps.mean(axis=0)
-    return np.asarray((count - 1) / count * steps.T @ steps)
+        raise InsufficientDataError(
+            "expected sweeps that share more tissue, got too little to compare its parts"
+        )
+    sums = np.zeros((count, slopes.shape[1]))
+    np.add.at(sums, cluster, slopes)
+    sums -= sums.mean(axis=0)
+    return np.asarray(count / (count - 1.0) * sums.T @ sums)
 
 
 def _numbered(cells: FloatArray) -> IntArray:
@@ -96,14 +95,8 @@ def _numbered(cells: FloatArray) -> IntArray:
 
 def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
     """Sweep, and stretch of it, that each patch's image belongs to."""
-    sweep, image = refined.sources.T
+    sweep, image = refined.comparison.images.T
     return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
-
-
-def _held(covariance: FloatArray, chosen: IntArray) -> FloatArray:
-    full = np.zeros((len(NAMES),) * 2)
-    full[np.ix_(chosen, chosen)] = covariance
-    return full
 
 
 def point_covariance(covariance: FloatArray, point_mm: FloatArray) -> FloatArray:

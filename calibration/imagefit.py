@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.imagestacks import IntArray
 from calibration.similarity import Comparison, Likeness
 from speckle3d.core.geometry import FloatArray, skew
 
@@ -22,8 +21,11 @@ ROBUST = 0.5
 
 MAX_STEPS = 25
 
-_SETTLED = 2e-3
-"""Step, in mm or per 30 mm of lever, at which to stop: a hundredth of what speckle lets be known."""
+LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
+"""What a turn, a displacement, and a relative change of pixel size move: the image's edge, in mm."""
+
+SETTLED = 2e-3
+"""Step of the image's edge, mm, at which to stop: a hundredth of what speckle lets be known."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,8 @@ class Refined:
         At the estimate, with derivatives.
     weight : ndarray, shape (p,)
         Of each patch.
-    places_mm : ndarray, shape (p, 3)
-        Where in the world the patches lie.
-    sources : ndarray of int, shape (p, 2)
-        Which sweep and which of its images they are on.
+    comparison : Comparison
+        Where the patches come from.
     pivot_mm : ndarray, shape (3,)
         The point of the image that turns leave in place.
     free : tuple of int
@@ -70,12 +70,23 @@ class Refined:
     estimate: Estimate
     likeness: Likeness
     weight: FloatArray
-    places_mm: FloatArray
-    sources: IntArray
+    comparison: Comparison
     pivot_mm: FloatArray
     free: tuple[int, ...]
     evaluations: int
     converged: bool
+
+    @property
+    def places_mm(self) -> FloatArray:
+        """Where in the world the patches lie, shape (p, 3)."""
+        return self.comparison.places_mm(self.estimate.sensor_from_image)
+
+    @property
+    def system(self) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton's matrix and the slope of the similarity, of the free parameters at the pivot."""
+        chosen = np.array(self.free)
+        normal, gradient = _system(self.likeness, self.weight, about_pivot(self.pivot_mm))
+        return normal[np.ix_(chosen, chosen)], gradient[chosen]
 
 
 def refine(
@@ -96,7 +107,6 @@ def refine(
     estimate, here = start, look(start)
     weight = weights(here)
     damping, evaluations, converged = 1e-2, 1, False
-    units = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])[chosen]
     while evaluations < max_steps and here.valid.sum() >= 3:
         normal, gradient = _system(here, weight, base)
         matrix, slope = normal[np.ix_(chosen, chosen)], gradient[chosen]
@@ -106,18 +116,17 @@ def refine(
         trial = estimate.stepped(step, pivot)
         there = look(trial)
         evaluations += 1
-        if _better(here, there, weight):
+        if better(here, there, weight):
             estimate, here, damping = trial, there, max(0.2 * damping, 1e-5)
             weight = weights(here)
         else:
             damping *= 8.0
-        if np.abs(step[chosen] * units).max() < _SETTLED:
+        if np.abs(step * LEVERS_MM).max() < SETTLED:
             converged = True
             break
         if damping > 1e6:
             break
-    places = comparison.places_mm(estimate.sensor_from_image)
-    return Refined(estimate, here, weight, places, comparison.images, pivot, free, evaluations, converged)
+    return Refined(estimate, here, weight, comparison, pivot, free, evaluations, converged)
 
 
 def weights(likeness: Likeness) -> FloatArray:
@@ -144,7 +153,7 @@ def _system(likeness: Likeness, weight: FloatArray, base: FloatArray) -> tuple[F
     return normal, base.T @ (weight @ likeness.gradient)
 
 
-def _better(here: Likeness, there: Likeness, weight: FloatArray) -> bool:
+def better(here: Likeness, there: Likeness, weight: FloatArray) -> bool:
     """Whether patches that count at both places are more alike; or the likeness would reward their loss."""
     both = here.valid & there.valid
     if both.sum() < 0.5 * here.valid.sum():

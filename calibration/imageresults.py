@@ -12,6 +12,7 @@ from calibration.angulation import Angulation
 from calibration.imagecurves import similarity_curves, similarity_map
 from calibration.imagereport import figure_images, pictures
 from calibration.images import (
+    SPECKLED_SIMILARITY,
     Crossing,
     ImageCalibration,
     ImageSettings,
@@ -24,6 +25,9 @@ from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 
 CURVES_TO, CURVE_POINTS, MAP_POINTS = 6.0, 25, 13
 """Reach of the similarity curves and maps in mm and degrees, and how finely they are drawn."""
+
+WEAK_SCALE = 0.01
+"""Standard error of a pixel size above which it is better taken from the scanner, which knows it to that."""
 
 MAPS = (("x", "y"), ("z", "tilt"), ("yaw", "roll"))
 _WORSE = 0.02
@@ -90,6 +94,7 @@ def notes_of(found: Found, angulation: Angulation) -> list[str]:
         f"sweeps at {angulation.crossing_deg:.0f} degrees, fans of {angulation.fan_deg[0]:.0f} and "
         f"{angulation.fan_deg[1]:.0f}; they share {100 * angulation.overlap[0]:.0f} % and "
         f"{100 * angulation.overlap[1]:.0f} % of their images",
+        "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
         f"{result.evaluations} comparisons by {result.method}",
     ]
 
@@ -138,4 +143,14 @@ def _verdict(result: ImageCalibration, angulation: Angulation) -> str:
     gain = result.held_out.after - np.nan_to_num(result.held_out.before)
     if gain < -_WORSE:
         return "doubtful: frames that were not used are less alike than at the start"
+    if result.scale_errors.max() > WEAK_SCALE:
+        lateral, axial = 100.0 * result.scale_errors
+        return (
+            f"weak: the pixel sizes are known to {lateral:.0f} and {axial:.0f} %: do without estimating them"
+        )
+    if result.alike < SPECKLED_SIMILARITY:
+        return (
+            f"doubtful: the sweeps are little alike (correlation {result.alike:.2f}), which may displace the "
+            "answer by more than its errors say"
+        )
     return angulation.verdict

@@ -20,8 +20,9 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.crossing import Crossing, Level, Progress, prepare
 from calibration.imagecovariance import covariance_at_origin, point_covariance
+from calibration.imagecurvature import Settled, curvature, settle
 from calibration.imagefit import Estimate, Refined, refine
-from calibration.imagesearch import search
+from calibration.imagesearch import DECIDED, search
 from calibration.imagestacks import TrackedImages
 from calibration.similarity import Comparison
 from calibration.simplex import climb
@@ -49,10 +50,14 @@ images tell more there than patches that overlap, since every pose errs for itse
 SHOWN_SIGMA_MM = 1.0
 """Blur at which similarities are reported, in units of the crossing."""
 
-LEAST_SIMILARITY = 0.25
-"""Correlation of patches, times the root of the share of them with support, below which sweeps are taken to
-show too little in common. Of sweeps of different tissue the best found is 0.05 to 0.2; of the same, 0.65 to
-0.9. In speckle so heavy that it is 0.2, answers were wrong by millimetres along the beams."""
+LEAST_SIMILARITY = 0.3
+"""Correlation of patches where speckle is blurred away, times the root of the share of them with support,
+below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
+0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
+
+SPECKLED_SIMILARITY = 0.45
+"""Below, the verdict warns: shadows and reflections that the sweeps do not share displaced such answers by up
+to a millimetre and two degrees, more than the covariance says."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,9 @@ class ImageCalibration:
         some motion of the image undetermined.
     weakest : str
         The parameter that makes up most of the least determined direction.
+    alike : float
+        Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
+        support; see `LEAST_SIMILARITY`.
     similarity, held_out : Improvement
         Of images that were compared, and of frames that were left out of everything.
     frames_used, frames_held_out : tuple of ndarray of int
@@ -141,6 +149,7 @@ class ImageCalibration:
     covariance: FloatArray
     condition_number: float
     weakest: str
+    alike: float
     similarity: Improvement
     held_out: Improvement
     frames_used: tuple[tuple[int, ...], tuple[int, ...]]
@@ -195,12 +204,16 @@ def calibrate_crossing(
             climbed = climb(crossing, first, chosen.scales, pool, progress)
             found, evaluations, converged = climbed.estimate, climbed.evaluations, climbed.converged
             refined = _look(crossing, found, chosen, pool)
+            alike = _require_alike(crossing, found, pool)
+            settled = Settled(refined, curvature(refined, pool))
         else:
             found, looks = _within_reach(crossing, first, chosen, pool, progress)
             refined, steps = _refined(crossing, found, chosen, pool, progress)
+            alike = _require_alike(crossing, refined.estimate, pool)
+            settled = settle(refined, pool)
+            refined = settled.refined
             found, evaluations, converged = refined.estimate, looks + steps, refined.converged
-    _require_alike(refined)
-    return _result(crossing, chosen, first, found, refined, evaluations, converged)
+    return _result(crossing, chosen, first, found, settled, alike, evaluations, converged)
 
 
 def _within_reach(
@@ -243,14 +256,17 @@ def _free(settings: ImageSettings) -> tuple[int, ...]:
     return tuple(range(8 if settings.scales else 6))
 
 
-def _require_alike(refined: Refined) -> None:
-    score = refined.likeness.score
+def _require_alike(crossing: Crossing, found: Estimate, pool: ThreadPoolExecutor) -> float:
+    """How alike the sweeps are at an answer, where speckle is blurred away."""
+    seen = crossing.level(DECIDED, found.sensor_from_image)
+    score = seen.at(found.sensor_from_image, found.scales, pool=pool).score
     if score < LEAST_SIMILARITY:
         got = "no overlap" if score < 0 else f"{score:.2f} at best"
         raise InsufficientDataError(
             "expected sweeps that show the same structure, with a correlation of at least "
             f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
         )
+    return score
 
 
 def _result(
@@ -258,11 +274,12 @@ def _result(
     settings: ImageSettings,
     first: Estimate,
     found: Estimate,
-    refined: Refined,
+    settled: Settled,
+    alike: float,
     evaluations: int,
     converged: bool,
 ) -> ImageCalibration:
-    spread = covariance_at_origin(refined, crossing.unit)
+    spread = covariance_at_origin(settled, crossing.unit)
     near = found.sensor_from_image
     shown = crossing.whole(SHOWN_SIGMA_MM, 10, near), crossing.check(SHOWN_SIGMA_MM, near)
     return ImageCalibration(
@@ -275,6 +292,7 @@ def _result(
         covariance=spread.covariance[:6, :6],
         condition_number=spread.condition_number,
         weakest=spread.weakest,
+        alike=alike,
         similarity=_improvement(shown[0], first, found),
         held_out=_improvement(shown[1], first, found),
         frames_used=_numbers(crossing.frames_used),
