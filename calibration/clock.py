@@ -35,7 +35,16 @@ turns that are not small, fit best at delays that are wrong."""
 _AMBIGUOUS = 0.1
 """Another delay counts as a rival if it is worse by less than this share of what the best delay gains."""
 
-_FEWEST_FRAMES = 20
+FEWEST_FRAMES = 20
+
+_STILL = 1e-9
+"""Motion, mm or rad, below which a line's is only rounding."""
+
+_TREND = 0.95
+"""Share of a motion that a constant speed may explain; such a motion fits at any delay."""
+
+_ONE_WAY = "the motion goes one way and does not return: move the probe up and down"
+_IRREGULARLY = "move the probe up and down, irregularly"
 
 
 @dataclass(frozen=True)
@@ -98,10 +107,10 @@ def delay_from_lines(
         delay is at the end of the range, or another is as good, as with a periodic motion.
     """
     there = covered(readings, frame_time_s, around_s, search_s)
-    if there.sum() < _FEWEST_FRAMES:
+    if there.sum() < FEWEST_FRAMES:
         raise InsufficientDataError(
-            f"expected readings within {search_s:g} s of at least {_FEWEST_FRAMES} frames with a line, got "
-            f"them for {there.sum()}"
+            f"expected readings from {search_s:g} s before to {search_s:g} s after at least {FEWEST_FRAMES} "
+            f"frames with a line, got them for {there.sum()} of {len(frame_time_s)} such frames"
         )
     wanted = signal[there, 0 if isinstance(readings, TimedPoses) else 1]
     misfit_at = _misfit(wanted - wanted.mean(), frame_time_s[there], readings)
@@ -109,11 +118,17 @@ def delay_from_lines(
     tried = np.asarray(around_s + steps * STEP_S, dtype=np.float64)
     misfit = np.array([misfit_at(float(delay)) for delay in tried], dtype=np.float64)
     best = int(np.argmin(misfit))
-    _require_clear(tried, misfit, best)
+    returns = _returns(wanted, frame_time_s[there])
+    _require_clear(tried, misfit, best, returns)
     near = minimize_scalar(
         misfit_at, bounds=(tried[best - 1], tried[best + 1]), method="bounded", options={"xatol": 1e-5}
     )
     error = _standard_error(misfit_at, float(near.x), wanted, frame_time_s[there], readings)
+    if not error < search_s:
+        raise InsufficientDataError(
+            f"expected a motion that shows the delay, got {near.x:+.3f} s +- {error:.3g} s, no better than "
+            f"the {search_s:g} s searched: {_IRREGULARLY if returns else _ONE_WAY}"
+        )
     return Delay(float(near.x), error, 1.0 - float(near.fun), tried, misfit)
 
 
@@ -132,7 +147,7 @@ def _misfit(
 ) -> Callable[[float], float]:
     """Share of the signal's variance that the sensor leaves unexplained, as a function of the delay."""
     energy = float(wanted @ wanted)
-    if energy == 0.0:
+    if float(np.ptp(wanted)) < _STILL:
         raise InsufficientDataError("expected a line that moves, got one that stands still")
 
     def at(delay_s: float) -> float:
@@ -147,18 +162,40 @@ def _residuals(wanted: FloatArray, motion: FloatArray) -> FloatArray:
     return np.asarray(wanted - motion @ found)
 
 
-def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int) -> None:
+def _returns(wanted: FloatArray, times_s: FloatArray) -> bool:
+    """Whether the line does more than go one way at one speed."""
+    trend = np.polynomial.Polynomial.fit(times_s, wanted, 1)(times_s)
+    return float(np.var(wanted - trend)) > (1.0 - _TREND) * float(np.var(wanted))
+
+
+def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int, returns: bool) -> None:
     """Refuse what does not follow, lies at the end of the range, or has a rival."""
     if 1.0 - misfit[best] < LEAST_FOLLOWED:
         raise InsufficientDataError(
             f"expected a line that follows the sensor, got {100 * (1 - misfit[best]):.0f} % of its motion "
-            "explained at the best delay: move the probe up and down, faster"
+            f"explained at the best delay, {tried_s[best]:+.3f} s: move the probe up and down, faster; or "
+            "the delay lies outside the range searched: --search-s"
         )
-    require_peak(tried_s, misfit, best)
+    try:
+        require_peak(tried_s, misfit, best)
+    except InsufficientDataError:
+        if returns:
+            raise
+        raise InsufficientDataError(f"expected one delay, got many that fit alike: {_ONE_WAY}") from None
 
 
-def require_peak(tried_s: FloatArray, misfit: FloatArray, best: int) -> None:
+def require_peak(
+    tried_s: FloatArray,
+    misfit: FloatArray,
+    best: int,
+    why: str = "the motion repeats itself; move irregularly",
+) -> None:
     """Refuse a best delay that lies at the end of the range, or that has a rival.
+
+    Parameters
+    ----------
+    why : str
+        What a rival means.
 
     Raises
     ------
@@ -166,17 +203,16 @@ def require_peak(tried_s: FloatArray, misfit: FloatArray, best: int) -> None:
     """
     if best in (0, len(tried_s) - 1):
         raise InsufficientDataError(
-            f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's end"
+            f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's "
+            "end: the delay may lie outside the range searched: --search-s"
         )
     inner = np.flatnonzero((misfit[1:-1] <= misfit[:-2]) & (misfit[1:-1] <= misfit[2:])) + 1
     gain = float(np.median(misfit) - misfit[best])
     rivals = [i for i in inner if i != best and misfit[i] - misfit[best] < _AMBIGUOUS * gain]
     rivals = [i for i in rivals if misfit[min(i, best) : max(i, best)].max() - misfit[best] > 0.5 * gain]
     if rivals:
-        raise InsufficientDataError(
-            f"expected one delay, got {tried_s[best]:+.3f} and {tried_s[rivals[0]]:+.3f} s nearly as good: "
-            "the motion repeats itself; move irregularly"
-        )
+        pair = f"{tried_s[best]:+.3f} and {tried_s[rivals[0]]:+.3f} s"
+        raise InsufficientDataError(f"expected one delay, got {pair} nearly as good: {why}")
 
 
 def _standard_error(

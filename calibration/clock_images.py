@@ -22,7 +22,8 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock import SEARCH_S, Delay, require_peak
+from calibration.clock import SEARCH_S, Delay
+from calibration.clock_peak import SIGMAS, STEP_S, clear_peak, curves_at, doubts, half_width, mean_of, placed
 from calibration.imagestacks import TrackedImages
 from calibration.pairing import covered
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -39,14 +40,13 @@ COARSE, FINE = 8, 60
 """Images of each way that are compared to find the peak, and to place it; the paper takes four. A tracker's
 jitter of 0.15 mm is 15 ms at 10 mm/s, and only many images average it away."""
 
-STEP_S = 0.01
 _SMOOTHED_S = 0.2
-_WIDEST_S = 0.1
-_PLACES, _BLOCK = 9, 5
+_PLACES = 9
 _LEAST_TRAVEL_MM = 2.0
+"""About an elevational beam width: images of less travel look alike wherever they were taken."""
+
 _FEWEST_FRAMES = 20
 _SMALLEST_SHARE = 0.3
-_RESAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,9 @@ def delay_from_images(
     Raises
     ------
     InsufficientDataError
-        If the probe does not go forward and back, the images do not show where they were taken, the best
-        delay is at the end of the range, or another is as good, as with a periodic motion.
+        If the probe does not go forward and back, or stays in the plane of its images, the images do not show
+        where they were taken, the best delay is at the end of the range, or another is as good, as with a
+        periodic motion.
     """
     if queries < 2:
         raise InvalidInputError(f"queries: expected at least 2, got {queries}")
@@ -98,24 +99,32 @@ def delay_from_images(
 
     steps = np.arange(-round(search_s / STEP_S), round(search_s / STEP_S) + 1)
     tried = np.asarray(around_s + steps * STEP_S, dtype=np.float64)
-    misfit, coarse = np.ones(tried.size), likeness(min(COARSE, queries))
-    for number, delay in enumerate(tried):
-        misfit[number] = 1.0 - _mean(coarse(float(delay)))
-        if progress is not None:
-            progress(number + 1, len(tried))
-    best = int(np.argmin(misfit))
-    require_peak(tried, misfit, best)
-    fine = likeness(queries)
+    tried, curves = curves_at(likeness(min(COARSE, queries)), tried, progress)
+    misfit = np.array([1.0 - mean_of(each) for each in curves])
+    best = clear_peak(tried, curves, misfit, search_s)
+    fine, width = likeness(queries), half_width(tried, misfit, best)
     near = minimize_scalar(
-        lambda delay: 1.0 - _mean(fine(float(delay))),
+        lambda delay: 1.0 - mean_of(fine(float(delay))),
         bounds=(tried[best - 1], tried[best + 1]),
         method="bounded",
         options={"xatol": 2e-4},
     )
-    width = _half_width(tried, misfit, best)
-    seconds, scatter = _placed(fine, float(near.x) + width * np.linspace(-1.0, 1.0, _PLACES))
+    low, high = max(near.x - width, tried[0]), min(near.x + width, tried[-1])
+    seconds, scatter = placed(fine, np.linspace(low, high, _PLACES))
+    # A top whose own error is not well within its width is none.
+    if not (near.fun < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
+        raise InsufficientDataError(
+            f"expected correlations with a top, got none near the best delay, {near.x:+.3f} s: "
+            f"{doubts(search_s)}"
+        )
     jitter = _from_jitter(readings, steady, frame_time_s[there] - seconds, sensor_from_image, grid)
-    return Delay(seconds, float(np.hypot(scatter, jitter)), 1.0 - float(near.fun), tried, misfit)
+    error = float(np.hypot(scatter, jitter))
+    if not error < search_s:
+        raise InsufficientDataError(
+            f"expected readings that tell the delay, got {seconds:+.3f} s +- {error:.3g} s from their jitter "
+            f"alone, no better than the {search_s:g} s searched: move the probe faster"
+        )
+    return Delay(seconds, error, 1.0 - float(near.fun), tried, misfit)
 
 
 class _Pooled:
@@ -227,9 +236,22 @@ def _there_and_back(poses: RigidTransform, grid: ImageGrid) -> tuple[_Part, _Par
             f"expected a motion forward and back over {_LEAST_TRAVEL_MM:g} mm or more, got one that comes "
             f"back by {max(high - low, 0.0):.1f} mm"
         )
+    _require_across(poses, grid)
     share = (along - low) / (high - low)
     ways = np.arange(turn + 1), np.arange(turn, along.size)
     return _Part(ways[0], share[ways[0]]), _Part(ways[1], share[ways[1]])
+
+
+def _require_across(poses: RigidTransform, grid: ImageGrid) -> None:
+    """Refuse images that all lie in one plane: none of them cuts the others."""
+    normal = poses.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
+    places = np.array([poses.apply(corner) for corner in grid.corners_mm])
+    across = float(np.ptp(places @ (normal / np.linalg.norm(normal)), axis=1).max())
+    if across < _LEAST_TRAVEL_MM:
+        raise InsufficientDataError(
+            f"expected a motion across the image's plane of {_LEAST_TRAVEL_MM:g} mm or more, an elevational "
+            f"beam width, got {across:.1f} mm: slide the probe towards one of its flat sides and back"
+        )
 
 
 def _way(there: npt.NDArray[np.int64], part: _Part, number: int) -> _Way:
@@ -256,12 +278,6 @@ def _correlation(image: GreyArray, resliced: GreyArray) -> float:
     return float(np.corrcoef(one, other)[0, 1])
 
 
-def _mean(correlations: FloatArray) -> float:
-    """Mean over the queries; zero where fewer than half have support."""
-    held = np.isfinite(correlations)
-    return float(correlations[held].mean()) if 2 * held.sum() >= max(correlations.size, 1) else 0.0
-
-
 def _from_jitter(
     readings: TimedPoses,
     steady: TimedPoses,
@@ -286,32 +302,3 @@ def _from_jitter(
     sigma = float(np.std((raw - held) @ along))
     speed = path / float(times_s[-1] - times_s[0])
     return float(sigma * 2.0 / np.sqrt(used.sum()) / (2.0 * speed))
-
-
-def _half_width(tried_s: FloatArray, misfit: FloatArray, best: int) -> float:
-    """How far from the best delay half of what it gains over the others is lost."""
-    half = 0.5 * (misfit[best] + float(np.median(misfit)))
-    above = np.flatnonzero(misfit > half)
-    nearest = float(np.abs(tried_s[above] - tried_s[best]).min()) if above.size else _WIDEST_S
-    return min(max(nearest, 2.0 * STEP_S), _WIDEST_S)
-
-
-def _placed(likeness: _Likeness, near_s: FloatArray) -> tuple[float, float]:
-    """Top of a parabola through the mean likeness near the peak, and its scatter over runs of queries.
-
-    The top alone ripples with the frames that happen to be there. Runs, since neighbours share frames of
-    the other way.
-    """
-    curves = np.array([likeness(float(each)) for each in near_s])
-    curves = curves[:, np.isfinite(curves).all(axis=0)]
-    middle = float(near_s.mean())
-    runs = curves.shape[1] // _BLOCK
-    if runs < 2:
-        return middle, float("inf")
-    means = curves[:, : runs * _BLOCK].reshape(len(near_s), runs, _BLOCK).mean(axis=2)
-    second, first = np.polyfit(near_s - middle, means, 2)[:2]
-    drawn = np.random.default_rng(0).integers(0, runs, (_RESAMPLES, runs))
-    if not second.mean() < 0:
-        return middle, float("inf")
-    scatter = np.std(-first[drawn].mean(axis=1) / (2.0 * second[drawn].mean(axis=1)))
-    return middle - float(first.mean() / (2.0 * second.mean())), float(scatter)

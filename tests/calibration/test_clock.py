@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration import clock
 from calibration.clock import delay_from_lines, line_signal
 from calibration.lines import detect_lines
 from speckle3d.core.errors import InsufficientDataError
@@ -73,6 +74,37 @@ def test_a_line_that_does_not_follow_or_stands_still_is_refused():
         delay_from_lines(other, frames, poses)
     with pytest.raises(InsufficientDataError, match="stands still"):
         delay_from_lines(np.zeros_like(signal), frames, poses)
+
+
+def one_axis(height, times):
+    """A tracker that goes straight up and down, on the images' clock."""
+    return TimedPoses(times, RigidTransform.from_translation(np.outer(height(times), [0.0, 0.0, 1.0])))
+
+
+def test_a_motion_that_does_not_return_is_called_that():
+    rng = np.random.default_rng(0)
+    times, frames = np.arange(-1.0, 13.0, 1 / 256.0), np.arange(0.0, 12.0, 0.04)
+    readings = one_axis(lambda t: 2.0 * t, times)
+    for error in (0.1 * np.sin(31.0 * frames), 0.1 * rng.standard_normal(frames.size)):
+        signal = np.column_stack([10.0 + 2.0 * frames + error, np.zeros(frames.size)])
+        with pytest.raises(InsufficientDataError, match="does not return"):
+            delay_from_lines(signal, frames, readings)
+
+
+def test_an_error_that_is_no_better_than_the_range_is_refused(monkeypatch):
+    signal, frames, poses, _ = recorded(0)
+    for error in (float("inf"), float("nan"), 0.6):
+        monkeypatch.setattr(clock, "_standard_error", lambda *_, error=error: error)
+        with pytest.raises(InsufficientDataError, match="no better than the"):
+            delay_from_lines(signal, frames, poses)
+
+
+def test_rounding_is_not_taken_for_motion():
+    signal, frames, poses, _ = recorded(0)
+    # A mean of many equal numbers is not quite that number.
+    still = np.full_like(signal, 1.4) + 1e-15 * np.arange(len(signal))[:, None]
+    with pytest.raises(InsufficientDataError, match="stands still"):
+        delay_from_lines(still, frames, poses)
 
 
 def test_a_delay_beyond_the_range_and_missing_readings_are_refused():

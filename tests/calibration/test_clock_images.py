@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform
 
 from calibration.clock_images import delay_from_images, smoothed
@@ -68,6 +69,63 @@ def test_a_rough_mounting_is_enough(recording):
 def test_a_delay_outside_the_range_is_refused(recording):
     with pytest.raises(InsufficientDataError, match=r"range's end|nearly as good"):
         delay_from_images(tracked(recording, 0.2), RigidTransform.identity(), 0.08)
+
+
+def rolled(images):
+    """The way back first: what was seen at every place was seen more than a second before or after."""
+    return np.roll(images, 30, axis=0)
+
+
+def noise(images):
+    return np.random.default_rng(0).standard_normal(images.shape)
+
+
+def smooth_noise(images):
+    """As alike from frame to frame as images are."""
+    return gaussian_filter(noise(images), (2.0, 1.0, 4.0))
+
+
+def reversed_in_time(images):
+    return images[::-1]
+
+
+def mixed(images):
+    return images[np.random.default_rng(0).permutation(len(images))]
+
+
+def one_alone(images):
+    return np.repeat(images[:1], len(images), axis=0)
+
+
+@pytest.mark.parametrize("change", [rolled, noise, smooth_noise, reversed_in_time, mixed, one_alone])
+def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change):
+    whole = tracked(recording, 0.0)
+    with pytest.raises(InsufficientDataError, match="--search-s"):
+        delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), 0.4, 20)
+
+
+@pytest.mark.parametrize("offset_s", [0.6, -0.6])
+def test_a_delay_far_outside_the_range_is_refused(recording, offset_s):
+    with pytest.raises(InsufficientDataError, match=r"may lie outside|lies outside|forward and back"):
+        delay_from_images(tracked(recording, offset_s), RigidTransform.identity(), 0.3, 20)
+
+
+def test_noise_twice_the_picture_hides_no_delay(recording):
+    whole = tracked(recording, 0.03)
+    rough = whole.images + 2.0 * whole.images.std() * noise(whole.images)
+    found = delay_from_images(replace(whole, images=rough), RigidTransform.identity(), 0.15)
+    assert found.seconds == pytest.approx(0.03, abs=0.006)
+
+
+def test_images_of_one_plane_are_refused_at_once(recording):
+    whole = tracked(recording, 0.0)
+    times = whole.frame_time_s
+    along = 10.0 * np.sin(np.linspace(0.0, np.pi, times.size))
+    # Tremor of a millimetre across is less than a beam's width.
+    path = np.column_stack([along, 0.5 * along, 0.5 * np.sin(20.0 * times)])
+    readings = TimedPoses(times, RigidTransform.from_translation(path))
+    with pytest.raises(InsufficientDataError, match=r"across the image's plane .* got 0\.9 mm"):
+        delay_from_images(replace(whole, readings=readings, images=None), RigidTransform.identity(), 0.05)
 
 
 def test_a_motion_one_way_is_refused(recording):
