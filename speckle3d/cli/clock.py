@@ -12,7 +12,7 @@ import typer
 
 from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
 from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines, require_free
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
     from calibration.clock import Delay
@@ -47,8 +47,13 @@ def calibrate_clock(
     out: Annotated[Path | None, typer.Option("-o", "--output", help="Where that copy goes.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Find a sensor's clock offset: a motion forward and back, or up and down (or rolling) over a plane."""
+    """Find a sensor's clock offset: a motion forward and back, or up and down (or rolling) over a plane.
+
+    The offset is added to the sensor's times; PLUS's LocalTimeOffsetSec, of the image device, is the same
+    with the other sign.
+    """
     from speckle3d.io.calibrations import read_calibration, write_calibration
+    from speckle3d.study.summary import plain
 
     if out is not None and calibration is None:
         raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
@@ -57,6 +62,10 @@ def calibrate_clock(
     if out is not None:
         _require_free(out, images, poses, calibration)
     known = None if calibration is None else read_calibration(calibration)
+    if known is not None and known.sensor != sensor:
+        raise MismatchError(
+            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
+        )
     if by is By.images and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
     if by is By.images:
@@ -69,8 +78,13 @@ def calibrate_clock(
         write_calibration(out, replace(known, time_offset_s=found.seconds))
         note(f"calibration with this offset in {out}")
     if as_json:
-        table = {"time_offset_s": found.seconds, "standard_error_s": found.standard_error_s}
-        emit(json.dumps(table | {"followed": found.followed, "frames": frames}, indent=2))
+        table = {
+            "time_offset_s": found.seconds,
+            "standard_error_s": found.standard_error_s,
+            "followed": found.followed,
+            "frames": frames,
+        }
+        emit(json.dumps(plain(table), indent=2, allow_nan=False))
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)
@@ -100,11 +114,17 @@ def _by_line(
     search_s: float,
 ) -> tuple[Delay, int]:
     """The delay, and in how many frames a line was found."""
-    from calibration.clock import delay_from_lines, line_signal
-    from speckle3d.cli.recordings import open_recording
+    from calibration.clock import FEWEST_FRAMES, delay_from_lines, line_signal
+    from speckle3d.cli.recordings import open_recording, require_unsized
 
+    require_unsized(images, pixel_mm)
     recording = open_recording(images, poses, pixel_mm, sensor)
     seen = find_lines(recording, region, images)
+    if len(seen.frame) < FEWEST_FRAMES:
+        raise InsufficientDataError(
+            f"{images}: expected a line in at least {FEWEST_FRAMES} frames, got one in {len(seen.frame)} of "
+            f"{len(recording.frame_time_s)}: record a plane's echo, for longer; of tissue use --by images"
+        )
     with naming(str(images)):
         signal = line_signal(seen.marks_px, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
         times = recording.frame_time_s[seen.frame]
@@ -121,8 +141,9 @@ def _by_images(
 ) -> tuple[Delay, int]:
     """The delay, and how many frames there were."""
     from calibration.clock_images import delay_from_images
-    from speckle3d.cli.recordings import open_tracked
+    from speckle3d.cli.recordings import open_tracked, require_unsized
 
+    require_unsized(images, pixel_mm)
     tracked, held = open_tracked(images, poses, pixel_mm, None if known is None else known.time_offset_s)
     mounting = held if known is None else known.sensor_from_image
     if mounting is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -83,11 +84,32 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:
     try:
         return load_sweep(path, given)
     except InvalidInputError as error:
-        if pixel_mm is None and str(error).endswith(("give column_pitch_mm", "give row_spacing_mm")):
-            raise InvalidInputError(
-                f"{path}: the header does not say how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
-            ) from None
-        raise
+        lacking = re.search(r"give (\w+)(?: \(low, high\))?$", str(error))
+        if lacking is None:
+            raise
+        raise InvalidInputError(f"{path}: {_advice(lacking[1])}") from None
+
+
+def _advice(lacking: str) -> str:
+    """What to do about a setting that a header lacks, in terms of options that there are."""
+    if lacking in ("column_pitch_mm", "row_spacing_mm"):
+        return "the header does not say how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
+    option = lacking.replace("_", "-")
+    return (
+        f"the header does not say its {option}: make it a sweep file first, by `speckle3d convert IN OUT "
+        f"--{option} ...` with what else that asks for"
+    )
+
+
+def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
+    """Refuse a pixel size for images that have their own, where it would go unused.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    if pixel_mm is not None and sniff(path) == "hdf5":
+        raise InvalidInputError(f"--pixel-mm: expected none with {path}, a sweep file, which has its own")
 
 
 def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:

@@ -1,4 +1,4 @@
-"""Clock offsets from the command line: nothing is overwritten, and what cannot be told is said in one line."""
+"""Clock offsets from the command line: nothing is overwritten, what cannot be told is one line."""
 
 import json
 
@@ -67,3 +67,86 @@ def test_no_input_and_nothing_but_a_calibration_is_overwritten(run, refused, bac
     write_calibration(again, read_calibration(held))
     assert run(*clock, "-o", again)[0] == 0
     assert read_calibration(again).time_offset_s == pytest.approx(-0.04, abs=0.012)
+
+
+@pytest.fixture
+def noise(back, tmp_path):
+    """The readings of `back` with images of nothing."""
+    path = tmp_path / "noise.h5"
+    path.write_bytes(back.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file["rf"][...] = np.random.default_rng(0).normal(0, 300, file["rf"].shape).astype(np.int16)
+    return path
+
+
+def test_images_that_show_nothing_leave_no_calibration(refused, noise, held, tmp_path):
+    line = refused("calibrate", "clock", noise, *IMAGES, "--calibration", held, "-o", tmp_path / "c.h5")
+    assert "--search-s" in line
+    assert str(noise) in line
+
+
+def test_a_calibration_of_another_sensor_is_refused(refused, back, tmp_path):
+    held = tmp_path / "imu.h5"
+    write_calibration(held, calibration(Rotation.identity(), None))
+    line = refused("calibrate", "clock", back, "--calibration", held, "-o", tmp_path / "c.h5")
+    assert "expected a calibration of the tracker, got one of orientation" in line
+
+
+def test_a_pixel_size_beside_a_files_own_is_refused(refused, back):
+    for way in ("line", "images"):
+        line = refused("calibrate", "clock", back, "--by", way, "--pixel-mm", "0.1", "0.1")
+        assert line.startswith("speckle3d: --pixel-mm: ")
+        assert "has its own" in line
+
+
+def test_frames_in_which_no_line_is_seen_are_counted(refused, noise):
+    line = refused("calibrate", "clock", noise)
+    assert "expected a line in at least 20 frames, got one in" in line
+    assert " of 50: " in line
+    assert "--by images" in line
+
+
+def image_sequence(path, kind, sample, frames=4):
+    """A MetaImage whose header knows times and places but neither sizes nor rates."""
+    pose = " ".join(f"{value:g}" for value in np.eye(4).ravel())
+    lines = ["ObjectType = Image", "NDims = 3", f"DimSize = 16 16 {frames}", f"ElementType = {sample}"]
+    lines += [f"UltrasoundImageType = {kind}", "UltrasoundImageOrientation = MF"]
+    for number in range(frames):
+        lines += [
+            f"Seq_Frame{number:04d}_Timestamp = {0.04 * number}",
+            f"Seq_Frame{number:04d}_ProbeToTrackerTransform = {pose}",
+            f"Seq_Frame{number:04d}_ProbeToTrackerTransformStatus = OK",
+        ]
+    path.write_bytes(
+        "\n".join([*lines, "ElementDataFile = LOCAL\n"]).encode()
+        + bytes(512 * frames)[: 256 * frames * (1 + (sample == "MET_SHORT"))]
+    )
+    return path
+
+
+@pytest.mark.parametrize("way", ["line", "images"])
+def test_what_a_header_lacks_is_named_by_options_that_there_are(refused, tmp_path, way):
+    grey = image_sequence(tmp_path / "grey.mha", "BRIGHTNESS", "MET_UCHAR")
+    assert "give --pixel-mm COLUMN ROW" in refused("calibrate", "clock", grey, "--by", way)
+    rf = image_sequence(tmp_path / "rf.mha", "RF_REAL", "MET_SHORT")
+    for options in ((), ("--pixel-mm", "0.1", "0.1")):
+        line = refused("calibrate", "clock", rf, "--by", way, *options)
+        assert "speckle3d convert IN OUT --sampling-rate-hz" in line
+        assert "_hz" not in line
+
+
+def test_help_says_how_the_sign_relates_to_that_of_plus(run):
+    _, text, _ = run("calibrate", "clock", "--help")
+    assert "LocalTimeOffsetSec" in text
+
+
+def test_what_is_printed_for_machines_is_json_even_if_numbers_are_not(run, back, monkeypatch):
+    from calibration import clock_images
+    from calibration.clock import Delay
+
+    odd = Delay(0.0, float("inf"), 1.0, np.zeros(1), np.zeros(1))
+    monkeypatch.setattr(clock_images, "delay_from_images", lambda *_args, **_named: odd)
+    code, text, err = run("calibrate", "clock", back, *IMAGES, "--json")
+    assert code == 0, err
+    told = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    assert told["standard_error_s"] is None
