@@ -171,7 +171,10 @@ def angulation(
         If a sweep has fewer than two frames, or the sweeps never cross, however far their images reach.
     """
     if min(len(first), len(second)) < 2:
-        raise InsufficientDataError(f"expected two sweeps, got {len(first)} and {len(second)} frames")
+        raise InsufficientDataError(
+            f"expected readings of the tracker in both sweeps, got some for {len(first)} and {len(second)} "
+            "frames: do the clocks belong together?"
+        )
     one, other = first * sensor_from_image, second * sensor_from_image
     centre, half = corners_mm.mean(axis=0), 0.5 * np.ptp(corners_mm, axis=0)
     blocks, overlap = _both_ways(one, other, corners_mm)

@@ -23,6 +23,9 @@ _GLANCES = 1024
 """Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
 once, but slopes that lead to it start much farther out."""
 
+_MORE_GLANCES = 4096
+"""Places looked at where nothing came of those: the right one may lie in a corner of the box."""
+
 _BESIDE = 256
 """Places looked at about each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
 
@@ -58,27 +61,22 @@ def search(
     """
     say = progress or _silent
     first = start.sensor_from_image
-    places = _spread(first, capture_mm, capture_rad, _GLANCES)
-    glance = crossing.level(GLANCE, first)
-    scores = np.empty(len(places))
-    for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
-        scores[n] = score
-        say("looking around", n + 1, len(places))
-    best = [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:_FOLLOWED] if scores[n] > -1]
-    if not best:
-        raise InsufficientDataError(
-            f"expected sweeps that overlap within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
-            "of the start, got no overlap anywhere"
-        )
-    followed = [
-        one
-        for one in _refined(crossing, FOLLOWED, best, pool, say, "following up")
-        if _within(first, one.estimate, capture_mm, capture_rad)
-    ]
+    looks, followed = 0, []
+    for glances in (_GLANCES, _MORE_GLANCES):
+        looks += glances
+        best = _glanced(crossing, start, glances, capture_mm, capture_rad, pool, say)
+        followed = [
+            one
+            for one in (_refined(crossing, FOLLOWED, best, pool, say, "following up") if best else [])
+            if _within(first, one.estimate, capture_mm, capture_rad)
+        ]
+        if followed:
+            break
     if not followed:
+        got = "none but farther off" if best else "no overlap anywhere"
         raise InsufficientDataError(
             f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
-            "of the start, got none but farther off"
+            f"of the start, got {got}"
         )
     compared = _refined(crossing, COMPARED, _distinct(followed, crossing)[:_COMPARED], pool, say, "comparing")
     # Where the tissue is layered, or repeats itself, the best place so far is often beside the right one.
@@ -88,9 +86,29 @@ def search(
     best_first = sorted(compared + again, key=lambda one: -one.likeness.score)
     left = _distinct(best_first, crossing)[:_DECIDED]
     decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
-    looks = len(places) + _BESIDE * len(compared[:_HOPPED])
+    looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
     return Found(decided[0].estimate, looks)
+
+
+def _glanced(
+    crossing: Crossing,
+    start: Estimate,
+    count: int,
+    capture_mm: float,
+    capture_rad: float,
+    pool: ThreadPoolExecutor,
+    say: Progress,
+) -> list[Estimate]:
+    """The best of many places all over the box."""
+    places = _spread(start.sensor_from_image, capture_mm, capture_rad, count)
+    glance = crossing.level(GLANCE, start.sensor_from_image)
+    scores = np.empty(len(places))
+    for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
+        scores[n] = score
+        say("looking around", n + 1, len(places))
+    most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
+    return [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:most] if scores[n] > -1]
 
 
 def _beside(

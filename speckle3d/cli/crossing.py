@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from calibration.imagestacks import TrackedImages
     from speckle3d.core.calibration import Calibration
 
+
+_FAR_MM = 300.0
+"""What fits on a probe."""
 
 MOST_OFFSET_S = 1e6
 """No clock offset is larger: not even one between seconds since switching on and since some midnight."""
@@ -91,6 +95,8 @@ def calibrate_images(
     require_free(out, first, second, start, clock, *(poses or ()))
     settings = ImageSettings(method.value, scales, capture_mm, capture_deg)
     given = _open(first, second, readings, pixel_mm, time_offset_s, clock, start, start_mm, start_deg)
+    if (far := math.hypot(*given.start.translation)) > _FAR_MM:
+        note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")
     enough = _angulation(given.sweeps, given.start)
     enough.require()
     found = _solve(given.sweeps, given.start, settings)
