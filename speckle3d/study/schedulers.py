@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -238,24 +240,43 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Any]:
     """Client of so many worker processes of one thread each on this machine, ended with the block."""
-    dask = _dask()
+    with _without_interrupts():
+        cluster = _start_local(workers)
+    with cluster, _dask().Client(cluster) as client:
+        yield client
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Start processes that Ctrl-C does not end; one that comes in these seconds is lost.
+
+    A terminal sends it to every process. The study's own then ends its workers, which need not say, each with
+    a traceback, that they were stopped. What a process ignores, those that it starts ignore, too.
+    """
+    if threading.current_thread() is not threading.main_thread():  # which alone may say so
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+
+
+def _start_local(workers: int) -> Any:
     # A worker has one thread: more in the kernels would only get in the way.
     env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    with (
-        dask.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=None,
-            # Even so it opens a port, by default the same for every cluster of the machine; 0 is a free one.
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-            memory_limit=0,
-            silence_logs=50,
-            env=env | {"MPLBACKEND": os.environ.get("MPLBACKEND", "agg")},
-        ) as cluster,
-        dask.Client(cluster) as client,
-    ):
-        yield client
+    return _dask().LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        # Even so it opens a port, by default the same for every cluster of the machine; 0 is a free one.
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+        memory_limit=0,
+        silence_logs=50,
+        env=env | {"MPLBACKEND": os.environ.get("MPLBACKEND", "agg")},
+    )
 
 
 def remaining_s(finished: Sequence[tuple[float, float]], left_frames: float, workers: int) -> float | None:

@@ -94,6 +94,14 @@ def test_jobs_are_given_up_with_those_they_wait_for_and_begun_ones_are_finished_
     assert order.priority == {0: 1, 1: 1, 2: 2, 3: 2, 4: 2, 5: 0}
 
 
+def test_ctrl_c_reaches_the_study_alone_and_its_workers_say_nothing(client, capfd):
+    for pid in client.run(os.getpid).values():
+        os.kill(pid, signal.SIGINT)
+    time.sleep(0.5)
+    assert client.submit(double, 6, pure=False).result(timeout=20) == 12
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_an_address_without_a_scheduler_is_one_line(monkeypatch):
     monkeypatch.setattr("speckle3d.study.schedulers.CONNECT_S", 0.5)
     with (
