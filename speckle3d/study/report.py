@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,9 @@ from speckle3d.study.report_statistics import (
     summary_lines,
 )
 from speckle3d.study.results import copy_lines
+
+_FIGURE = re.compile(r"(?P<stem>.+-[0-9a-f]{8})-(curves|outlines|reslices|patches)\.(png|svg)")
+"""What a sweep's figures are called: its folder's name, which ends in eight digits of its key, first."""
 
 _NOTHING = '<p class="quiet">There is nothing to compare.</p>'
 
@@ -66,7 +70,7 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
 
     The page is one file that needs no network: with scripts its curves, outlines and maps can be turned and
     read off; without, and in print, it shows the same figures as pictures. A sweep that cannot be shown is
-    told with its reason, and does not stop the others.
+    told with its reason, and does not stop the others. Figures of sweeps that are no longer in the study go.
 
     Parameters
     ----------
@@ -127,16 +131,27 @@ def _write(directory: Path, study: Mapping[str, Any], progress: Callable[[int, i
         "configuration": escape(str(study.get("settings_toml", ""))),
         "provenance": _provenance(study),
     }
+    _clear_figures(directory / "figures", {str(entry.get("folder", "")).rpartition("/")[2] for entry in done})
     target = directory / "report.html"
     with atomic_path(target) as part:
         part.write_text(page(parts, figures), encoding="utf-8")
     return target
 
 
+def _clear_figures(folder: Path, stems: Collection[str]) -> None:
+    """Remove figures, by the names given here, of sweeps or settings that are no longer in the study."""
+    for path in folder.glob("*"):
+        found = _FIGURE.fullmatch(path.name)
+        if found and found["stem"] not in stems:
+            path.unlink(missing_ok=True)
+
+
 def _overview(
     directory: Path, scored: Sequence[Mapping[str, Any]], modes: Sequence[str], figures: list[Figure]
 ) -> str:
     if not scored:
+        for path in (directory / "figures").glob("overview.*"):
+            path.unlink()
         return ""
     shown = [mode for mode in modes if any(row["mode"] == mode for row in scored)]
     caption = (

@@ -276,6 +276,18 @@ def test_what_is_no_study_is_refused(tmp_path, content, message):
     assert not (tmp_path / "report.html").exists()
 
 
+def test_figures_of_what_is_no_longer_in_the_study_go_and_others_stay(tmp_path):
+    entry = {"name": "a", "path": "a.h5", "status": "done", "folder": "sweeps/a-0123abcd"}
+    study = {"format": "speckle3d.study", "version": 1, "modes": [], "sweeps": [entry]}
+    (tmp_path / "study.json").write_text(json.dumps(study))
+    (tmp_path / "figures").mkdir()
+    stay = {"a-0123abcd-curves.png", "my-figure.png", "b-curves.png", "a-76543210-curves.txt"}
+    for name in (*stay, "a-76543210-curves.png", "b-0123abcd-reslices.svg", "overview.png"):
+        (tmp_path / "figures" / name).touch()
+    write_report(tmp_path)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == stay
+
+
 def test_a_study_of_broken_sweeps_alone_is_still_a_page(tmp_path):
     study = {
         "format": "speckle3d.study",
