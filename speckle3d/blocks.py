@@ -201,20 +201,24 @@ class _BlockMatcher:
         """
         s = self._settings
         most = s.key_frames + s.far_key_frames
-        recent, keys = range(max(0, first - s.recent), first), [first - 1]
+        recent, keys, sound = range(max(0, first - s.recent), first), [first - 1], None
         self._motion[first - 1] = InPlaneMotion()
         back = range(first - 1, max(-1, first - 1 - max(s.block_frames, s.recent)), -1)
         with closing(self._prefetch(back, first - 1)) as earlier:
             for frame, ready, _ in earlier:
                 then = time.perf_counter()
                 self._ready[frame] = ready
-                if frame < first - 1 and self._lead(keys[-1], frame) < s.key_correlation:
-                    keys.append(frame)
+                if frame < first - 1:
+                    median = self._lead(keys[-1], frame)
+                    if sound is None and median >= s.least_correlation:
+                        sound = keys[-1]
+                    if median < s.key_correlation:
+                        keys.append(frame)
                 self._ready = {k: v for k, v in self._ready.items() if k in keys or k in recent}
                 self._times.add("in-plane motion and correlation", then)
                 if len(keys) >= most and frame <= recent.start:
                     break
-        self._schedule.begin(sorted(keys[:most]))
+        self._schedule.begin(sorted(keys[:most]), first - 1 if sound is None else sound)
 
     def _lead(self, key: int, frame: int) -> float:
         """Match a frame with a key frame after it; its motion is the key frame's if they are not alike."""

@@ -146,17 +146,18 @@ def test_a_frame_repeated_at_a_border_is_still_seen_to_be(sweep, curves):
     assert np.flatnonzero(found.flags & FrameFlag.FROZEN).tolist() == [24]
 
 
-def test_a_block_after_frames_without_speckle_is_matched(sweep, curves):
-    """Frames that resemble nothing before the border: key frames are found past them."""
+@pytest.mark.parametrize("lost", [(22, 23), (20, 21, 22, 23), (9, 10, 11), (23, 24, 25)])
+def test_the_path_goes_on_past_frames_without_speckle(sweep, curves, lost):
+    """Within a block or at its border, at 24. Where the next is 0.6 mm on, speckle itself has little left."""
 
     class Lifted(Reordered):
         def __getitem__(self, index):
             frame = super().__getitem__(index)
-            return 0 * frame if index in (22, 23) else frame
+            return 0 * frame if index in lost else frame
 
     spoilt = replace(reordered(sweep, np.arange(48)), frames=Lifted(sweep.frames, np.arange(48)))
     found = track(spoilt, curves, CONFIG)
-    assert np.flatnonzero(found.flags).tolist() == [22, 23]
+    assert np.flatnonzero(found.flags).tolist() == list(lost)
     centre = sweep.grid.centre_mm
     true = (spoilt.truth[0].inv() * spoilt.truth).apply(centre)[:, 2]
     assert abs(found.image.apply(centre)[-1, 2] - true[-1]) < 0.06 * true[-1]

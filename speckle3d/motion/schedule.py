@@ -58,28 +58,38 @@ class TrajectorySettings(BaseModel):
 
 
 class PairSchedule:
-    """Keeps the frames that the next one is measured against: a few recent ones and a few key frames."""
+    """Keeps the frames that the next one is measured against: a few recent ones and a few key frames.
+
+    Frames that resemble none of theirs, as with the probe lifted, are never key frames, and the last ones
+    before them are kept until one resembles them again.
+    """
 
     def __init__(self, settings: TrajectorySettings | None = None) -> None:
         self.settings = settings or TrajectorySettings()
         self._keys: list[int] = []
+        self._sound: list[int] = []
 
-    def begin(self, keys: list[int]) -> None:
-        """Begin in the middle of a sweep, with the key frames before it, latest last."""
-        self._keys = list(keys)
+    def begin(self, keys: list[int], sound: int) -> None:
+        """Begin in the middle of a sweep, with the key frames before it, latest last, and a sound frame."""
+        self._keys, self._sound = list(keys), [sound]
 
     def references(self, frame: int) -> list[int]:
-        """Earlier frames to measure `frame` against, latest first."""
+        """Earlier frames to measure `frame` against: the last sound one, then latest first."""
         recent = range(max(0, frame - self.settings.recent), frame)
         keys = self._keys if frame % 2 else self._keys[-self.settings.key_frames :]
-        return sorted({*recent, *keys}, reverse=True)
+        latest_first = sorted({*recent, *keys, *self._sound}, reverse=True)
+        return sorted(latest_first, key=lambda earlier: earlier not in self._sound[-1:])
 
     def settle(self, frame: int, correlations: dict[int, float]) -> None:
         """Take note of the median correlations of `frame` with its references."""
+        if correlations and max(correlations.values()) < self.settings.least_correlation:
+            return
+        self._sound = [*self._sound, frame][-self.settings.recent :]
         last = self._keys[-1] if self._keys else None
         if last is None or correlations.get(last, 0.0) < self.settings.key_correlation:
             self._keys = [*self._keys, frame][-(self.settings.key_frames + self.settings.far_key_frames) :]
 
     def needed(self, frame: int) -> set[int]:
         """Frames up to `frame` that later ones may be measured against."""
-        return {*range(max(0, frame - self.settings.recent + 1), frame + 1), *self._keys}
+        recent = range(max(0, frame - self.settings.recent + 1), frame + 1)
+        return {*recent, *self._keys, *self._sound}
