@@ -120,6 +120,8 @@ def delay_from_lines(
     best = int(np.argmin(misfit))
     returns = _returns(wanted, frame_time_s[there])
     _require_clear(tried, misfit, best, returns)
+    motion = _motion(readings, frame_time_s[there] - tried[best])
+    _require_varied(wanted - wanted.mean(), motion, float(misfit[best]))
     near = minimize_scalar(
         misfit_at, bounds=(tried[best - 1], tried[best + 1]), method="bounded", options={"xatol": 1e-5}
     )
@@ -160,6 +162,18 @@ def _misfit(
 def _residuals(wanted: FloatArray, motion: FloatArray) -> FloatArray:
     found = np.linalg.lstsq(motion, wanted, rcond=1e-9)[0]
     return np.asarray(wanted - motion @ found)
+
+
+def _require_varied(wanted: FloatArray, motion: FloatArray, least_misfit: float) -> None:
+    """Refuse a line that says so little that any slow motion would explain as much of it, at some delay."""
+    # The delay is fitted too.
+    count, fitted = len(wanted) / _likeness(wanted), int(np.linalg.matrix_rank(motion, rtol=1e-9)) + 1
+    by_any = (count - 1.0) / (count - fitted) if count > fitted else float("inf")
+    if not least_misfit * by_any <= 1.0 - LEAST_FOLLOWED:
+        raise InsufficientDataError(
+            f"expected a line whose motion tells much more than the {fitted} numbers fitted to it, got one "
+            f"that turns so seldom that it tells {count:.1f}: record for longer, and {_IRREGULARLY}"
+        )
 
 
 def _returns(wanted: FloatArray, times_s: FloatArray) -> bool:

@@ -99,6 +99,15 @@ def test_an_error_that_is_no_better_than_the_range_is_refused(monkeypatch):
             delay_from_lines(signal, frames, poses)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_short_slow_motion_that_anything_explains_is_refused(seed):
+    _, frames, poses, _ = recorded(seed, noise_mm=0.01, jitter_mm=0.01)
+    other, _, _, _ = recorded(seed + 50, noise_mm=0.01)
+    few = frames < 1.2
+    with pytest.raises(InsufficientDataError, match=r"tells much more|follows the sensor|one delay"):
+        delay_from_lines(other[few], frames[few], poses)
+
+
 def test_rounding_is_not_taken_for_motion():
     signal, frames, poses, _ = recorded(0)
     # A mean of many equal numbers is not quite that number.

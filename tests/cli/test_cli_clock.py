@@ -135,6 +135,11 @@ def test_what_a_header_lacks_is_named_by_options_that_there_are(refused, tmp_pat
         assert "_hz" not in line
 
 
+def test_tissue_is_not_taken_for_a_plane(refused, back):
+    # In 43 frames something like a line is seen; it once followed the sensor by 98 %, 95 ms off.
+    assert "tells much more than the 8 numbers fitted to it" in refused("calibrate", "clock", back)
+
+
 def test_help_says_how_the_sign_relates_to_that_of_plus(run):
     _, text, _ = run("calibrate", "clock", "--help")
     assert "LocalTimeOffsetSec" in text
