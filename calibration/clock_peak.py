@@ -62,7 +62,8 @@ def clear_peak(tried_s: FloatArray, curves: FloatArray, misfit: FloatArray, sear
     Raises
     ------
     InsufficientDataError
-        If it lies at the range's end, images hardly correlate there, it has a rival, or is not that of most images.
+        If it lies at the range's end, images hardly correlate there, it has a rival, or most images have
+        another.
     """
     best = int(np.argmin(misfit))
     beside = tried_s[max(best - 1, 0) : best + 2]
@@ -74,7 +75,7 @@ def clear_peak(tried_s: FloatArray, curves: FloatArray, misfit: FloatArray, sear
         )
     if 1.0 - misfit[best] < LEAST_CORRELATION:
         raise InsufficientDataError(
-            f"expected images of the two ways that correlate by at least {LEAST_CORRELATION:g} at some delay, "
+            f"expected images of the two ways that correlate by {LEAST_CORRELATION:g} or more at some delay, "
             f"got {1.0 - misfit[best]:.2f} at best: {doubts(search_s)}"
         )
     require_peak(tried_s, misfit, best, f"the motion repeats itself, or {doubts(search_s)}")
