@@ -122,7 +122,8 @@ class DecorrelationCurves:
 
 def _differing(a: CurveKey, b: CurveKey) -> Iterable[tuple[str, object, object]]:
     if type(a.signal) is not type(b.signal):
-        yield "signal", type(a.signal).__name__, type(b.signal).__name__
+        mine, theirs = ("RF" if isinstance(each.signal, RFSettings) else "B-mode" for each in (a, b))
+        yield "signal", mine, theirs
         return
     if a.correlation_of != b.correlation_of:
         yield "correlation_of", a.correlation_of, b.correlation_of

@@ -20,6 +20,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.study.job import REFERENCES, SUBSET
 from speckle3d.study.lock import only_run
+from speckle3d.study.naming import named
 from speckle3d.study.results import Study, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
 from speckle3d.study.sweepjob import (
@@ -125,7 +126,7 @@ def compare_sweeps(
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
     plan = [
         plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
-        for name, path in _named(paths)
+        for name, path in named(paths)
     ]
     jobs = [each for each in plan if isinstance(each, SweepJob)]
     outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
@@ -200,16 +201,6 @@ def _require_known(modes: tuple[str, ...] | None, reference: str | None) -> None
             raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
     if reference is not None and reference not in REFERENCES:
         raise InvalidInputError(f"expected a reference among {', '.join(REFERENCES)}; got {reference!r}")
-
-
-def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Each path once, by its stem, or with its folder or a number where that is taken."""
-    named: dict[str, Path] = {}
-    for path in dict.fromkeys(each.resolve() for each in paths):
-        names = [path.stem, f"{path.parent.name}-{path.stem}"]
-        names += [f"{path.stem}-{number}" for number in range(2, len(paths) + 2)]
-        named[next(name for name in names if name not in named)] = path
-    return list(named.items())
 
 
 def _clear(jobs: Sequence[SweepJob]) -> None:

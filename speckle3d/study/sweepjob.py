@@ -24,7 +24,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import one_line, sha256_of
-from speckle3d.io.load import companion_files, load_landmarks, load_sweep
+from speckle3d.io.load import companion_files, load_landmarks, load_sweep, sniff
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.pipeline import match_ahead
 from speckle3d.study.blockfiles import BlockFiles
@@ -117,6 +117,7 @@ def plan_sweep(
     path = path.resolve()
     found = (curves or path.parent / "curves.h5").resolve()
     try:
+        sniff(path)  # names a file that is not there
         stamp = _stamp(path)
         frames, sha256 = len(load_sweep(path)), sha256_of(path)
         used = [sha256_of(each) for each in (found, *calibrations, *companion_files(path))]
@@ -275,4 +276,6 @@ def lost(job: SweepJob, reason: str) -> SweepOutcome:
 
 def _reason(error: Exception) -> str:
     words = " ".join(one_line(error).split())
+    if isinstance(error, OSError) and error.filename and not isinstance(error, Speckle3DError):
+        words = f"{error.filename}: {words}"
     return words if isinstance(error, Speckle3DError) else f"{type(error).__name__}: {words}"

@@ -189,7 +189,16 @@ def test_sweeps_of_one_name_are_told_apart_and_one_given_twice_is_one(sweeps, tm
     twin = tmp_path / "other" / "broken.h5"
     twin.write_bytes(b"nothing")
     found = compare_sweeps([sweeps[1], twin, sweeps[1], sweeps[0]], tmp_path, ["pose"])
-    assert [each.name for each in found.outcomes] == ["broken", "other-broken", "s5"]
+    first = f"{sweeps[1].parent.name}-broken"
+    assert [each.name for each in found.outcomes] == [first, "other-broken", "s5"]
+
+
+def test_a_sweep_that_is_not_there_is_named_as_it_was_given(sweeps, tmp_path):
+    (tmp_path / "dangling.h5").symlink_to(tmp_path / "gone.h5")
+    found = compare_sweeps([tmp_path / "missing.h5", tmp_path / "dangling.h5", sweeps[0]], tmp_path, ["pose"])
+    reasons = {each.name: each.reason for each in found.outcomes if each.status == "failed"}
+    assert reasons["missing"] == f"{tmp_path / 'missing.h5'}: expected a file, got none"
+    assert reasons["dangling"].startswith(str(tmp_path / "gone.h5"))
 
 
 def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):

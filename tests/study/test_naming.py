@@ -1,0 +1,35 @@
+import itertools
+from pathlib import Path
+
+from speckle3d.study.naming import named
+
+
+def names_of(folder, *files):
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    return {str(path.relative_to(folder)): name for name, path in named([folder / each for each in files])}
+
+
+def test_sweeps_of_one_name_have_the_shortest_folders_that_tell_them_apart_in_any_order(tmp_path):
+    files = ("x/1/s.h5", "y/1/s.h5", "x/2/s.h5", "x/2/t.h5")
+    expected = {"x/1/s.h5": "x-1-s", "y/1/s.h5": "y-1-s", "x/2/s.h5": "2-s", "x/2/t.h5": "t"}
+    for order in itertools.permutations(files):
+        assert names_of(tmp_path, *order) == expected
+
+
+def test_names_that_meet_on_the_way_are_told_apart_too(tmp_path):
+    found = names_of(tmp_path, "a/b.h5", "c/b.h5", "a-b.h5", "d/e.h5", "d/e.mha")
+    assert len(set(found.values())) == 5
+    assert (found["c/b.h5"], found["d/e.h5"], found["d/e.mha"]) == ("c-b", "e-h5", "e-mha")
+    joined = names_of(tmp_path, "k/l-m/n.h5", "k-l/m/n.h5", "k/l/m-n.h5")
+    assert len(set(joined.values())) == 3
+
+
+def test_one_file_given_twice_is_one_and_a_link_has_its_own_name(tmp_path):
+    (tmp_path / "s.h5").touch()
+    (tmp_path / "again.h5").symlink_to(tmp_path / "s.h5")
+    (tmp_path / "dangling.h5").symlink_to(tmp_path / "gone.h5")
+    paths = [tmp_path / name for name in ("s.h5", "again.h5", "dangling.h5")]
+    assert named([*paths, paths[0]]) == [("s", paths[0]), ("dangling", paths[2])]
+    assert named([Path("s.h5")])[0][0] == "s"
