@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,12 @@ MODE_LABELS = {
 
 _MODE_STYLES = {"image": "-", "orientation": "--", "pose": "-.", "crossed": (0, (1, 1))}
 """A second cue beside colour: corrected curves often lie on each other."""
+
+_LETTER_IN = 0.085
+"""Width of a letter of medium size."""
+
+_FEWEST_LETTERS = 12
+"""In a line: the longest word."""
 
 
 def figure_drift(
@@ -133,11 +140,17 @@ def figure_reslice(
     for panel, (mode, image) in zip(panels, images_db.items(), strict=True):
         panel.imshow(image, cmap=greys, vmin=brightest - dynamic_range_db, vmax=brightest, aspect="equal",
                      extent=extents_mm[mode], interpolation="nearest")  # fmt: skip
-        panel.set_title(MODE_LABELS.get(mode, mode), fontsize="medium", color=MODE_COLOURS.get(mode, "black"))
+        title = wrapped(MODE_LABELS.get(mode, mode), figure.get_figwidth() / len(images_db))
+        panel.set_title(title, fontsize="medium", color=MODE_COLOURS.get(mode, "black"))
         panel.set_xlabel(axis_labels[0])
     panels[0].set_ylabel(axis_labels[1])
     figure.suptitle(title)
     return figure
+
+
+def wrapped(title: str, width_in: float) -> str:
+    """Title in lines that fit above a panel, and do not run into its neighbour's."""
+    return textwrap.fill(title, max(_FEWEST_LETTERS, int(width_in / _LETTER_IN)), break_on_hyphens=False)
 
 
 def save_figure(figure: Figure, path: Path) -> Path:

@@ -115,7 +115,7 @@ def _write(directory: Path, study: Mapping[str, Any], progress: Callable[[int, i
         if progress:
             progress(i + 1, len(done))
     parts = {
-        "title": f"Drift-correction modes compared on {counted(len(done) or len(broken), 'sweep')}",
+        "title": f"Drift-correction modes compared on {counted(len(done) - len(copies) or len(broken), 'sweep')}",
         "lead": paragraphs(
             summary_lines(found, len(done), len(broken), study.get("paired") or [], references)
             + [f"{line}." for line in copy_lines(copies)]

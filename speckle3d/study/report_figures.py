@@ -16,12 +16,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.study.figures import DOTS_PER_INCH, MODE_COLOURS, MODE_LABELS
+from speckle3d.study.figures import DOTS_PER_INCH, MODE_COLOURS, MODE_LABELS, wrapped
 from speckle3d.study.job import REFERENCES
 from speckle3d.study.overall import mean_over_sweeps
 from speckle3d.study.report_data import RejectedPatches, SweepCurves
@@ -124,7 +125,7 @@ def figure_curves(curves: SweepCurves) -> Figure:
 def figure_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid, reference: str) -> Figure:
     """Draw the frames' outlines of every mode in space, the reference's in grey behind each."""
     shown = [mode for mode in poses if mode != reference] or list(poses)
-    figure = _figure(3.1 * len(shown), 3.1)
+    figure = _figure(3.1 * len(shown), 3.5)
     lines = {mode: outline(each, grid) for mode, each in poses.items()}
     everything = np.concatenate(list(lines.values()))
     low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
@@ -133,9 +134,11 @@ def figure_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid, refere
         if reference in lines:
             _outline(axes, lines[reference], color="0.55", linewidth=0.8)
         _outline(axes, lines[mode], color=colour_of(mode, shown), linewidth=0.9)
-        axes.set(xlabel="elevational / mm", ylabel="lateral / mm", zlabel="depth / mm")
-        axes.set_title(label_of(mode).replace(", ", ",\n"), fontsize="medium", color=colour_of(mode, shown))
-        axes.set_box_aspect(np.maximum(high - low, 0.15 * (high - low).max())[[2, 0, 1]], zoom=0.72)
+        for axis, name in ((axes.xaxis, "elevational"), (axes.yaxis, "lateral"), (axes.zaxis, "depth")):
+            axis.set_label_text(f"{name} / mm", fontsize="small")
+            axis.set_major_locator(MaxNLocator(4))
+        axes.set_title(wrapped(label_of(mode), 3.1), fontsize="medium", color=colour_of(mode, shown), y=0.95)
+        axes.set_box_aspect(np.maximum(high - low, 0.15 * (high - low).max())[[2, 0, 1]], zoom=0.62)
         axes.tick_params(labelsize=6)
         axes.invert_zaxis()
         axes.view_init(elev=22, azim=-62)
@@ -154,9 +157,8 @@ def figure_cuts(cuts: Cuts) -> Figure:
                              height_ratios=[scale * tall, below])  # fmt: skip
     for i, (mode, cut) in enumerate(cuts.by_mode.items()):
         _draw_cut(panels[0, i], panels[1, i], cut)
-        panels[0, i].set_title(
-            label_of(mode).replace(", ", ",\n"), fontsize="medium", color=colour_of(mode, modes)
-        )
+        title = wrapped(label_of(mode), cut.extent_mm[0] * scale + 0.4)
+        panels[0, i].set_title(title, fontsize="medium", color=colour_of(mode, modes))
         panels[0, i].set_anchor("N")
     panels[0, 0].set_ylabel("depth from the top / mm")
     panels[1, 0].set_ylabel("enlarged")

@@ -195,7 +195,7 @@ def _length_line(scored: Scored, best: str) -> str:
         if row["mode"] != best and row["length_percent"] is not None
     ]
     against = f", against {', '.join(others)}" if others else ""
-    which = " that have every mode" if scored.left_out else ""
+    which = f" that {'has' if mine['sweeps'] == 1 else 'have'} every mode" if scored.left_out else ""
     return (
         f"Over {counted(mine['sweeps'], 'sweep')}{which} ({counted(scored.parts, 'part')}), {label_of(best)} "
         f"has the smallest error of length: {mine['length_percent']:.1f} % on average over sweeps "

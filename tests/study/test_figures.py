@@ -6,7 +6,7 @@ import pytest
 from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
-from speckle3d.study.figures import MODE_COLOURS, figure_drift, figure_reslice, save_figure
+from speckle3d.study.figures import MODE_COLOURS, figure_drift, figure_reslice, save_figure, wrapped
 from speckle3d.study.metrics import accumulated
 
 
@@ -117,3 +117,12 @@ def test_a_png_of_150_dots_per_inch_appears_whole(sweep, tmp_path):
 def test_neither_pyplot_nor_a_window_system_is_touched():
     code = "import sys, speckle3d.study.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_titles_are_wrapped_to_narrow_panels():
+    assert wrapped("image-based, consistent subset", 1.0).splitlines() == [
+        "image-based,",
+        "consistent",
+        "subset",
+    ]
+    assert wrapped("image-based, consistent subset", 3.0) == "image-based, consistent subset"

@@ -208,7 +208,7 @@ def test_modes_of_different_sweeps_are_ranked_on_those_that_have_all():
     found = scored_means(rows, ["image", "pose"])
     assert [row["length_percent"] for row in found.means] == [2.0, 3.0]
     line = summary_lines(found, 2, 0)[0]
-    assert line.startswith("Over 1 sweep that have every mode (1 part), image-based has the smallest error")
+    assert line.startswith("Over 1 sweep that has every mode (1 part), image-based has the smallest error")
     apart = scored_means(part_rows(a_image=[2.0], b_pose=[3.0]), ["image", "pose"])
     assert not apart.together
     assert summary_lines(apart, 2, 0)[0].startswith("No sweep was reconstructed in every mode")
