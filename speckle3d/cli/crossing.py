@@ -13,7 +13,7 @@ import typer
 
 from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
 from speckle3d.cli.phantoms import Out, PixelMm, require_free
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
@@ -102,7 +102,7 @@ def calibrate_images(
     found = _solve(given.sweeps, given.start, settings)
     delay = None
     if given.clock is not None:
-        delay = _clock(given.clock, found.result.sensor_from_image)
+        delay = _clock(clock, given.clock, found.result.sensor_from_image)
         note(f"sensor clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s; solving again")
         sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
         given = replace(given, sweeps=(sweeps[0], sweeps[1]))
@@ -131,9 +131,11 @@ def _open(
     start_mm: tuple[float, float, float] | None,
     start_deg: tuple[float, float, float] | None,
 ) -> _Inputs:
-    from speckle3d.cli.recordings import open_tracked
+    from speckle3d.cli.recordings import open_tracked, require_unsized
     from speckle3d.io.calibrations import read_calibration
 
+    for path in (first, second):
+        require_unsized(path, pixel_mm)
     known = None if start is None else read_calibration(start)
     if time_offset_s is None and known is not None:
         time_offset_s = known.time_offset_s
@@ -194,10 +196,10 @@ def _solve(
         )
 
 
-def _clock(tracked: TrackedImages, mounting: RigidTransform) -> Delay:
+def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> Delay:
     from calibration.clock_images import delay_from_images
 
-    with progress_bar("trying delays") as progress:
+    with progress_bar("trying delays") as progress, naming(str(path)):
         return delay_from_images(tracked, mounting, progress=progress)
 
 
