@@ -114,8 +114,9 @@ def _write(directory: Path, study: Mapping[str, Any], progress: Callable[[int, i
         sections.append(_section(directory, entry, f"sweep-{i + 1}", figures))
         if progress:
             progress(i + 1, len(done))
+    shown = counted(len(done) - len(copies) or len(broken), "sweep")
     parts = {
-        "title": f"Drift-correction modes compared on {counted(len(done) - len(copies) or len(broken), 'sweep')}",
+        "title": f"Drift-correction modes compared on {shown}",
         "lead": paragraphs(
             summary_lines(found, len(done), len(broken), study.get("paired") or [], references)
             + [f"{line}." for line in copy_lines(copies)]
