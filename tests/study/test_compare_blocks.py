@@ -109,7 +109,7 @@ def test_blocks_in_process_give_the_bits_of_one_stream_and_leave_nothing(path, s
     assert results(only_folder(found.directory)) == streamed
     assert where.runs() == dict.fromkeys([*BLOCKS, "long"], 1)
     assert sorted(each.name for each in found.directory.iterdir()) == [
-        "study.json", "sweeps", "table.csv", "table.txt",
+        ".lock", "study.json", "sweeps", "table.csv", "table.txt",
     ]  # fmt: skip
     assert [blocks for blocks, _, _ in seen] == [3, 2, 1, 0, 0]
     assert [done for _, done, _ in seen] == [0, 0, 0, 0, 1]
