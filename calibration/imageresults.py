@@ -16,6 +16,7 @@ from calibration.images import (
     Crossing,
     ImageCalibration,
     ImageSettings,
+    Improvement,
     Progress,
     TrackedImages,
     calibrate_crossing,
@@ -87,8 +88,8 @@ def notes_of(found: Found, angulation: Angulation) -> list[str]:
     used, held = result.similarity, result.held_out
     kept = sum(map(len, result.frames_held_out))
     return [
-        f"correlation of images with the other sweep: {used.before:.3f} before, {used.after:.3f} after",
-        f"of {kept} frames kept out of it for this check: {held.before:.3f} before, {held.after:.3f} after",
+        f"correlation of images with the other sweep: {_told(used)}",
+        f"of {kept} frames kept out of it for this check: {_told(held)}",
         f"image centre known to {centre[0]:.2f}, {centre[1]:.2f} and {centre[2]:.2f} mm across, along the "
         "beam and out of plane",
         f"sweeps at {angulation.crossing_deg:.0f} degrees, fans of {angulation.fan_deg[0]:.0f} and "
@@ -97,6 +98,11 @@ def notes_of(found: Found, angulation: Angulation) -> list[str]:
         "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
         f"{result.evaluations} comparisons by {result.method}",
     ]
+
+
+def _told(gained: Improvement) -> str:
+    before = f"{gained.before:.3f}" if np.isfinite(gained.before) else "no overlap"
+    return f"{before} before, {gained.after:.3f} after"
 
 
 def figure_of(found: Found, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]) -> Figure:
@@ -138,16 +144,16 @@ def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
 
 
 def _verdict(result: ImageCalibration, angulation: Angulation) -> str:
-    if not result.converged:
-        return "did not converge: a better start or sweeps with more structure are needed"
-    gain = result.held_out.after - np.nan_to_num(result.held_out.before)
-    if gain < -_WORSE:
-        return "doubtful: frames that were not used are less alike than at the start"
     if result.scale_errors.max() > WEAK_SCALE:
         lateral, axial = 100.0 * result.scale_errors
         return (
             f"weak: the pixel sizes are known to {lateral:.0f} and {axial:.0f} %: do without estimating them"
         )
+    if not result.converged:
+        return "did not converge: a better start or sweeps with more structure are needed"
+    gain = result.held_out.after - np.nan_to_num(result.held_out.before)
+    if gain < -_WORSE:
+        return "doubtful: frames that were not used are less alike than at the start"
     if result.alike < SPECKLED_SIMILARITY:
         return (
             f"doubtful: the sweeps are little alike (correlation {result.alike:.2f}), which may displace the "
