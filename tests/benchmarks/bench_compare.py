@@ -1,6 +1,6 @@
 """What worker processes gain a study: two against one, and two of which one is killed.
 
-Run: ``python tests/benchmarks/bench_compare.py [SWEEPS] [FRAMES]`` (16 and 60; minutes; sweeps are cached);
+Run: ``python tests/benchmarks/bench_compare.py [SWEEPS] [FRAMES]`` (16 and 150; minutes; sweeps are cached);
 ``... --long [REPEATS]`` (10) for one long sweep in blocks: full frames, sixty repeated, which at every
 repetition have nothing in common with those before, so that the sweep seems to go on.
 
@@ -80,7 +80,7 @@ def long_study(repeats=10, folder=None):
     return [path], source, Config.model_validate({"trajectory": {"block_frames": -(-count // BLOCKS)}})
 
 
-def short_study(sweeps=16, frames=60):
+def short_study(sweeps=16, frames=150):
     """Many small sweeps."""
     paths = [
         simulated(
