@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines, require_free
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError, naming
+from speckle3d.cli.outputs import require_free
+from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
     from calibration.clock import Delay
@@ -60,7 +61,7 @@ def calibrate_clock(
     if by is By.line and calibration is not None and out is None:
         raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     if out is not None:
-        _require_free(out, images, poses, calibration)
+        require_free(out, images, poses, calibration)
     known = None if calibration is None else read_calibration(calibration)
     if known is not None and known.sensor != sensor:
         raise MismatchError(
@@ -88,21 +89,6 @@ def calibrate_clock(
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)
-
-
-def _require_free(out: Path, *inputs: Path | None) -> None:
-    """Refuse an output that would take the place of an input, or of anything but a calibration."""
-    from speckle3d.io.calibrations import FORMAT
-    from speckle3d.io.hdf5 import opened
-
-    require_free(out, *inputs)
-    if not out.exists():
-        return
-    try:
-        with opened(out, FORMAT):
-            return
-    except (FileError, InvalidInputError):
-        raise InvalidInputError(f"{out}: is there and is not a calibration: give -o another name") from None
 
 
 def _by_line(

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.phantoms import Out, PixelMm, require_free
+from speckle3d.cli.outputs import require_free
+from speckle3d.cli.phantoms import Out, PixelMm
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
+from speckle3d.cli.outputs import require_free
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -51,10 +52,6 @@ Place = Annotated[str | None, typer.Option(help="Lines: where on an echo: front,
 Validation = Annotated[
     Path | None, typer.Option(help="Another recording of the phantom, on which the calibration is checked.")
 ]
-
-
-_BESIDE = (".txt", ".png", ".csv")
-"""What lies beside a calibration file: its table, its pictures, and the dots it was made from."""
 
 
 class Stages(StrEnum):
@@ -222,21 +219,6 @@ def calibrate_wires(
         other_seen = _seen_wires(other, phantom, config, validation_points, region, validation)
         notes += _validated(outcome, other, other_seen, validation)
     _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
-
-
-def require_free(out: Path, *inputs: Path | None) -> None:
-    """Refuse an output that cannot be written, or that would take the place of its report or of an input."""
-    from speckle3d.io.hdf5 import require_target
-
-    target = require_target(out)
-    if target.suffix in _BESIDE:
-        raise InvalidInputError(
-            f"{out}: expected a calibration file, not {', '.join(_BESIDE)}, which are written beside it"
-        )
-    written = {target, *(target.with_suffix(suffix) for suffix in _BESIDE)}
-    for path in inputs:
-        if path is not None and path.resolve() in written:
-            raise InvalidInputError(f"{path}: would be overwritten by the results: give -o another name")
 
 
 def _three_wires() -> Any:

@@ -61,7 +61,7 @@ def test_no_input_and_nothing_but_a_calibration_is_overwritten(run, refused, bac
     assert "would be overwritten" in refused(*clock, "-o", held)
     assert "would be overwritten" in refused(*clock, "--poses", curves, "-o", curves)
     for path in (other, curves):
-        assert "is there and is not a calibration" in refused(*clock, "-o", path)
+        assert "expected a new name or a calibration to replace" in refused(*clock, "-o", path)
     assert {path: path.read_bytes() for path in before} == before
     again = tmp_path / "again.h5"
     write_calibration(again, read_calibration(held))

@@ -161,7 +161,7 @@ def test_an_orientation_sensor_is_validated_on_another_recording(run, scans, tmp
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("in.h5", "in.h5: would be overwritten by the results"),
+        ("in.h5", "in.h5: is an input and would be overwritten"),
         ("probe.txt", "expected a calibration file, not .txt, .png, .csv"),
         ("none/probe.h5", "expected an existing folder"),
         (".", "got a folder or device"),
