@@ -55,7 +55,7 @@ def test_a_cluster_without_workers_does_not_hold_a_study_for_ever(monkeypatch):
 
 
 def test_a_killed_worker_costs_only_the_job_it_was_at(client, tmp_path):
-    client.wait_for_workers(2, timeout=30)
+    client.wait_for_workers(2, timeout=120)
     for number in (0, 1):
         (tmp_path / f"{number}.go").touch()
     results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost)
@@ -94,11 +94,12 @@ def test_jobs_are_given_up_with_those_they_wait_for_and_begun_ones_are_finished_
     assert order.priority == {0: 1, 1: 1, 2: 2, 3: 2, 4: 2, 5: 0}
 
 
-def test_ctrl_c_reaches_the_study_alone_and_its_workers_say_nothing(client, capfd):
-    for pid in client.run(os.getpid).values():
-        os.kill(pid, signal.SIGINT)
-    time.sleep(0.5)
-    assert client.submit(double, 6, pure=False).result(timeout=20) == 12
+def test_ctrl_c_reaches_the_study_alone_and_its_workers_say_nothing(capfd):
+    with local_cluster(1) as client:
+        for pid in client.run(os.getpid).values():
+            os.kill(pid, signal.SIGINT)
+        time.sleep(0.5)
+        assert client.submit(double, 6, pure=False).result(timeout=60) == 12
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -114,7 +115,7 @@ def test_an_address_without_a_scheduler_is_one_line(monkeypatch):
 def test_an_existing_cluster_is_used_and_left_running(client):
     with scheduler_for(client.scheduler.address, None) as there:
         assert dict(there.run(double, [4], lost)) == {0: 8}
-    assert client.submit(double, 5).result(timeout=20) == 10
+    assert client.submit(double, 5).result(timeout=60) == 10
 
 
 @pytest.mark.parametrize(("address", "workers"), [("tcp://a:1", 2), (None, 0)])
