@@ -8,7 +8,7 @@ from crossing_scenes import crossing_sweeps, displaced
 
 from calibration.crossing import Level, prepare
 from calibration.imagecurvature import APART_MM, curvature, settle
-from calibration.imagefit import LEVERS_MM, Estimate, refine
+from calibration.imagefit import LEVERS_MM, SETTLED, Estimate, refine
 
 FREE = tuple(range(6))
 
@@ -44,7 +44,7 @@ def alike_at(refined, step):
 def test_gauss_newtons_matrix_is_stiffer(refined):
     normal, _ = refined.system
     part = np.linalg.eigvals(np.linalg.solve(normal, curvature(refined))).real
-    # Speckle's slopes are in the one and not in the other.
+    # Speckle's slopes are in the one and not in the other: 0.1 to 0.7 in nine scenes.
     assert (part > 0).all()
     assert (part < 0.9).all()
 
@@ -54,5 +54,7 @@ def test_what_is_settled_cannot_be_bettered(refined):
     assert settled.converged
     base = np.diag(LEVERS_MM[:6])
     left = np.linalg.solve(curvature(settled), settled.system[1])
-    assert np.abs(base @ left).max() < 0.02
+    # Ten times where steps stop: the curvature here is not quite that of where the steps began.
+    assert np.abs(base @ left).max() < 10.0 * SETTLED
+    # What is raised is a weighted mean; the plain one may lose a little by it.
     assert settled.likeness.mean >= refined.likeness.mean - 1e-3
