@@ -11,9 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import ImagePoints, IntArray, as_directions
-from calibration.lines import EchoLines, LineSettings, detect_lines
+from calibration.clock.pairing import Offset, covered, estimate_offset
+from calibration.detection.lines import EchoLines, LineSettings, detect_lines
 from calibration.orientation import Viewed, calibrate_orientation
-from calibration.pairing import Offset, covered, estimate_offset
 from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
 from calibration.report import Shot
 from calibration.results import as_calibration

@@ -22,8 +22,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import Chain, ImagePoints, IntArray
-from calibration.dots import Dots
-from calibration.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
+from calibration.detection.dots import Dots
+from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
 from calibration.wirefit import rigid_fits
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray

@@ -17,7 +17,6 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.adequacy import judge, require_adequate
 from calibration.chain import (
     CHAIN,
     PROBE,
@@ -31,8 +30,9 @@ from calibration.chain import (
     as_directions,
     residuals_and_jacobian,
 )
+from calibration.identifiability import judge, require_adequate
 from calibration.solution import Solution
-from calibration.stages import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
+from calibration.starts import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.leastsquares import Fit, clustered_covariance, correlated_lags, levenberg_marquardt

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.adequacy import judge
 from calibration.chain import CHAIN, SCALES, residuals_and_jacobian
+from calibration.identifiability import judge
 from calibration.solution import Solution
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.core.leastsquares import clustered_covariance, correlated_lags

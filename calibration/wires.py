@@ -15,11 +15,11 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.adequacy import require_adequate
 from calibration.chain import PROBE, SCALES, TARGET, Chain, ImagePoints, Phantom, Seen
+from calibration.identifiability import require_adequate
 from calibration.plane import OUTLIER_SIGMA, solve, some
 from calibration.solution import Solution
-from calibration.stages import least_absolute, rotations_all_over
+from calibration.starts import least_absolute, rotations_all_over
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import FloatArray, rotation_from_axes
 from speckle3d.core.wires import WirePhantom

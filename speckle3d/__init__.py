@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.io.volumes import read_volume, write_volume
+    from speckle3d.motion.estimate import Tracked
     from speckle3d.pipeline import calibrate_curves, correct, track
+    from speckle3d.scoring.lengths import ModeError, compare_modes
     from speckle3d.simulation.presets import SimulationSettings, simulate
-    from speckle3d.solution import Tracked
     from speckle3d.study.images import grey_images
     from speckle3d.study.job import JobResult, run_job
-    from speckle3d.study.metrics import ModeError, compare_modes
 
     __version__: str
 
@@ -38,15 +38,15 @@ _HOME = {
     "Config": "config",
     "DecorrelationCurves": "core.curves",
     "JobResult": "study.job",
-    "ModeError": "study.metrics",
+    "ModeError": "scoring.lengths",
     "Reconstruction": "core.reconstruction",
     "SimulationSettings": "simulation.presets",
     "Speckle3DError": "core.errors",
     "Sweep": "core.sweep",
-    "Tracked": "solution",
+    "Tracked": "motion.estimate",
     "calibrate_curves": "pipeline",
     "calibrated": "core.calibration",
-    "compare_modes": "study.metrics",
+    "compare_modes": "scoring.lengths",
     "compound": "imaging.volume",
     "correct": "pipeline",
     "grey_images": "study.images",

@@ -13,15 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.correction.curves import Curves
 from speckle3d.correction.drift import DriftSettings
+from speckle3d.matching.inplane import InPlaneSettings
+from speckle3d.matching.intensity import IntensitySettings
+from speckle3d.matching.matcher import MatchingSettings
+from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.quality import QualitySettings
+from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
-from speckle3d.motion.inplane import InPlaneSettings
-from speckle3d.motion.intensity import IntensitySettings
-from speckle3d.motion.matching import MatchingSettings
-from speckle3d.motion.patches import PatchSettings
 from speckle3d.motion.planes import PlaneSettings
-from speckle3d.motion.quality import QualitySettings
-from speckle3d.motion.schedule import TrajectorySettings
 
 
 class SensorSettings(BaseModel):

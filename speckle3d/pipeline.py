@@ -10,7 +10,12 @@ from collections.abc import Callable, Iterator, Sequence
 
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.blocks import (
+from speckle3d.config import Config
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.sweep import Sweep
+from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.matching.blocks import (
     Block,
     ImageSink,
     MatchedBlock,
@@ -19,18 +24,13 @@ from speckle3d.blocks import (
     blocks_of,
     match_block,
 )
-from speckle3d.config import Config
-from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
-from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
-from speckle3d.direction import orientation_at, orientation_sensor
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.motion.decorrelation import fit_curves
+from speckle3d.motion.direction import orientation_at, orientation_sensor
 from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.matching import FrameMatcher
+from speckle3d.motion.estimate import PairSink, Solution, Tracked
+from speckle3d.motion.path import Walk
 from speckle3d.motion.phantom import phantom_samples
-from speckle3d.solution import PairSink, Solution, Tracked
-from speckle3d.walk import Walk
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""

@@ -3,11 +3,11 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xsens.framing import Message, encode
-from xsens.messages import Configuration, MessageId, UnitConfiguration
-from xsens.mtdata import DataLayout, OutputMode
-from xsens.mtdata2 import Item, encode_items
-from xsens.rawcounts import RawCalibration
+from xsens.messages.catalogue import Configuration, MessageId, UnitConfiguration
+from xsens.messages.framing import Message, encode
+from xsens.messages.mtdata import DataLayout, OutputMode
+from xsens.messages.mtdata2 import Item, encode_items
+from xsens.messages.rawcounts import RawCalibration
 
 G = 9.80665
 

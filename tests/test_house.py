@@ -8,8 +8,8 @@ import pytest
 from imu_logs import samples
 
 import speckle3d
-from xsens.logs import write_csv
-from xsens.samples import ImuLog
+from xsens.logs.read import write_csv
+from xsens.logs.samples import ImuLog
 
 HEAVY = ("numba", "llvmlite", "h5py", "numpy", "scipy", "SimpleITK", "matplotlib", "pydantic")
 
@@ -34,7 +34,10 @@ def test_the_errors_load_nothing_heavy_and_the_core_only_numpy_and_scipy(python)
 
 
 def test_every_module_of_the_sensor_package_stays_clear_of_numba_and_h5py(python, project):
-    names = [f"xsens.{path.stem}" for path in (project / "xsens").glob("[a-z]*.py")]
+    names = [
+        ".".join(path.relative_to(project).with_suffix("").parts)
+        for path in (project / "xsens").rglob("[a-z]*.py")
+    ]
     code = "\n".join(f"import {name}" for name in ["xsens", *names])
     assert loaded_after(python, code, ("numba", "h5py")) == []
 

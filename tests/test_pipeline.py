@@ -12,13 +12,13 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
-from speckle3d.direction import settle_direction, smooth_rotations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
-from speckle3d.motion.matching import FrameMatcher
-from speckle3d.motion.quality import FrameFlag
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.quality import FrameFlag
+from speckle3d.motion.direction import settle_direction, smooth_rotations
 from speckle3d.pipeline import correct, track
-from speckle3d.study.metrics import compare_modes
+from speckle3d.scoring.lengths import compare_modes
 
 
 class FirstFrames:

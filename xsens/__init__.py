@@ -10,54 +10,60 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from speckle3d.core.streams import TimedRotations
-    from xsens.accuracy import AccuracyTable, PairErrors, common_readings, mounting_from_motion, pair_errors
-    from xsens.accuracy_figures import figure_turns
-    from xsens.bytelogs import parse_stream
-    from xsens.comparison import compare_orientations
-    from xsens.device import DeviceError, DeviceSettings
-    from xsens.framing import Framer, Message, decode, encode
-    from xsens.fusion import Orientation, orient
-    from xsens.fusion_settings import FusionSettings
-    from xsens.live import LiveState
-    from xsens.logparts import Hints
-    from xsens.logs import read_log, write_csv
-    from xsens.mechanism import MechanismSettings, read_mechanism_csv, readings_at
-    from xsens.online import OnlineFilter, OnlineState
-    from xsens.recording import Recorder, record
-    from xsens.samples import Gap, ImuLog
+    from xsens.accuracy.angles import (
+        AccuracyTable,
+        PairErrors,
+        common_readings,
+        mounting_from_motion,
+        pair_errors,
+    )
+    from xsens.accuracy.comparison import compare_orientations
+    from xsens.accuracy.figures import figure_turns
+    from xsens.accuracy.mechanism import MechanismSettings, read_mechanism_csv, readings_at
+    from xsens.fusion.online import OnlineFilter, OnlineState
+    from xsens.fusion.orient import Orientation, orient
+    from xsens.fusion.settings import FusionSettings
+    from xsens.live.device import DeviceError, DeviceSettings
+    from xsens.live.monitor import LiveState
+    from xsens.live.recording import Recorder, record
+    from xsens.logs.bytelogs import parse_stream
+    from xsens.logs.logparts import Hints
+    from xsens.logs.read import read_log, write_csv
+    from xsens.logs.samples import Gap, ImuLog
+    from xsens.messages.framing import Framer, Message, decode, encode
 
 _HOME = {
-    "AccuracyTable": "accuracy",
-    "DeviceError": "device",
-    "DeviceSettings": "device",
-    "Framer": "framing",
-    "FusionSettings": "fusion_settings",
-    "Gap": "samples",
-    "Hints": "logparts",
-    "ImuLog": "samples",
-    "LiveState": "live",
-    "MechanismSettings": "mechanism",
-    "Message": "framing",
-    "OnlineFilter": "online",
-    "OnlineState": "online",
-    "Orientation": "fusion",
-    "PairErrors": "accuracy",
-    "Recorder": "recording",
+    "AccuracyTable": "xsens.accuracy.angles",
+    "DeviceError": "xsens.live.device",
+    "DeviceSettings": "xsens.live.device",
+    "Framer": "xsens.messages.framing",
+    "FusionSettings": "xsens.fusion.settings",
+    "Gap": "xsens.logs.samples",
+    "Hints": "xsens.logs.logparts",
+    "ImuLog": "xsens.logs.samples",
+    "LiveState": "xsens.live.monitor",
+    "MechanismSettings": "xsens.accuracy.mechanism",
+    "Message": "xsens.messages.framing",
+    "OnlineFilter": "xsens.fusion.online",
+    "OnlineState": "xsens.fusion.online",
+    "Orientation": "xsens.fusion.orient",
+    "PairErrors": "xsens.accuracy.angles",
+    "Recorder": "xsens.live.recording",
     "TimedRotations": "speckle3d.core.streams",
-    "common_readings": "accuracy",
-    "compare_orientations": "comparison",
-    "decode": "framing",
-    "encode": "framing",
-    "figure_turns": "accuracy_figures",
-    "mounting_from_motion": "accuracy",
-    "orient": "fusion",
-    "pair_errors": "accuracy",
-    "parse_stream": "bytelogs",
-    "read_log": "logs",
-    "read_mechanism_csv": "mechanism",
-    "readings_at": "mechanism",
-    "record": "recording",
-    "write_csv": "logs",
+    "common_readings": "xsens.accuracy.angles",
+    "compare_orientations": "xsens.accuracy.comparison",
+    "decode": "xsens.messages.framing",
+    "encode": "xsens.messages.framing",
+    "figure_turns": "xsens.accuracy.figures",
+    "mounting_from_motion": "xsens.accuracy.angles",
+    "orient": "xsens.fusion.orient",
+    "pair_errors": "xsens.accuracy.angles",
+    "parse_stream": "xsens.logs.bytelogs",
+    "read_log": "xsens.logs.read",
+    "read_mechanism_csv": "xsens.accuracy.mechanism",
+    "readings_at": "xsens.accuracy.mechanism",
+    "record": "xsens.live.recording",
+    "write_csv": "xsens.logs.read",
 }
 """Where each public name lives."""
 
@@ -102,8 +108,7 @@ if not TYPE_CHECKING:  # or every misspelt name would pass as an object
         """Load a public name on first use."""
         if name not in _HOME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        home = _HOME[name]
-        value = getattr(import_module(home if "." in home else f"{__name__}.{home}"), name)
+        value = getattr(import_module(_HOME[name]), name)
         globals()[name] = value
         return value
 

@@ -16,7 +16,7 @@ from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
-    from calibration.clock import Delay
+    from calibration.clock.line import Delay
     from speckle3d.core.calibration import Calibration
 
 
@@ -100,7 +100,7 @@ def _by_line(
     search_s: float,
 ) -> tuple[Delay, int]:
     """The delay, and in how many frames a line was found."""
-    from calibration.clock import FEWEST_FRAMES, delay_from_lines, line_signal
+    from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from speckle3d.cli.recordings import open_recording, require_unsized
 
     require_unsized(images, pixel_mm)
@@ -126,7 +126,7 @@ def _by_images(
     search_s: float,
 ) -> tuple[Delay, int]:
     """The delay, and how many frames there were."""
-    from calibration.clock_images import delay_from_images
+    from calibration.clock.images import delay_from_images
     from speckle3d.cli.recordings import open_tracked, require_unsized
 
     require_unsized(images, pixel_mm)

@@ -52,9 +52,9 @@ def compare(
     A sweep that fails is a row that says why; the exit code is 2 only if all do.
     """
     from speckle3d.config import Config, load_config
+    from speckle3d.report.page import write_report
     from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study
-    from speckle3d.study.report import write_report
     from speckle3d.study.results import copy_lines
     from speckle3d.study.schedulers import scheduler_for
 

@@ -19,11 +19,11 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, nami
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
-    from calibration.angulation import Angulation
-    from calibration.clock import Delay
-    from calibration.imageresults import Found
-    from calibration.images import ImageSettings
-    from calibration.imagestacks import TrackedImages
+    from calibration.clock.line import Delay
+    from calibration.images.angulation import Angulation
+    from calibration.images.results import Found
+    from calibration.images.solver import ImageSettings
+    from calibration.images.stacks import TrackedImages
     from speckle3d.core.calibration import Calibration
 
 
@@ -88,7 +88,7 @@ def calibrate_images(
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor from two crossing sweeps of anything with visible structure."""
-    from calibration.images import ImageSettings
+    from calibration.images.solver import ImageSettings
 
     if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
@@ -180,7 +180,7 @@ def _start(
 
 
 def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform) -> Angulation:
-    from calibration.angulation import angulation
+    from calibration.images.angulation import angulation
 
     posed = [each.world_from_sensor(each.covered()) for each in sweeps]
     return angulation(posed[0], posed[1], start, sweeps[0].grid.corners_mm)
@@ -189,7 +189,7 @@ def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransfo
 def _solve(
     sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageSettings
 ) -> Found:
-    from calibration.imageresults import solve
+    from calibration.images.results import solve
 
     with progress_bar("comparing sweeps") as bar:
         return solve(
@@ -198,7 +198,7 @@ def _solve(
 
 
 def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> Delay:
-    from calibration.clock_images import delay_from_images
+    from calibration.clock.images import delay_from_images
 
     with progress_bar("trying delays") as progress, naming(str(path)):
         return delay_from_images(tracked, mounting, progress=progress)
@@ -216,7 +216,7 @@ def _finish(
     """Write the calibration, its table and its pictures, and print the table."""
     from importlib.metadata import version
 
-    from calibration.imageresults import as_calibration, figure_of, notes_of
+    from calibration.images.results import as_calibration, figure_of, notes_of
     from calibration.report import json_report, text_report
     from speckle3d.core.calibration import Source
     from speckle3d.io.calibrations import write_calibration

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from speckle3d.core.geometry import FloatArray
     from speckle3d.core.streams import TimedRotations
     from speckle3d.core.sweep import OrientationSensor
-    from xsens.fusion import Orientation
-    from xsens.samples import ImuLog
+    from xsens.fusion.orient import Orientation
+    from xsens.logs.samples import ImuLog
 
 imu = typer.Typer(help="The orientation sensor: logs, live data, orientation.", no_args_is_help=True)
 app.add_typer(imu, name="imu")
@@ -101,7 +101,7 @@ def imu_convert(
     rate_hz: RateHz = None,
 ) -> None:
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
-    from xsens.logs import write_csv
+    from xsens.logs.read import write_csv
 
     _require_another(out, log_file)
     log = read(log_file, rate_hz)
@@ -131,7 +131,7 @@ def imu_orient(
     as_json: Json = False,
 ) -> None:
     """Find the sensor's orientation from its log, and put it into a sweep, on its own clock."""
-    from xsens.logs import write_csv
+    from xsens.logs.read import write_csv
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
@@ -172,8 +172,8 @@ def imu_record(
     from rich.live import Live
     from rich.text import Text
 
-    from xsens.device import DeviceSettings
-    from xsens.recording import record
+    from xsens.live.device import DeviceSettings
+    from xsens.live.recording import record
 
     settings: Any = DeviceSettings(content=content, rate_hz=rate_hz, baud=baud)  # type: ignore[arg-type]
     console = Console(stderr=True)
@@ -204,7 +204,7 @@ def _require_another(out: Path | None, log_file: Path) -> None:
 
 def read(path: Path, rate_hz: float | None) -> ImuLog:
     """Read a log of any kind."""
-    from xsens.logs import Hints, read_log
+    from xsens.logs.read import Hints, read_log
 
     return read_log(path, None if rate_hz is None else Hints(rate_hz=rate_hz))
 
@@ -225,8 +225,8 @@ def orientation_of(
     """Orientation of a log by one of the methods, with the filter's own account unless it is the sensor's."""
     if method is Method.sensor:
         return log.rotations(), None
-    from xsens.fusion import orient
-    from xsens.fusion_settings import FusionSettings
+    from xsens.fusion.orient import orient
+    from xsens.fusion.settings import FusionSettings
 
     found = orient(log, FusionSettings(use_magnetometer=magnetometer), smooth=method is Method.smoother)
     for text in found.notes:
@@ -336,7 +336,7 @@ def _beside_own(log: ImuLog, rotations: TimedRotations) -> list[tuple[str, float
     """How far the orientation found is from the sensor's own."""
     import numpy as np
 
-    from xsens.comparison import compare_orientations
+    from xsens.accuracy.comparison import compare_orientations
 
     apart = compare_orientations(rotations, log.rotations())
     return [

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from speckle3d.core.streams import TimedRotations
-    from xsens.accuracy import PairErrors
+    from xsens.accuracy.angles import PairErrors
 
 
 @imu.command("accuracy")
@@ -68,7 +68,7 @@ def imu_accuracy(
 ) -> None:
     """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2)."""
     from speckle3d.io.calibrations import read_calibration
-    from xsens.accuracy import AccuracyTable
+    from xsens.accuracy.angles import AccuracyTable
 
     if (reference is None) == (optical is None):
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
@@ -87,7 +87,7 @@ def imu_accuracy(
     table = AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
         from speckle3d.study.figures import save_figure
-        from xsens.accuracy_figures import figure_turns
+        from xsens.accuracy.figures import figure_turns
 
         save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
     if as_json:
@@ -105,8 +105,8 @@ def _beside_mechanism(
 ) -> PairErrors:
     from scipy.spatial.transform import Rotation
 
-    from xsens.accuracy import pair_errors
-    from xsens.mechanism import read_mechanism_csv, readings_at
+    from xsens.accuracy.angles import pair_errors
+    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
 
     settings = read_mechanism_csv(reference, turns)
     readings = readings_at(rotations, settings)
@@ -122,7 +122,7 @@ def _beside_tracker(
 ) -> PairErrors:
     from scipy.spatial.transform import Rotation
 
-    from xsens.accuracy import common_readings, mounting_from_motion, pair_errors
+    from xsens.accuracy.angles import common_readings, mounting_from_motion, pair_errors
 
     measured, target = common_readings(rotations, _tracked(optical), time_offset_s)
     mounted = Rotation.identity()

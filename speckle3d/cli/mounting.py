@@ -101,6 +101,6 @@ def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
 
 def _image_grid(sweep: Sweep) -> ImageGrid:
     """Grid of the images, in which a calibration counts pixels: from RF they are made with fewer samples."""
-    from speckle3d.motion.intensity import IntensityExtractor
+    from speckle3d.matching.intensity import IntensityExtractor
 
     return IntensityExtractor.for_sweep(sweep).grid

@@ -16,8 +16,8 @@ from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
     from calibration.chain import ImagePoints
+    from calibration.detection.lines import LineSettings
     from calibration.job import Job, Outcome, Recording, Seen
-    from calibration.lines import LineSettings
     from speckle3d.core.geometry import FloatArray
 
 Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
@@ -237,7 +237,7 @@ def _line_settings(
 ) -> LineSettings:
     from pydantic import ValidationError
 
-    from calibration.lines import LineSettings
+    from calibration.detection.lines import LineSettings
 
     given = {
         name: value
@@ -310,8 +310,8 @@ def find_lines(
 def _seen_wires(
     recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
 ) -> Seen:
+    from calibration.detection.wires import seen_crossings, seen_nwires
     from calibration.job import Seen
-    from calibration.wire_images import seen_crossings, seen_nwires
     from speckle3d.io.points import read_points
 
     names = ("x", "y", "z") if phantom == "three" else () if config is None else config.phantom.names

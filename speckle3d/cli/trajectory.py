@@ -44,7 +44,7 @@ def export(
 ) -> None:
     """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""
     from speckle3d.io.tum import is_tum, write_tum
-    from speckle3d.study.trajectories import load_reconstructed
+    from speckle3d.scoring.trajectories import load_reconstructed
 
     unit = cast("LengthUnit", length_unit)
     require_own_place(out, "TUM text", is_tum, reconstruction_file)
@@ -68,8 +68,8 @@ def score(
     as_json: Json = False,
 ) -> None:
     """Score a trajectory: pose errors as evo has them, drift rates, displacement of pixels and landmarks."""
+    from speckle3d.scoring.trajectories import compare_trajectories, load_estimate, load_reference
     from speckle3d.study.summary import plain
-    from speckle3d.study.trajectories import compare_trajectories, load_estimate, load_reference
 
     _require_meaning(estimate_file, reference_file, mode, reference, length_unit)
     unit, chosen = cast("LengthUnit | None", length_unit), mode or "image"
@@ -95,7 +95,7 @@ def _require_meaning(
     estimate: Path, of: Path, mode: str | None, reference: str | None, length_unit: str | None
 ) -> None:
     """Refuse options that nothing would be done with."""
-    from speckle3d.study.trajectories import kind_of
+    from speckle3d.scoring.trajectories import kind_of
 
     kinds = kind_of(estimate), kind_of(of)
     for name, value, kind, among in (

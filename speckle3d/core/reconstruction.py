@@ -82,7 +82,7 @@ class Trust:
         Of (x, y, z, tilt, yaw, roll) of every frame's pose about the image's centre, along the first frame's
         axes, mm and rad.
     flags : ndarray of int, shape (n,)
-        Zero for a frame that is as it should be; else bits of `speckle3d.motion.quality.FrameFlag`.
+        Zero for a frame that is as it should be; else bits of `speckle3d.matching.quality.FrameFlag`.
     """
 
     covariance: FloatArray

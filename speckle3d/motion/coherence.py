@@ -27,9 +27,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import FloatArray
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
+from speckle3d.matching.intensity import Float32Array
+from speckle3d.matching.patches import IntArray, PatchGrid
 from speckle3d.motion.distances import EchoModel
-from speckle3d.motion.intensity import Float32Array
-from speckle3d.motion.patches import IntArray, PatchGrid
 
 COARSE_SCALES = np.geomspace(0.4, 3.0, 16)
 FINE_SCALES = np.geomspace(0.85, 1.18, 7)

@@ -20,7 +20,7 @@ from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.statistics import correlation_variance
-from speckle3d.motion.intensity import two_way_wavenumber
+from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.motion.tilt import effective_distance, fit_tilt_response
 
 TILT_ROUNDS = 4

@@ -9,7 +9,7 @@ import numpy as np
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import FloatArray
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
-from speckle3d.motion.patches import PatchGrid
+from speckle3d.matching.patches import PatchGrid
 
 LEAST_CORRELATION = 0.03
 """A patch that correlates less than this holds no distance at all."""

@@ -12,9 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Sweep
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples
-from speckle3d.motion.inplane import InPlaneMotion
-from speckle3d.motion.matching import FrameMatcher, ReadyFrame, compose, inverse
 
 IntArray = npt.NDArray[np.int64]
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles, skew
-from speckle3d.motion.inplane import InPlaneMotion
-from speckle3d.motion.patches import IntArray
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.patches import IntArray
+from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.planes import PairPlane
-from speckle3d.motion.schedule import TrajectorySettings
 
 SETTLED = 1e-7
 ROUNDS = 6

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import FloatArray
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.study.metrics import JITTER_FRAMES, accumulated
+from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
 
 DOTS_PER_INCH = 150
 

@@ -23,10 +23,10 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.pipeline import calibrate_curves
+from speckle3d.scoring.lengths import ModeError, compare_modes
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.lock import only_run
-from speckle3d.study.metrics import ModeError, compare_modes
 from speckle3d.study.published import json_beside, text_beside
 from speckle3d.study.results import Study
 from speckle3d.study.schedulers import InProcess, Scheduler

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.study.metrics import ModeError
+from speckle3d.report.data import FORMAT, VERSION
+from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.overall import over_sweeps, overall_text, shared_means
-from speckle3d.study.report_data import FORMAT, VERSION
 from speckle3d.study.summary import Summary, csv_text, plain, remark_on, table_text
 from speckle3d.study.sweepjob import SweepOutcome
 

@@ -20,9 +20,9 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from speckle3d.blocks import on_one_thread
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.hdf5 import one_line
+from speckle3d.matching.blocks import on_one_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

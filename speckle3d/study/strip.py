@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from speckle3d.config import Config
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.motion.intensity import Float32Array, IntensityExtractor
+from speckle3d.matching.intensity import Float32Array, IntensityExtractor
 
 Float16Array = npt.NDArray[np.float16]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.study.metrics import ModeError
+from speckle3d.scoring.lengths import ModeError
 
 _COLUMNS = (
     ("sweep", "sweep", "{}"),

@@ -1,6 +1,6 @@
 """One sweep of a study as a job: it travels to a worker, works in a folder of its own, never raises.
 
-The blocks of a long sweep are jobs of their own, which need nothing of each other (`speckle3d.blocks`). What
+The blocks of a long sweep are jobs of their own, which need nothing of each other (`speckle3d.matching.blocks`). What
 they leave, the sweep's own job takes; a block that is not there it does itself.
 """
 
@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from speckle3d.blocks import Block, blocks_of
 from speckle3d.config import Config, config_from_toml
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import Sweep
@@ -26,10 +25,11 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import one_line, sha256_of
 from speckle3d.io.load import companion_files, load_landmarks, load_sweep, sniff
 from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.matching.blocks import Block, blocks_of
 from speckle3d.pipeline import match_ahead
+from speckle3d.scoring.scores import drift_rows
 from speckle3d.study.blockfiles import BlockFiles
 from speckle3d.study.job import available_modes, find_reference, require_possible, run_job
-from speckle3d.study.scoring import drift_rows
 from speckle3d.study.strip import Strip
 from speckle3d.study.summary import plain
 

@@ -32,11 +32,11 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
-from speckle3d.direction import settle_direction
 from speckle3d.io.load import load_sweep
+from speckle3d.motion.direction import settle_direction
 from speckle3d.pipeline import calibrate_curves, correct, track
+from speckle3d.scoring.lengths import accumulated, align_sign, compare_modes
 from speckle3d.simulation.presets import SimulationSettings
-from speckle3d.study.metrics import accumulated, align_sign, compare_modes
 
 FIRST_SEED = 1001
 VECTORS = 48

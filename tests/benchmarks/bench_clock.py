@@ -11,8 +11,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from cache import simulated
 
-from calibration.clock_images import delay_from_images
-from calibration.imagestacks import TrackedImages
+from calibration.clock.images import delay_from_images
+from calibration.images.stacks import TrackedImages
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.study.images import GreyImages

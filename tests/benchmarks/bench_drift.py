@@ -24,7 +24,7 @@ from drifting import CENTRE_MM, CORNERS_MM, drifted, hand_sweep, tracked
 from speckle3d.core.leastsquares import levenberg_marquardt
 from speckle3d.correction import drift
 from speckle3d.correction.drift import DriftSettings, correct_orientation, correct_pose
-from speckle3d.study.metrics import accumulated
+from speckle3d.scoring.lengths import accumulated
 
 FIRST_SEED = 90_000
 CASES = {

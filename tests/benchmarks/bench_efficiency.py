@@ -32,8 +32,8 @@ from scipy.interpolate import CubicSpline
 from speckle3d.config import Config
 from speckle3d.io.load import load_sweep
 from speckle3d.kernels.correlation import patch_correlations
-from speckle3d.motion.inplane import InPlaneMotion
-from speckle3d.motion.matching import Echo, FrameMatcher, MatchingSettings
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.matcher import Echo, FrameMatcher, MatchingSettings
 from speckle3d.simulation.presets import SimulationSettings
 
 HAND_SEEDS = (21, 22)

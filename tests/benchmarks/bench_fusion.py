@@ -15,8 +15,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from broad import TRIALS, east_first, errors_deg, read_trial
 from vqf import VQF
 
-from xsens.fusion import orient
-from xsens.fusion_settings import FusionSettings
+from xsens.fusion.orient import orient
+from xsens.fusion.settings import FusionSettings
 
 
 def main():

@@ -17,7 +17,7 @@ import numpy as np
 from cache import simulated_pair
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images import ImageSettings, TrackedImages, calibrate_crossing, prepare
+from calibration.images.solver import ImageSettings, TrackedImages, calibrate_crossing, prepare
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.geometry import rotation_from_fixed_angles
-from xsens.accuracy import AccuracyTable, pair_errors
+from xsens.accuracy.angles import AccuracyTable, pair_errors
 
 CALIBRATION_SD_DEG = (1.50, 1.10, 0.08)
 """Tilt, yaw and roll: table 1 of Housden et al., 2008."""

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
 
-from xsens.logs import read_log
-from xsens.messages import Framer
-from xsens.mtdata import DataLayout, OutputMode, OutputSettings
+from xsens.logs.read import read_log
+from xsens.messages.catalogue import Framer
+from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
 RATE_HZ, MINUTES = 256.0, 10
 COUNT = int(60 * MINUTES * RATE_HZ)

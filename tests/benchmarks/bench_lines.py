@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from calibration.columns import lay_columns
-from calibration.edges import first_echoes, take_profiles
-from calibration.lines import detect_lines
+from calibration.detection.columns import lay_columns
+from calibration.detection.edges import first_echoes, take_profiles
+from calibration.detection.lines import detect_lines
 from speckle3d.kernels.lines import consensus_line
 
 FRAMES, SHAPE, PIXEL_MM = 700, (640, 480), (0.08, 0.1)

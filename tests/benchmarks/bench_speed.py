@@ -26,8 +26,8 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.io.curves import write_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.kernels.correlation import patch_correlations
-from speckle3d.motion.matching import FrameMatcher, ReadyFrame
-from speckle3d.motion.patches import PatchGrid
+from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
+from speckle3d.matching.patches import PatchGrid
 from speckle3d.pipeline import correct, track
 from speckle3d.simulation.presets import SimulationSettings
 

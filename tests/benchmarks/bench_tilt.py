@@ -15,8 +15,8 @@ import numpy as np
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.curves import read_curves
+from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.patches import lay_patches
 from speckle3d.simulation.movement import HandMotion
 
 CURVES = Path(__file__).resolve().parents[2] / "data" / "curves.h5"

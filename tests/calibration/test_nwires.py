@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 from wire_scenes import PIXEL_MM, candidates, n_phantom, plus_results, scene
 
 from calibration.chain import ImagePoints
-from calibration.dots import Dots, dots_in_frames
-from calibration.labelling import LabelledDots
+from calibration.detection.dots import Dots, dots_in_frames
+from calibration.detection.labelling import LabelledDots
 from calibration.nwires import (
     NWireErrors,
     label_and_start,

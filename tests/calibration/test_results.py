@@ -5,8 +5,8 @@ import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, line_directions, scan_plane, scan_wires
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.adequacy import judge
 from calibration.chain import CHAIN, PROBE, ImagePoints
+from calibration.identifiability import judge
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from calibration.results import as_calibration

@@ -7,8 +7,8 @@ import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, centre_of, scan_wires
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.adequacy import MOTIONS
 from calibration.chain import ImagePoints
+from calibration.identifiability import MOTIONS
 from calibration.plane import OUTLIER_SIGMA
 from calibration.wires import calibrate_crossing, calibrate_wires
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError

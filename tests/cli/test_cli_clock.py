@@ -146,8 +146,8 @@ def test_help_says_how_the_sign_relates_to_that_of_plus(run):
 
 
 def test_what_is_printed_for_machines_is_json_even_if_numbers_are_not(run, back, monkeypatch):
-    from calibration import clock_images
-    from calibration.clock import Delay
+    from calibration.clock import images as clock_images
+    from calibration.clock.line import Delay
 
     odd = Delay(0.0, float("inf"), 1.0, np.zeros(1), np.zeros(1))
     monkeypatch.setattr(clock_images, "delay_from_images", lambda *_args, **_named: odd)

@@ -4,8 +4,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.imagestacks import Stack
-from calibration.similarity import Comparison, Patches
+from calibration.images.similarity import Comparison, Patches
+from calibration.images.stacks import Stack
 
 PIXELS = np.array([0.5, 0.4, 0.2, 1.0])
 CALIBRATION = RigidTransform.from_components([3.0, -20.0, 5.0], Rotation.from_rotvec([0.2, -0.4, 0.9]))

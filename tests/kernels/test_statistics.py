@@ -8,7 +8,7 @@ import speckle
 
 from speckle3d.kernels.correlation import patch_coherences, patch_correlations
 from speckle3d.kernels.statistics import correlation_variance
-from speckle3d.motion.patches import lay_patches
+from speckle3d.matching.patches import lay_patches
 
 PATCHES = lay_patches(speckle.GRID)
 REACH = (0.2, 0.4, 0.6, 0.8, 0.9)

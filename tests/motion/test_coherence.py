@@ -8,8 +8,8 @@ import speckle
 
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.motion.coherence import CoherenceSettings, estimate_coherence
-from speckle3d.motion.patches import PatchSettings, lay_patches
 
 GRID = ImageGrid(vectors=48, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
 PATCHES = lay_patches(GRID, PatchSettings())

@@ -5,9 +5,9 @@ import pytest
 import speckle
 
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.matching.patches import PatchGrid
 from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples, fit_curves
 from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.patches import PatchGrid
 
 DEPTHS_MM = (8.0, 16.0, 24.0)
 WIDTHS_MM = (0.33, 0.5, 0.42)

@@ -7,6 +7,8 @@ import speckle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from speckle3d.matching.inplane import InPlaneMotion, match_patches
+from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import (
     INTERPOLATION,
     SHARE_ERROR,
@@ -14,8 +16,6 @@ from speckle3d.motion.distances import (
     DistanceEstimator,
     EchoModel,
 )
-from speckle3d.motion.inplane import InPlaneMotion, match_patches
-from speckle3d.motion.patches import lay_patches
 
 PATCHES = lay_patches(speckle.GRID)
 SIGMA_MM, CELLS = 0.45, 25.0

@@ -10,11 +10,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.matching.inplane import InPlaneSettings
+from speckle3d.matching.intensity import IntensitySettings
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.patches import PatchSettings
 from speckle3d.motion.decorrelation import CurveSettings, fit_curves
-from speckle3d.motion.inplane import InPlaneSettings
-from speckle3d.motion.intensity import IntensitySettings
-from speckle3d.motion.matching import FrameMatcher
-from speckle3d.motion.patches import PatchSettings
 from speckle3d.motion.phantom import known_positions, phantom_samples
 
 SIGMA_MM, FRAMES = 0.3, 44

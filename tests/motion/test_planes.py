@@ -9,8 +9,8 @@ import speckle
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import DistanceEstimator, EchoModel
-from speckle3d.motion.patches import lay_patches
 from speckle3d.motion.planes import PlaneFitter, PlaneSettings
 
 GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)

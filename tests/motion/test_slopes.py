@@ -9,8 +9,8 @@ import speckle
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.patches import lay_patches
 from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings
 from speckle3d.motion.slopes import BEYOND_DOUBT, NEAR_MM, UNEVENNESS, SlopeEvidence, weigh_slopes
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import DistanceEstimator, PatchDistances
-from speckle3d.motion.patches import lay_patches
 from speckle3d.motion.planes import PlaneFitter
 from speckle3d.motion.subset import consistent_subset
 

@@ -20,14 +20,14 @@ from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.report.page import write_report
+from speckle3d.scoring.displacements import landmark_errors
+from speckle3d.scoring.scores import drift_rows
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.job import Reference
 from speckle3d.study.lock import only_run
-from speckle3d.study.points import landmark_errors
-from speckle3d.study.report import write_report
 from speckle3d.study.schedulers import OnCluster, local_cluster
-from speckle3d.study.scoring import drift_rows
 from speckle3d.study.sweepjob import SweepOutcome, plan_sweep, run_sweep
 
 # Dask's processes leave sockets to the garbage collector when one is killed.

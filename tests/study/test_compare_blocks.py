@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from cluster_jobs import part_of_study
 
-from speckle3d.blocks import blocks_of
 from speckle3d.config import Config
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.matching.blocks import blocks_of
 from speckle3d.study.compare import MATCHING_SHARE, StudyProgress, compare_sweeps
 from speckle3d.study.job import SUBSET, run_job
 from speckle3d.study.schedulers import InProcess, OnCluster, local_cluster

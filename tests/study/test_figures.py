@@ -6,8 +6,8 @@ import pytest
 from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.scoring.lengths import accumulated
 from speckle3d.study.figures import MODE_COLOURS, figure_drift, figure_reslice, save_figure, wrapped
-from speckle3d.study.metrics import accumulated
 
 
 @pytest.fixture(scope="module")

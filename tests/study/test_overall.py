@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from speckle3d.scoring.statistics import holm, mean_interval
 from speckle3d.study.overall import beats, over_sweeps, overall_text, shared_means
-from speckle3d.study.statistics import holm, mean_interval
 
 
 def study(sweeps, gain=3.0, seed=3):

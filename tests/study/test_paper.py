@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from speckle3d.io.load import load_sweep
+from speckle3d.scoring.lengths import ModeError
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.study import paper
-from speckle3d.study.metrics import ModeError
 from speckle3d.study.published import MODES, PUBLISHED, beside, text_beside
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.study.metrics import ModeError
+from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.summary import Summary, csv_text, json_text, plain, remark_on, table_text, write_summary
 
 

@@ -9,10 +9,10 @@ sys.path.insert(0, str(HERE.parents[1]))
 
 from imu_logs import calibration, configured, items_of, legacy_messages, mt9_bin, mtdata2_messages, samples  # noqa: E402
 
-from xsens.framing import Message, encode  # noqa: E402
-from xsens.messages import Configuration, MessageId, UnitConfiguration  # noqa: E402
-from xsens.mtdata import DataLayout  # noqa: E402
-from xsens.mtdata2 import Item, encode_items  # noqa: E402
+from xsens.messages.catalogue import Configuration, MessageId, UnitConfiguration  # noqa: E402
+from xsens.messages.framing import Message, encode  # noqa: E402
+from xsens.messages.mtdata import DataLayout  # noqa: E402
+from xsens.messages.mtdata2 import Item, encode_items  # noqa: E402
 
 
 def of_items(*messages):

@@ -1,0 +1,1 @@
+"""The delay between images and a sensor."""

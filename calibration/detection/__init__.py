@@ -1,0 +1,1 @@
+"""From images to points: lines, dots, and which wire each dot is."""

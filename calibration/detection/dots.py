@@ -1,0 +1,282 @@
+"""Wires seen end on: bright dots in images, found without help.
+
+A dot stands out from its surroundings at one size, to which the difference of two Gaussians answers, and is
+not part of a line. Side lobes make it wide and ringing gives it a tail, both weaker than the dot itself, so
+its place is the centroid of what is above half of its peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+from scipy import ndimage
+
+from calibration.detection.columns import BoolArray, IntArray, lay_columns
+from speckle3d.core.errors import InvalidInputError, MismatchError, naming
+from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.sweep import Frames
+
+Float32Array = npt.NDArray[np.float32]
+
+_MAD_TO_SIGMA = 1.4826
+_FAINTEST = 0.03
+"""Part of the strongest dot's contrast: 15 dB below it in an image of 60 dB that the strongest saturates is
+0.75, and wires off the image's plane were seen at 0.1."""
+_PLACING = 0.35
+"""Smoothing before a dot is placed, as part of the dot's own size: enough to join the grains of one dot."""
+_ANGLES = 24
+_LINE_REACH = 2.5
+"""How far along a line is looked whether a peak is part of one, in surroundings; 24 directions are then less
+than half a millimetre apart."""
+_MOST_MAXIMA = 500
+"""A bound on time alone: what is weaker than so many others is no candidate."""
+_REACH = 2.0
+"""Half the window in which a dot is placed, in surroundings."""
+
+
+class DotSettings(BaseModel):
+    """How dots are found."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    dot_mm: float = Field(0.35, gt=0, description="Standard deviation of the Gaussian that a dot resembles.")
+    surround_mm: float = Field(
+        1.2, gt=0, description="Standard deviation of the Gaussian that it must stand out from."
+    )
+    apart_mm: float = Field(0.8, gt=0, description="The weaker of two dots nearer than this is none.")
+    noise_sds: float = Field(
+        5.0, ge=0, description="Contrast that makes a dot, in robust standard deviations of the image's own."
+    )
+    level: float = Field(0.5, gt=0, lt=1, description="Part of its peak above which a dot's pixels count.")
+    candidates: int = Field(20, ge=1, description="The strongest dots of an image that are kept.")
+
+
+@dataclass(frozen=True)
+class Dots:
+    """Candidates for wires, the strongest of each frame first.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (n,)
+        Ascending.
+    pixels : ndarray, shape (n, 2)
+        Column and row, fractional.
+    score : ndarray, shape (n,)
+        Contrast with the surroundings, less that of a line the dot may be part of, grey levels.
+    dropped : dict of int to str
+        Why other frames have none.
+    """
+
+    frame: IntArray
+    pixels: FloatArray
+    score: FloatArray
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.frame)
+        if self.pixels.shape != (n, 2) or self.score.shape != (n,):
+            raise MismatchError(f"dots: expected {n} of each, got pixels of shape {self.pixels.shape}")
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, chosen: BoolArray | IntArray) -> Dots:
+        return Dots(self.frame[chosen], self.pixels[chosen], self.score[chosen], self.dropped)
+
+
+def dots_in_image(
+    image: npt.NDArray[Any],
+    pixel_mm: npt.ArrayLike,
+    settings: DotSettings | None = None,
+    region_px: npt.ArrayLike | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Find the bright dots of one image.
+
+    Parameters
+    ----------
+    image : ndarray, shape (column, row)
+        Grey levels of any real type, rows down from the probe.
+    pixel_mm : array_like, shape (2,)
+        Distance between columns and between rows, mm; ten per cent do not matter.
+    region_px : array_like, shape (k, 2), optional
+        Corners (column, row) of a polygon outside which nothing counts.
+
+    Returns
+    -------
+    pixels : ndarray, shape (n, 2)
+    score : ndarray, shape (n,)
+        Contrast with the surroundings, grey levels, descending.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is not what it must be.
+    """
+    s = settings or DotSettings()
+    size = _checked_pixel(pixel_mm)
+    if image.ndim != 2 or not np.isrealobj(image):
+        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
+    return _dots(image, size, s, _inside(image.shape, region_px))
+
+
+def dots_in_frames(
+    frames: Frames,
+    pixel_mm: npt.ArrayLike,
+    settings: DotSettings | None = None,
+    region_px: npt.ArrayLike | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Dots:
+    """Find the bright dots of every frame, read one at a time.
+
+    Parameters
+    ----------
+    frames : Frames, shape (n, column, row)
+    pixel_mm, settings, region_px
+        See `dots_in_image`.
+    progress : callable, optional
+        Called with the number of frames done and their total.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is not what it must be.
+    """
+    s = settings or DotSettings()
+    size, count = _checked_pixel(pixel_mm), frames.shape[0]
+    inside = _inside(frames.shape[1:], region_px)
+    found = []
+    for index in range(count):
+        with naming(f"frame {index}"):
+            found.append(_dots(np.asarray(frames[index]), size, s, inside))
+        if progress:
+            progress(index + 1, count)
+    held = [len(score) for _, score in found]
+    return Dots(
+        frame=np.repeat(np.arange(count), held),
+        pixels=np.concatenate([np.zeros((0, 2)), *(pixels for pixels, _ in found)]),
+        score=np.concatenate([np.zeros(0), *(score for _, score in found)]),
+        dropped={i: "no dot" for i, n in enumerate(held) if n == 0},
+    )
+
+
+def single_dots(dots: Dots, clear: float = 1.5) -> Dots:
+    """The strongest dot of each frame that shows one wire, or one crossing of wires.
+
+    Parameters
+    ----------
+    clear : float
+        How much stronger it must be than the frame's next; other frames are dropped.
+    """
+    first = np.flatnonzero(np.diff(dots.frame, prepend=-1))
+    follows = np.append(dots.frame[1:] == dots.frame[:-1], False)[first]
+    after = np.where(follows, np.append(dots.score[1:], 0.0)[first], 0.0)
+    kept = dots.score[first] >= clear * after
+    unclear = {int(i): "no dot clearly the strongest" for i in dots.frame[first[~kept]]}
+    one = dots[first[kept]]
+    return Dots(one.frame, one.pixels, one.score, {**dots.dropped, **unclear})
+
+
+def _dots(
+    image: npt.NDArray[Any], pixel_mm: FloatArray, s: DotSettings, inside: BoolArray | None
+) -> tuple[FloatArray, FloatArray]:
+    grey = np.asarray(image, dtype=np.float32)
+    require_finite(grey, "image")
+    contrast = ndimage.gaussian_filter(grey, s.dot_mm / pixel_mm)
+    contrast -= ndimage.gaussian_filter(grey, s.surround_mm / pixel_mm, truncate=3.0)
+    limit = _limit(contrast if inside is None else contrast[inside], s)
+    peaks = _maxima(contrast, limit, pixel_mm, s, inside)
+    score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm, s)
+    best = np.argsort(-score, kind="stable")
+    best = best[score[best] > limit][: s.candidates]
+    fine = ndimage.gaussian_filter(grey, _PLACING * s.dot_mm / pixel_mm)
+    places = [_placed(fine, peak, pixel_mm, s) for peak in peaks[best]]
+    return np.reshape(places, (-1, 2)), score[best].astype(float)
+
+
+def _limit(contrast: Float32Array, s: DotSettings) -> float:
+    # A sample of the pixels says as much about the noise.
+    noise = _MAD_TO_SIGMA * float(np.median(np.abs(contrast.ravel()[::7])))
+    rounding = float(np.finfo(np.float32).eps * np.abs(contrast).max())
+    return float(np.max([s.noise_sds * noise, _FAINTEST * float(contrast.max()), rounding]))
+
+
+def _maxima(
+    contrast: Float32Array, limit: float, pixel_mm: FloatArray, s: DotSettings, inside: BoolArray | None
+) -> IntArray:
+    """Columns and rows of maxima that are some way apart, shape (n, 2), strongest first."""
+    size = 2 * np.maximum(np.rint(s.apart_mm / 2 / pixel_mm), 1).astype(int) + 1
+    top = (contrast == ndimage.maximum_filter(contrast, size=tuple(size))) & (contrast > limit)
+    if inside is not None:
+        top &= inside
+    peaks = np.argwhere(top)
+    peaks = peaks[np.argsort(-contrast[tuple(peaks.T)], kind="stable")][:_MOST_MAXIMA]
+    return _far_apart(peaks, s.apart_mm / pixel_mm)
+
+
+def _along_lines(
+    contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray, s: DotSettings
+) -> Float32Array:
+    """Contrast of lines that peaks may be part of: what there is on both sides of them, shape (n,).
+
+    Specular echoes, of a floor as much as of the phantom's frame, would otherwise be rows of dots.
+    """
+    angle = np.linspace(0.0, np.pi, _ANGLES, endpoint=False)
+    away = _LINE_REACH * s.surround_mm * np.column_stack([np.cos(angle), np.sin(angle)]) / pixel_mm
+    sides = []
+    for step in (away, -away):
+        places = np.rint(peaks[:, None] + step).astype(int)
+        held = np.all((places >= 0) & (places < contrast.shape), axis=2)
+        column, row = np.moveaxis(np.where(held[..., None], places, 0), 2, 0)
+        sides.append(np.where(held, contrast[column, row], np.float32(0.0)))
+    return np.asarray(np.minimum(*sides).max(axis=1, initial=0.0), dtype=np.float32)
+
+
+def _far_apart(peaks: IntArray, apart_px: FloatArray) -> IntArray:
+    """Those of the peaks, strongest first, that have no stronger one near."""
+    kept: list[int] = []
+    scaled = peaks / apart_px
+    for i, peak in enumerate(scaled):
+        if not kept or np.min(np.sum((scaled[kept] - peak) ** 2, axis=1)) >= 1.0:
+            kept.append(i)
+    return peaks[kept]
+
+
+def _placed(fine: Float32Array, peak: IntArray, pixel_mm: FloatArray, s: DotSettings) -> FloatArray:
+    """Centroid of the pixels that belong to a peak and are above a part of it, by how much they are."""
+    reach = np.rint(_REACH * s.surround_mm / pixel_mm).astype(int)
+    start = np.maximum(peak - reach, 0)
+    window = fine[start[0] : peak[0] + reach[0] + 1, start[1] : peak[1] + reach[1] + 1]
+    row, column = np.meshgrid(*(np.arange(n) for n in window.shape[::-1]))
+    away = np.hypot((column + start[0] - peak[0]) * pixel_mm[0], (row + start[1] - peak[1]) * pixel_mm[1])
+    base = float(np.median(window))
+    top = float(window[away <= s.dot_mm].max(initial=base))
+    height = window - (base + s.level * (top - base))
+    labels = ndimage.label(height > 0)[0]
+    own = np.unique(labels[(away <= s.dot_mm) & (height > 0)])
+    weight = np.where(np.isin(labels, own) & (labels > 0), height, 0.0)
+    total = float(weight.sum())
+    if total <= 0:
+        return peak.astype(float)
+    centroid = np.array([float((column * weight).sum()), float((row * weight).sum())]) / total
+    return np.asarray(start + centroid, dtype=float)
+
+
+def _inside(shape: tuple[int, ...], region_px: npt.ArrayLike | None) -> BoolArray | None:
+    if region_px is None:
+        return None
+    columns = lay_columns(shape, shape[0], region_px)
+    inside = np.zeros(shape, dtype=bool)
+    inside[columns.column] = columns.inside
+    return inside
+
+
+def _checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
+    pixel = np.asarray(pixel_mm, dtype=float)
+    if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
+        raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
+    return pixel

@@ -1,0 +1,119 @@
+"""The first strong echo in each column: a steep rise of the smoothed levels, then its front or its peak."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration.detection.columns import Columns
+from speckle3d.core.geometry import FloatArray
+from speckle3d.kernels.lines import echo_fronts, echo_levels, filter_columns, first_edges
+
+Float32Array = npt.NDArray[np.float32]
+Place = Literal["front", "slope", "peak"]
+
+_FINE = 0.25
+"""Smoothing with which an echo is placed, as a part of that with which it is found: enough against noise, and
+short against the rise of an echo."""
+_REACH = 3.5
+"""Length of the filters' sides, standard deviations."""
+_AHEAD = 2.0
+"""How far below its edge an echo is brightest at the most, standard deviations: one and a half its length."""
+_LEAST = 0.3
+"""Slope that is looked at, as a part of the steepest in the middle one of all columns."""
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """What columns of an image show along their depth.
+
+    Attributes
+    ----------
+    columns : Columns
+    levels : ndarray, shape (n, r)
+        The image, slightly smoothed.
+    slope : ndarray, shape (n, r)
+        How steeply the image, strongly smoothed, rises, levels per row.
+    sigma : float
+        Of the strong smoothing, rows.
+    """
+
+    columns: Columns
+    levels: Float32Array
+    slope: Float32Array
+    sigma: float
+
+    def brightness(self) -> Float32Array:
+        """Level of the echo that begins at each steep place, above the image's middle level; 0 elsewhere."""
+        bright = np.empty_like(self.levels)
+        least = _LEAST * typical(self.slope, self.columns)
+        dark = float(np.median(self.levels[self.columns.inside]))
+        ahead = int(np.ceil(_AHEAD * self.sigma))
+        echo_levels(self.slope, self.levels, self.columns.spans, least, dark, ahead, bright)
+        return bright
+
+
+@dataclass(frozen=True)
+class Edges:
+    """One edge in each column.
+
+    Attributes
+    ----------
+    row : ndarray, shape (n,)
+        Where the echo is; NaN without one.
+    strength : ndarray, shape (n,)
+        Its score; 0 without one.
+    """
+
+    row: FloatArray
+    strength: FloatArray
+
+
+def typical(score: Float32Array, columns: Columns) -> float:
+    """Largest score of the middle one of all columns."""
+    return float(np.median(score[columns.inside.any(axis=1)].max(axis=1)))
+
+
+def take_profiles(samples: Float32Array, columns: Columns, sigma: float) -> Profiles:
+    """Smooth columns by Gaussians, and differentiate in the same convolution; only the region counts.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (n, r)
+    sigma : float
+        Of the smoothing with which edges are found, rows.
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, appendix B.
+    """
+    levels, slope = np.empty_like(samples), np.empty_like(samples)
+    t = np.arange(1, int(np.ceil(_REACH * sigma)) + 1)
+    taps = t * np.exp(-0.5 * (t / sigma) ** 2)
+    filter_columns(samples, columns.spans, 0.0, (taps / (2 * t * taps).sum()).astype(np.float32), -1.0, slope)
+    t = np.arange(1, int(np.ceil(_REACH * _FINE * sigma)) + 1)
+    taps = np.exp(-0.5 * (t / (_FINE * sigma)) ** 2)
+    whole = float(1 + 2 * taps.sum())
+    filter_columns(samples, columns.spans, 1 / whole, (taps / whole).astype(np.float32), 1.0, levels)
+    return Profiles(columns, levels, slope, sigma)
+
+
+def first_echoes(profiles: Profiles, score: Float32Array, threshold: float, place: Place) -> Edges:
+    """Find in each column the first steep place of more than some score, or else of the largest.
+
+    Parameters
+    ----------
+    score : ndarray, shape (n, r)
+        What edges are judged by: their slope or their brightness.
+    place : str
+        See `LineSettings`.
+    """
+    spans = profiles.columns.spans
+    steepest, front, peak, strength = np.empty((4, len(score)))
+    found = np.empty(len(score), np.int64)
+    first_edges(profiles.slope, score, spans, threshold, steepest, strength, found)
+    echo_fronts(profiles.levels, spans, found, steepest, profiles.sigma, front, peak)
+    return Edges({"front": front, "slope": steepest, "peak": peak}[place], strength)

@@ -1,0 +1,313 @@
+"""Which dot is which wire of an N-wire phantom.
+
+First for every frame by itself: dots in a line are the wires of a layer, lines that are parallel at the right
+distances are layers, and the image must then lie among the wires so that all dots meet theirs. Once an image
+calibration is known, from other frames, it says where each wire is to be seen, and a dot found there counts
+even if others are missing.
+
+References
+----------
+.. [1] T. K. Chen, A. D. Thurston, R. E. Ellis and P. Abolmaesumi, "A real-time freehand ultrasound
+   calibration system with automatic accuracy feedback and control", Ultrasound Med. Biol. 35, 2009.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import RigidTransform
+
+from calibration.chain import Chain, ImagePoints
+from calibration.detection.dots import Dots
+from calibration.wirefit import linear_fits, rigid_fits
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.wires import IntArray, WirePhantom
+
+_STEEPEST = 2.0
+"""How much longer than in the phantom a distance may be in the image: a plane 60 degrees from square."""
+_PARALLEL_COSINE = 0.99
+_MOST_HYPOTHESES = 4000
+_REFINED = 128
+"""Ringing under four wires of a phantom that looks the same from four sides makes half as many hypotheses."""
+_LIKE_MM = 0.1
+"""Hypotheses that fit as well as the best up to this are told apart by their dots' strength."""
+_LEAST_MM = 0.5
+"""Nearer to an outer dot a middle one is the same: dots are found that far apart and more."""
+_BEYOND_MM = 5.0
+"""How far beyond a wire's stated ends it may be seen: ends are where it is fastened, roughly."""
+
+
+class LabelSettings(BaseModel):
+    """How dots are assigned to wires."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    collinear_mm: float = Field(0.8, gt=0, description="How far a dot may be off the line of the outer two.")
+    residual_mm: float = Field(0.5, gt=0, description="Largest root mean square misfit of a frame's dots.")
+    pixel_tolerance: float = Field(
+        0.05, gt=0, description="Relative standard deviation of the pixel size that is given."
+    )
+    gate_mm: float = Field(
+        1.5, gt=0, description="How far from where a calibration says it is a wire's dot may be."
+    )
+
+
+@dataclass(frozen=True)
+class LabelledDots:
+    """Dots and the wires they show.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (n,)
+        Ascending.
+    pixels : ndarray, shape (n, 2)
+    wire : ndarray of int, shape (n,)
+        Number of the wire in the phantom.
+    dropped : dict of int to str
+        Why other frames have none.
+    """
+
+    frame: IntArray
+    pixels: FloatArray
+    wire: IntArray
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.frame)
+        if self.pixels.shape != (n, 2) or self.wire.shape != (n,):
+            raise MismatchError(f"dots: expected {n} of each, got pixels of shape {self.pixels.shape}")
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def points(self, world_from_sensor: RigidTransform) -> ImagePoints:
+        """The dots with the sensor's pose in their frames; one pose for each frame of the sequence."""
+        if len(self) and int(self.frame.max()) >= len(world_from_sensor):
+            raise MismatchError(
+                f"expected a pose for frame {int(self.frame.max())}, got {len(world_from_sensor)} poses"
+            )
+        return ImagePoints(self.pixels, self.frame, world_from_sensor[self.frame], self.wire)
+
+
+def label_dots(
+    dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike, settings: LabelSettings | None = None
+) -> LabelledDots:
+    """Assign dots to the wires of an N-wire phantom, each frame by itself.
+
+    Parameters
+    ----------
+    pixel_mm : array_like, shape (2,)
+        Distance between columns and between rows, mm, known to `LabelSettings.pixel_tolerance`.
+
+    Returns
+    -------
+    LabelledDots
+        All wires of all N of each frame, or none of them. Where the phantom looks the same from two sides,
+        its first pattern is taken to be uppermost and its first wire on the side of the last column.
+
+    Raises
+    ------
+    InvalidInputError
+        If the phantom has fewer than two N, or they are not parallel.
+    """
+    s, layers, size = settings or LabelSettings(), _layers(phantom), np.asarray(pixel_mm, dtype=float)
+    wires = np.concatenate([layer.wires for layer in layers])
+    found: dict[int, FloatArray] = {}
+    dropped = dict(dots.dropped)
+    for frame in np.unique(dots.frame):
+        here = dots.frame == frame
+        try:
+            chosen = _label(dots.pixels[here] * size, dots.score[here], layers, phantom, s)
+            found[int(frame)] = dots.pixels[here][chosen]
+        except InsufficientDataError as error:
+            dropped[int(frame)] = str(error)
+    return LabelledDots(
+        frame=np.repeat(np.array(list(found), dtype=np.int64), wires.size),
+        pixels=np.concatenate([np.zeros((0, 2)), *found.values()]),
+        wire=np.tile(wires, len(found)),
+        dropped=dropped,
+    )
+
+
+def label_by_calibration(
+    dots: Dots,
+    phantom: WirePhantom,
+    chain: Chain,
+    world_from_sensor: RigidTransform,
+    settings: LabelSettings | None = None,
+) -> LabelledDots:
+    """Assign to each wire the dot that is where a calibration says it is to be seen.
+
+    Parameters
+    ----------
+    chain : Chain
+        The calibration, and where the phantom is.
+    world_from_sensor : RigidTransform
+        One for each frame of the sequence.
+
+    Returns
+    -------
+    LabelledDots
+        As many wires of each frame as show.
+    """
+    s = settings or LabelSettings()
+    image_from_phantom = (chain.target_from_world * world_from_sensor * chain.sensor_from_image).inv()
+    kept: list[tuple[int, int, int]] = []
+    dropped = dict(dots.dropped)
+    for frame in np.unique(dots.frame):
+        here = np.flatnonzero(dots.frame == frame)
+        expected_mm = _seen_at(phantom, image_from_phantom[int(frame)])
+        pairs = _nearest(dots.pixels[here] * chain.pixel_mm, dots.score[here], expected_mm, s.gate_mm)
+        kept += [(int(frame), int(here[dot]), wire) for dot, wire in pairs]
+        if not pairs:
+            dropped[int(frame)] = "no dot where the calibration expects a wire"
+    frames, index, wires = np.array(kept, dtype=np.int64).reshape(-1, 3).T
+    return LabelledDots(frames, dots.pixels[index], wires, dropped)
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """An N: its three wires, where the middle one crosses the others, and where it is among its like."""
+
+    wires: IntArray
+    crossings_mm: FloatArray
+    width_mm: float
+    height_mm: float
+    turned: float
+
+
+def _layers(phantom: WirePhantom) -> list[_Layer]:
+    shapes = phantom.n_shapes
+    if len(shapes) < 2:
+        raise InvalidInputError(f"phantom: expected two N of wires or more, got {len(shapes)}")
+    along = phantom.directions[shapes[0][0]]
+    first, layers = None, []
+    for shape, crossings in zip(shapes, phantom.crossings_mm(), strict=True):
+        between = phantom.points_mm[shape[2]] - phantom.points_mm[shape[0]]
+        across = between - (between @ along) * along
+        width = float(np.linalg.norm(across))
+        first = across / width if first is None else first
+        straight = float(across @ first) / width
+        if abs(straight) < _PARALLEL_COSINE or abs(phantom.directions[shape[0]] @ along) < _PARALLEL_COSINE:
+            raise InvalidInputError(
+                f"phantom: expected parallel N, got one askew ({phantom.names[shape[0]]})"
+            )
+        above = crossings[0] - phantom.points_mm[shapes[0][0]]
+        height = float(above @ np.cross(along, first))
+        layers.append(_Layer(np.array(shape), crossings, width, height, float(np.sign(straight))))
+    return layers
+
+
+def _label(
+    dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom: WirePhantom, s: LabelSettings
+) -> IntArray:
+    """Which dot shows each wire of the layers, shape (3 layers,), of one frame."""
+    triples = [_triples(dots_mm, layer, phantom, s) for layer in layers]
+    missing = [i for i, found in enumerate(triples) if len(found) == 0]
+    if missing:
+        raise InsufficientDataError(f"no three dots in a line for layer {missing[0]}")
+    chosen = _combined(triples, dots_mm, score, layers)
+    if len(chosen) == 0:
+        raise InsufficientDataError("no parallel lines of dots at the layers' distances")
+    wires = np.concatenate([layer.wires for layer in layers])
+    loose = linear_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
+    chosen = chosen[np.argsort(loose)[:_REFINED]]
+    fits = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
+    best = float(fits.rms_mm.min())
+    if best > s.residual_mm:
+        raise InsufficientDataError("no dots fit the wires")
+    like = np.flatnonzero(fits.rms_mm <= best + _LIKE_MM)
+    # Rounded, so that the usual way round decides where the same dots fit either way.
+    strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
+    usual = [-_unusual(dots_mm[chosen[i]]) for i in like]
+    return np.asarray(chosen[like[np.lexsort((usual, strength))[-1]]])
+
+
+def _unusual(labelled_mm: FloatArray) -> int:
+    """How many usual rules a labelling breaks: first wire at the last columns, first layer uppermost."""
+    layers = labelled_mm.reshape(-1, 3, 2)
+    return int(layers[0, 0, 0] < layers[0, 2, 0]) + int(layers[0, :, 1].mean() > layers[-1, :, 1].mean())
+
+
+def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom, s: LabelSettings) -> IntArray:
+    """Dots that may be a layer's first, middle and last wire, shape (t, 3)."""
+    between = dots_mm[None, :] - dots_mm[:, None]
+    length = np.linalg.norm(between, axis=2)
+    # Axes: first, last and middle dot.
+    x, y = np.moveaxis(between / np.where(length > 0, length, np.inf)[..., None], 2, 0)
+    to_middle = between[:, None]
+    reach = x[..., None] * to_middle[..., 0] + y[..., None] * to_middle[..., 1]
+    off = np.abs(x[..., None] * to_middle[..., 1] - y[..., None] * to_middle[..., 0])
+    long = (length > 0.9 * layer.width_mm) & (length < 1.1 * _STEEPEST * layer.width_mm)
+    between_them = (reach > _LEAST_MM) & (reach < length[..., None] - _LEAST_MM)
+    first, last, middle = np.nonzero(long[..., None] & between_them & (off < s.collinear_mm))
+    inside = _within_ends(reach[first, last, middle] / length[first, last], layer, phantom)
+    return np.stack([first, middle, last], axis=1)[inside]
+
+
+def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.NDArray[np.bool_]:
+    """Whether the middle wire, where it is seen, is between its ends."""
+    if phantom.ends_mm is None:
+        return np.ones(share.shape, dtype=bool)
+    start, end = layer.crossings_mm
+    direction = phantom.directions[layer.wires[1]]
+    place = (start + share[:, None] * (end - start)) @ direction
+    ends = np.sort(phantom.ends_mm[layer.wires[1]] @ direction)
+    return np.asarray((place > ends[0] - _BEYOND_MM) & (place < ends[1] + _BEYOND_MM))
+
+
+def _combined(
+    triples: list[IntArray], dots_mm: FloatArray, score: FloatArray, layers: list[_Layer]
+) -> IntArray:
+    """Hypotheses: a triple for each layer, parallel and at the layers' distances, shape (h, 3 layers)."""
+    chosen = triples[0]
+    for layer, found in zip(layers[1:], triples[1:], strict=True):
+        fits = _side_by_side(chosen[:, :3], found, dots_mm, layers[0], layer)
+        fits &= ~(chosen[:, None, :, None] == found[None, :, None, :]).any(axis=(2, 3))
+        one, other = np.nonzero(fits)
+        chosen = np.concatenate([chosen[one], found[other]], axis=1)
+        strongest = np.argsort(-score[chosen].sum(axis=1), kind="stable")
+        chosen = chosen[strongest[:_MOST_HYPOTHESES]]
+    return chosen
+
+
+def _side_by_side(
+    first: IntArray, other: IntArray, dots_mm: FloatArray, layer: _Layer, below: _Layer
+) -> npt.NDArray[np.bool_]:
+    """Which triples of one layer, (a, 3), and of another, (b, 3), may be in one image, shape (a, b)."""
+    along = [dots_mm[t[:, 2]] - dots_mm[t[:, 0]] for t in (first, other)]
+    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in along]
+    parallel = (unit[0] @ unit[1].T) * layer.turned * below.turned > _PARALLEL_COSINE
+    middle = [dots_mm[t[:, [0, 2]]].mean(axis=1) for t in (first, other)]
+    apart = middle[1][None] - middle[0][:, None]
+    distance = np.abs(unit[0][:, None, 0] * apart[..., 1] - unit[0][:, None, 1] * apart[..., 0])
+    gap = abs(below.height_mm - layer.height_mm)
+    return np.asarray(parallel & (distance > 0.85 * gap) & (distance < 1.1 * _STEEPEST * gap))
+
+
+def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatArray:
+    """Where an image cuts each wire, mm, shape (k, 2); NaN where it does not."""
+    place = image_from_phantom.apply(phantom.points_mm)
+    along = image_from_phantom.rotation.apply(phantom.directions)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = -place[:, 2] / along[:, 2]
+    steps[~np.isfinite(steps)] = np.nan
+    return np.asarray(place[:, :2] + steps[:, None] * along[:, :2])
+
+
+def _nearest(
+    dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray, gate_mm: float
+) -> list[tuple[int, int]]:
+    """Pairs of dot and wire, each once; a dot that is stronger may be farther."""
+    apart = np.linalg.norm(dots_mm[:, None] - expected_mm[None], axis=2)
+    worth = np.where(apart < gate_mm, score[:, None] * np.exp(-2.0 * (apart / gate_mm) ** 2), 0.0)
+    pairs = []
+    while worth.size and worth.max() > 0:
+        dot, wire = (int(i) for i in np.unravel_index(int(worth.argmax()), worth.shape))
+        pairs.append((dot, wire))
+        worth[dot], worth[:, wire] = 0.0, 0.0
+    return sorted(pairs, key=lambda pair: pair[1])

@@ -1,0 +1,348 @@
+"""The echo of a plane in an image: a straight line, found without help.
+
+Columns are looked down for the first strong edge from dark to light, and the line is the one most of these
+edges agree with. A frame in which too few agree has no line, and says why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from calibration.detection.columns import (
+    DENSELY,
+    BoolArray,
+    Columns,
+    IntArray,
+    lay_columns,
+    without_blank_sides,
+    without_standing,
+)
+from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.sweep import Frames
+from speckle3d.kernels.lines import consensus_line
+
+Float32Array = npt.NDArray[np.float32]
+
+_PARTS = (0.95, 0.85, 0.75, 0.65, 0.5)
+"""Brightness of an echo that counts when no threshold is given, as parts of the brightest one in the middle
+one of all columns: each is tried."""
+_WEAKER = 0.75
+"""How bright a line must be to go before a brighter one beneath it: brighter than haze and side lobes. The
+floor's reverberations lie beneath it and are no brighter."""
+_LEAST_SHARE = 0.25
+"""Part of the sampled columns that must agree however few the line could meet: two or three edges, which are
+noise, always agree with a line that cuts a corner of the region."""
+_FINEST_ROWS = 0.1
+"""Scatter below which an edge is not placed: interpolation between rows is not better."""
+
+
+class LineSettings(BaseModel):
+    """How the line of a plane's echo is found, [1]_ appendix B.
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    columns: int = Field(60, ge=5, description="Columns sampled, at regular intervals.")
+    smoothing_mm: float = Field(
+        0.7, gt=0, description="Standard deviation of the Gaussian along a column whose slope shows edges."
+    )
+    threshold: float | None = Field(
+        None,
+        gt=0,
+        description="Slope that makes an edge, grey levels per mm; by default echoes are judged by their "
+        "brightness instead, by several measures, and the first bright line is taken.",
+    )
+    tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
+    consensus: float = Field(
+        0.7, gt=0, le=1, description="Part that must agree of the columns whose region the line meets."
+    )
+    place: Place = Field(
+        "peak",
+        description="Where on an echo the line is put: where it has risen half way (front), where the "
+        "smoothed image is steepest (slope; up to smoothing_mm above a thin echo), or where it is brightest "
+        "(peak; a beam met by a wall at an angle has its middle there, its nearer edge at the front).",
+    )
+
+
+class NoLineError(InsufficientDataError):
+    """An image shows no line that can be trusted; the message says why."""
+
+
+@dataclass(frozen=True)
+class EchoLine:
+    """The line of a plane's echo in one image.
+
+    Attributes
+    ----------
+    points_px : ndarray, shape (2, 2)
+        Column and row, fractional, of two points on the line: at the mean of the agreeing columns minus and
+        plus their root mean square spread, where the errors of a fitted line are uncorrelated and equal.
+    point_sd_mm : float
+        Standard error of each point's depth, neighbouring columns' likeness accounted for.
+    direction_sd_rad : float
+        Standard error of the line's direction in the image plane.
+    consensus, possible : int
+        Columns that agree, and sampled columns whose region the line meets.
+    inlier_px : ndarray, shape (k, 2)
+        Column and row of the edges that agree.
+    """
+
+    points_px: FloatArray
+    point_sd_mm: float
+    direction_sd_rad: float
+    consensus: int
+    possible: int
+    inlier_px: FloatArray
+
+
+@dataclass(frozen=True)
+class EchoLines:
+    """The lines of a sequence.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (m,)
+        Numbers of the frames with a line, ascending.
+    points_px : ndarray, shape (m, 2, 2)
+    point_sd_mm, direction_sd_rad : ndarray, shape (m,)
+        See `EchoLine`.
+    dropped : dict of int to str
+        Why each other frame has none.
+    """
+
+    frame: IntArray
+    points_px: FloatArray
+    point_sd_mm: FloatArray
+    direction_sd_rad: FloatArray
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return int(self.frame.size)
+
+
+def detect_line(
+    image: npt.NDArray[Any],
+    pixel_mm: npt.ArrayLike,
+    settings: LineSettings | None = None,
+    region_px: npt.ArrayLike | None = None,
+) -> EchoLine:
+    """Find the line of a plane's echo in one image.
+
+    Parameters
+    ----------
+    image : ndarray, shape (column, row)
+        Grey levels or amplitudes of any real type, rows down from the probe.
+    pixel_mm : array_like, shape (2,)
+        Distance between columns and between rows, mm; a few per cent do not matter.
+    region_px : array_like, shape (k, 2), optional
+        Corners (column, row) of a polygon outside which nothing counts; by default the image without blank
+        columns at its sides.
+
+    Raises
+    ------
+    NoLineError
+        If too few columns agree on a line.
+    InvalidInputError
+        If an argument is not what it must be.
+    """
+    s = settings or LineSettings()
+    if image.ndim != 2:
+        raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
+    if not np.isrealobj(image):
+        raise InvalidInputError(f"image: expected real values, got {image.dtype}")
+    pixel = _checked_pixel(pixel_mm)
+    if region_px is None:
+        dense = lay_columns(image.shape, DENSELY * s.columns, None)
+        columns = without_blank_sides(dense, image).thinned(s.columns)
+    else:
+        columns = lay_columns(image.shape, s.columns, region_px)
+    return _detect(image, pixel, s, columns)
+
+
+def detect_lines(
+    frames: Frames,
+    pixel_mm: npt.ArrayLike,
+    settings: LineSettings | None = None,
+    region_px: npt.ArrayLike | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> EchoLines:
+    """Find the line of a plane's echo in every frame, read one at a time.
+
+    Without a region, columns in which nothing ever changes are left out, and so is what stands still above
+    everything that changes: the border and lettering of a recorded screen, and the transducer's ring-down.
+
+    Parameters
+    ----------
+    frames : Frames, shape (n, column, row)
+    pixel_mm, settings, region_px
+        See `detect_line`.
+    progress : callable, optional
+        Called with the number of frames done and their total.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is not what it must be.
+    """
+    s = settings or LineSettings()
+    if len(frames.shape) != 3 or np.issubdtype(frames.dtype, np.complexfloating):
+        raise InvalidInputError(
+            f"frames: expected real values of shape (n, column, row), got {frames.dtype} of {frames.shape}"
+        )
+    pixel = _checked_pixel(pixel_mm)
+    columns = lay_columns(frames.shape[1:], s.columns, region_px)
+    if region_px is None and frames.shape[0] > 0:
+        dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
+        columns = without_standing(dense, frames, s.smoothing_mm / pixel[1]).thinned(s.columns)
+    found: dict[int, EchoLine] = {}
+    dropped: dict[int, str] = {}
+    count = frames.shape[0]
+    for index in range(count):
+        try:
+            found[index] = _detect(frames[index], pixel, s, columns)
+        except NoLineError as error:
+            dropped[index] = str(error)
+        if progress:
+            progress(index + 1, count)
+    lines = list(found.values())
+    return EchoLines(
+        frame=np.array(list(found), dtype=np.int64),
+        points_px=np.reshape([line.points_px for line in lines], (-1, 2, 2)),
+        point_sd_mm=np.array([line.point_sd_mm for line in lines]),
+        direction_sd_rad=np.array([line.direction_sd_rad for line in lines]),
+        dropped=dropped,
+    )
+
+
+def _checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
+    pixel = np.asarray(pixel_mm, dtype=float)
+    if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
+        raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
+    return pixel
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A line that some columns' edges agree with."""
+
+    edges: Edges
+    agree: BoolArray
+    possible: int
+    start: float
+    slope: float
+
+    @property
+    def agreed(self) -> int:
+        return int(self.agree.sum())
+
+    @property
+    def strength(self) -> float:
+        return float(self.edges.strength[self.agree].mean())
+
+
+def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
+    samples = np.asarray(image[columns.column], np.float32)
+    _require_content(samples[columns.inside])
+    tolerance = s.tolerance_mm / float(pixel_mm[1])
+    profiles = take_profiles(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
+    if s.threshold is None:
+        score = profiles.brightness()
+        thresholds = [part * typical(score, columns) for part in _PARTS]
+    else:
+        score, thresholds = profiles.slope, [s.threshold * float(pixel_mm[1])]
+    echoes = [first_echoes(profiles, score, threshold, s.place) for threshold in thresholds]
+    tried = [_consensus(edges, columns, tolerance) for edges in _distinct(echoes)]
+    accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
+    if not accepted:
+        best = max(tried, key=lambda line: line.agreed)
+        raise NoLineError(
+            f"no line: {best.agreed} of {best.possible} possible columns agree, "
+            f"{_needed(best, columns, s)} needed"
+        )
+    return _measured(_first_strong(accepted, columns, tolerance), columns, pixel_mm)
+
+
+def _distinct(echoes: list[Edges]) -> list[Edges]:
+    """Without those like the ones before them, as neighbouring thresholds mostly give."""
+    kept = echoes[:1]
+    for edges in echoes[1:]:
+        if not np.array_equal(edges.row, kept[-1].row, equal_nan=True):
+            kept.append(edges)
+    return kept
+
+
+def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
+    shares = s.consensus * line.possible, _LEAST_SHARE * columns.held
+    return max(3, *(int(np.ceil(share - 1e-9)) for share in shares))
+
+
+def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -> _Candidate:
+    """The uppermost of the lines nearly as strong as the strongest, as the most columns see it."""
+    least = _WEAKER * max(line.strength for line in lines)
+    middle = float(columns.column.mean())
+    depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
+    upper = [line for line in lines if depths.get(id(line), np.inf) <= min(depths.values()) + tolerance]
+    return max(upper, key=lambda line: line.agreed)
+
+
+def _require_content(held: Float32Array) -> None:
+    if not np.isfinite(held).all():
+        raise NoLineError("no line: the image holds values that are not finite")
+    if held.size == 0 or np.ptp(held) == 0:
+        raise NoLineError("no line: the image is of one level all over")
+
+
+def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:
+    agree = np.zeros(edges.row.size, dtype=bool)
+    column = columns.column.astype(float)
+    possible, start, slope = consensus_line(column, edges.row, columns.inside, tolerance, agree)
+    return _Candidate(edges, agree, possible, start, slope)
+
+
+def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoLine:
+    # Errors of a fit's level at the mean column and of its slope are uncorrelated. One spread to either side
+    # both count the same, so that their sum and their difference are uncorrelated, too.
+    x, y = columns.column[line.agree].astype(float), line.edges.row[line.agree]
+    spread = float(x.std())
+    ends = x.mean() + spread * np.array([-1.0, 1.0])
+    residual = line.edges.row - line.start - line.slope * columns.column
+    level_sd_mm = _level_sd(np.where(line.agree, residual, np.nan)) * float(pixel_mm[1])
+    steepness = line.slope * pixel_mm[1] / pixel_mm[0]
+    return EchoLine(
+        points_px=np.stack([ends, line.start + line.slope * ends], axis=1),
+        point_sd_mm=float(np.sqrt(2.0) * level_sd_mm),
+        direction_sd_rad=float(level_sd_mm / (spread * pixel_mm[0]) / (1 + steepness**2)),
+        consensus=line.agreed,
+        possible=line.possible,
+        inlier_px=np.stack([x, y], axis=1),
+    )
+
+
+def _level_sd(residual: FloatArray) -> float:
+    """Standard error of the mean of residuals (NaN where missing) that may resemble their neighbours."""
+    there = np.isfinite(residual)
+    count = float(there.sum())
+    r = np.where(there, residual, 0.0)
+    energy = float(np.maximum(r @ r, count * _FINEST_ROWS**2))
+    likeness = 1.0
+    for lag in range(1, int(count) // 4):
+        pairs = max(1, int(np.count_nonzero(there[lag:] & there[:-lag])))
+        rho = float(r[lag:] @ r[:-lag]) * count / (energy * pairs)
+        if rho <= 0:
+            break
+        likeness += 2.0 * rho * (1 - lag / count)
+    likeness = float(np.minimum(likeness, count / 4))
+    # The line itself took two of as many free residuals as there are independent ones.
+    return float(np.sqrt(energy / (count - 2.0 * likeness) * likeness / count))

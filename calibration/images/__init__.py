@@ -1,0 +1,1 @@
+"""Calibration without a phantom, from two crossing sweeps."""

@@ -1,0 +1,196 @@
+"""A calibration from two crossing sweeps in pictures: images beside reslices, before and after; curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.images.angulation import PARAMETERS, Angulation, displacement_mm
+from calibration.images.curves import AXES, SimilarityCurves, SimilarityMap
+from calibration.images.stacks import TrackedImages
+from speckle3d.core.geometry import FloatArray
+from speckle3d.imaging.images import ChosenImages, GreyArray
+from speckle3d.imaging.reslice import image_plane, reslice_frames
+
+PIXEL_MM = 0.15
+_COLOURS = ("#0072B2", "#D55E00", "#009E73")
+_REACH_MM = 1.5
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """An image and what the other sweep shows in its place, at the start and at the answer.
+
+    Attributes
+    ----------
+    image, before, after : ndarray, shape (rows, columns)
+        NaN where nothing is shown.
+    width_mm, height_mm : float
+    title : str
+    """
+
+    image: GreyArray
+    before: GreyArray
+    after: GreyArray
+    width_mm: float
+    height_mm: float
+    title: str
+
+
+def pictures(
+    shown: TrackedImages, other: TrackedImages, frame: int, start: RigidTransform, found: RigidTransform
+) -> Pictures:
+    """Cut the plane of one image out of the other sweep, with either calibration."""
+    grid, frames = shown.grid, other.covered()
+    sensor = shown.world_from_sensor(np.array([frame]))[0]
+    cuts = []
+    for mounting in (start, found):
+        poses = other.world_from_sensor(frames) * mounting
+        plane = image_plane(sensor * mounting, grid, PIXEL_MM)
+        source = ChosenImages(other.images, frames)
+        cuts.append(reslice_frames(source, other.grid, poses, plane, _reach_mm(poses)))
+    alone, flat = RigidTransform.identity(1), image_plane(RigidTransform.identity(), grid, PIXEL_MM)
+    own = reslice_frames(ChosenImages(shown.images, np.array([frame])), grid, alone, flat, 1.0)
+    height = grid.depth_mm - grid.first_sample_depth_mm
+    return Pictures(own, cuts[0], cuts[1], grid.width_mm, height, f"{shown.name}, frame {frame}")
+
+
+def figure_images(
+    shown: Sequence[Pictures],
+    angulation: Angulation,
+    curves: SimilarityCurves,
+    maps: Sequence[SimilarityMap],
+    title: str,
+) -> Figure:
+    """One page: images beside reslices before and after, similarity about the answer, what errors do.
+
+    The maps are Figure 4 of [1]_.
+
+    References
+    ----------
+    .. [1] Wein and Khamene, SPIE Medical Imaging 6920, 2008.
+    """
+    figure = Figure(figsize=(12.0, 4.0 * len(shown) + 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    rows = len(shown)
+    panels = figure.subplots(rows + 2, 3, squeeze=False, height_ratios=[1.3] * rows + [1.0, 1.0])
+    for row, each in zip(panels, shown, strict=False):
+        for axes, image, what in zip(
+            row,
+            (each.image, each.before, each.after),
+            (each.title, "the other sweep there, before", "the other sweep there, after"),
+            strict=True,
+        ):
+            _draw_image(axes, image, each, what)
+    for axes, first, unit in ((panels[rows, 0], 3, "mm"), (panels[rows, 1], 0, "degrees")):
+        for k, colour in zip(range(first, first + 3), _COLOURS, strict=True):
+            axes.plot(curves.offset, curves.similarity[k], color=colour, label=AXES[k])
+        _label(axes, f"off the answer / {unit}", "mean correlation")
+        axes.legend(fontsize=8)
+    _draw_strength(panels[rows, 2], angulation)
+    for axes, found in zip(panels[-1], maps, strict=False):
+        _draw_map(axes, found)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def figure_reconstruction_error(
+    alpha_rad: float = -np.pi / 6,
+    point_mm: Sequence[float] = (40.0, 20.0, 0.0),
+    distance_mm: float = 100.0,
+    reach: float = 20.0,
+) -> Figure:
+    """Figure 2 of [1]_: how far apart two perpendicular fans put one point, against each calibration error.
+
+    Parameters
+    ----------
+    alpha_rad : float
+        Tilt of the first image; the second's follows from the point (equation 7).
+    point_mm : sequence of float
+        The point in the first image.
+    distance_mm : float
+        From the axis of the fans to the image's origin.
+    reach : float
+        Largest error, in mm and in degrees.
+
+    References
+    ----------
+    .. [1] Wein and Khamene, SPIE Medical Imaging 6920, 2008.
+    """
+    u, v, _ = point_mm
+    beta = -np.arctan(-u / ((v - distance_mm) * np.cos(alpha_rad)))
+    first = RigidTransform.from_rotation(Rotation.from_rotvec([alpha_rad, 0.0, 0.0]))
+    turned = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]) * Rotation.from_rotvec([beta, 0.0, 0.0])
+    second = RigidTransform.from_rotation(turned)
+    mounting = RigidTransform.from_translation([0.0, -distance_mm, 0.0])
+    values = np.linspace(-reach, reach, 81)
+    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, names, unit in zip(figure.subplots(1, 2), ("xyz", "θ"), ("mm", "degrees"), strict=True):
+        for k, colour in enumerate(_COLOURS):
+            errors = _errors(k, values, unit == "mm")
+            apart = [
+                np.linalg.norm(displacement_mm(first, second, mounting, e, list(point_mm))) for e in errors
+            ]
+            name = names[k] if unit == "mm" else f"{names}{'xyz'[k]}"
+            axes.plot(values, apart, color=colour, label=name)
+        _label(axes, f"calibration error / {unit}", "reconstruction error / mm")
+        axes.legend(fontsize=8)
+    return figure
+
+
+def _errors(axis: int, values: FloatArray, shift: bool) -> RigidTransform:
+    along = np.outer(values, np.eye(3)[axis])
+    if shift:
+        return RigidTransform.from_translation(along)
+    return RigidTransform.from_rotation(Rotation.from_rotvec(np.deg2rad(along)))
+
+
+def _reach_mm(poses: RigidTransform) -> float:
+    """A little more than the frames are apart, deep in a fan."""
+    steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
+    return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
+
+
+def _draw_image(axes: Axes, image: GreyArray, of: Pictures, title: str) -> None:
+    grey = of.image[np.isfinite(of.image)]
+    low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
+    extent = (0.0, of.width_mm, of.height_mm, 0.0)
+    axes.set_facecolor("#22303c")
+    axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="bilinear")
+    axes.set_title(title, fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def _draw_map(axes: Axes, found: SimilarityMap) -> None:
+    across, up = found.axes
+    drawn = axes.contourf(found.offset, found.offset, found.similarity.T, 16, cmap="viridis")
+    axes.figure.colorbar(drawn, ax=axes, label="mean correlation")
+    axes.plot(0.0, 0.0, "+", color="white")
+    _label(axes, f"{across} / {_unit_of(across)}", f"{up} / {_unit_of(up)}")
+
+
+def _unit_of(axis: str) -> str:
+    return "mm" if axis in ("x", "y", "z") else "degrees"
+
+
+def _draw_strength(axes: Axes, angulation: Angulation) -> None:
+    """How strongly each error shows, by itself and with the others free to hide it."""
+    place = np.arange(len(PARAMETERS))
+    axes.bar(place - 0.2, angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
+    axes.bar(place + 0.2, angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")
+    axes.set_xticks(place, [f"{name}\n/ {'°' if k < 3 else 'mm'}" for k, name in enumerate(PARAMETERS)])
+    _label(axes, "error", "disagreement / mm")
+    axes.legend(fontsize=8)
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(alpha=0.3)

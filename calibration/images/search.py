@@ -1,0 +1,188 @@
+"""From a start far off into the reach of Gauss-Newton: many cheap looks, the best followed up."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import qmc
+
+from calibration.images.crossing import Crossing, Level, Progress
+from calibration.images.fit import Estimate, Refined, refine
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import FloatArray
+
+GLANCE = Level(4.0, images=6, side=5, overlap=0.0, least_weight=0.45)
+FOLLOWED = Level(3.0, images=8, side=5, least_weight=0.45)
+COMPARED = Level(2.0, images=8)
+DECIDED = Level(1.2, images=8, overlap=0.25)
+
+_GLANCES = 1024
+"""Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
+once, but slopes that lead to it start much farther out."""
+
+_MORE_GLANCES = 4096
+"""Places looked at where nothing came of those: the right one may lie in a corner of the box."""
+
+_BESIDE = 256
+"""Places looked at about each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
+
+_FOLLOWED, _COMPARED, _HOPPED, _DECIDED = 20, 5, 3, 3
+
+_STEPS = 12
+
+_SAME_MM = 1.5
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the search ended, and in how many comparisons."""
+
+    estimate: Estimate
+    evaluations: int
+
+
+def search(
+    crossing: Crossing,
+    start: Estimate,
+    capture_mm: float,
+    capture_rad: float,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None = None,
+) -> Found:
+    """Look all over a box of six parameters about the start.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the sweeps show nothing in common anywhere.
+    """
+    say = progress or _silent
+    first = start.sensor_from_image
+    looks, followed = 0, []
+    for glances in (_GLANCES, _MORE_GLANCES):
+        looks += glances
+        best = _glanced(crossing, start, glances, capture_mm, capture_rad, pool, say)
+        followed = [
+            one
+            for one in (_refined(crossing, FOLLOWED, best, pool, say, "following up") if best else [])
+            if _within(first, one.estimate, capture_mm, capture_rad)
+        ]
+        if followed:
+            break
+    if not followed:
+        got = "none but farther off" if best else "no overlap anywhere"
+        raise InsufficientDataError(
+            f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
+            f"of the start, got {got}"
+        )
+    compared = _refined(crossing, COMPARED, _distinct(followed, crossing)[:_COMPARED], pool, say, "comparing")
+    # Where the tissue is layered, or repeats itself, the best place so far is often beside the right one.
+    hopped = _beside(crossing, compared[:_HOPPED], capture_mm, capture_rad, pool, say)
+    hopped = [one for one in hopped if _within(first, one.estimate, capture_mm, capture_rad)]
+    again = _refined(crossing, COMPARED, _distinct(hopped, crossing)[:_COMPARED], pool, say, "comparing")
+    best_first = sorted(compared + again, key=lambda one: -one.likeness.score)
+    left = _distinct(best_first, crossing)[:_DECIDED]
+    decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
+    looks += _BESIDE * len(compared[:_HOPPED])
+    looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
+    return Found(decided[0].estimate, looks)
+
+
+def _glanced(
+    crossing: Crossing,
+    start: Estimate,
+    count: int,
+    capture_mm: float,
+    capture_rad: float,
+    pool: ThreadPoolExecutor,
+    say: Progress,
+) -> list[Estimate]:
+    """The best of many places all over the box."""
+    places = _spread(start.sensor_from_image, capture_mm, capture_rad, count)
+    glance = crossing.level(GLANCE, start.sensor_from_image)
+    scores = np.empty(len(places))
+    for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
+        scores[n] = score
+        say("looking around", n + 1, len(places))
+    most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
+    return [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:most] if scores[n] > -1]
+
+
+def _beside(
+    crossing: Crossing,
+    about: list[Refined],
+    capture_mm: float,
+    capture_rad: float,
+    pool: ThreadPoolExecutor,
+    say: Progress,
+) -> list[Refined]:
+    """Look around the best places, in a box of half the capture, and follow up the best of what is there."""
+    best: list[Estimate] = []
+    for number, one in enumerate(about):
+        estimate = one.estimate
+        comparison = crossing.level(FOLLOWED, estimate.sensor_from_image)
+        places = _spread(estimate.sensor_from_image, 0.5 * capture_mm, 0.5 * capture_rad, _BESIDE)
+        found = list(
+            pool.map(lambda place, at=comparison, by=estimate: at.at(place, by.scales).score, places)
+        )
+        chosen = np.argsort(-np.array(found))[: _FOLLOWED // len(about)]
+        best += [Estimate(places[int(n)], estimate.scales) for n in chosen if found[int(n)] > -1]
+        say("looking beside", number + 1, len(about))
+    return _refined(crossing, FOLLOWED, best, pool, say, "following up") if best else []
+
+
+def _spread(first: RigidTransform, capture_mm: float, capture_rad: float, count: int) -> list[RigidTransform]:
+    """The start, and places spread evenly from which an increment within the box leads to it."""
+    places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
+    places[0] = 0.0
+    turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
+    away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
+    return list(first * away.inv())
+
+
+def _refined(
+    crossing: Crossing,
+    level: Level,
+    starts: list[Estimate],
+    pool: ThreadPoolExecutor,
+    say: Progress,
+    stage: str,
+) -> list[Refined]:
+    """Refine each, best first."""
+    comparison = crossing.level(level, starts[0].sensor_from_image)
+    done = []
+    for one in pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
+        done.append(one)
+        say(stage, len(done), len(starts))
+    return sorted(done, key=lambda one: -one.likeness.score)
+
+
+def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_rad: float) -> bool:
+    """Whether a place is no farther from the start than a corner of the box, and a fifth."""
+    step = found.sensor_from_image.inv() * first
+    far = np.sqrt(3.0) * 1.2
+    length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
+    return bool(length <= far * capture_mm + 1.0 and angle <= far * capture_rad + 0.02)
+
+
+def _distinct(found: list[Refined], crossing: Crossing) -> list[Estimate]:
+    """Estimates, less those that came to the same place as a better one."""
+    kept: list[Estimate] = []
+    for one in found:
+        if all(_apart(one.estimate, other, crossing.centre_mm) > _SAME_MM for other in kept):
+            kept.append(one.estimate)
+    return kept
+
+
+def _apart(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
+    """Distance, mm: of the centre, and of what turns about it 20 mm away."""
+    step = other.sensor_from_image.inv() * one.sensor_from_image
+    moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))
+    return float(np.hypot(moved, 20.0 * step.rotation.magnitude()))
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass

@@ -1,0 +1,312 @@
+"""Calibration without a phantom: two crossing sweeps of anything with structure must agree with each other.
+
+Images of each sweep are compared with what the other shows in their place, cut straight from its frames, and
+the calibration is moved until they are as alike as they can be.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging, 2008.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from calibration.images.covariance import covariance_at_origin, point_covariance
+from calibration.images.crossing import Crossing, Level, Progress, prepare
+from calibration.images.curvature import Settled, curvature, settle
+from calibration.images.fit import Estimate, Refined, refine
+from calibration.images.search import DECIDED, search
+from calibration.images.similarity import Comparison
+from calibration.images.simplex import climb
+from calibration.images.stacks import TrackedImages
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+
+__all__ = [
+    "Crossing",
+    "ImageCalibration",
+    "ImageSettings",
+    "Improvement",
+    "Progress",
+    "TrackedImages",
+    "calibrate_crossing",
+    "calibrate_images",
+    "prepare",
+]
+
+Method = Literal["gauss-newton", "nelder-mead"]
+
+FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
+"""Resolutions at which the answer of the search is refined. The last is still coarser than speckle; many
+images tell more there than patches that overlap, since every pose errs for itself."""
+
+SHOWN_SIGMA_MM = 1.0
+"""Blur at which similarities are reported, in units of the crossing."""
+
+LEAST_SIMILARITY = 0.3
+"""Correlation of patches where speckle is blurred away, times the root of the share of them with support,
+below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
+0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
+
+SPECKLED_SIMILARITY = 0.45
+"""Below, the verdict warns: shadows and reflections that the sweeps do not share displaced such answers by up
+to a millimetre and two degrees, more than the covariance says."""
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """How to calibrate from two crossing sweeps.
+
+    Parameters
+    ----------
+    method : str
+        ``"gauss-newton"``, or ``"nelder-mead"`` as published.
+    scales : bool
+        Estimate the two pixel sizes too. Sweeps that both turn about one point, as two that fan alike while
+        they slide do, cannot tell a larger image from one farther off: their standard errors say so. The size
+        along the beams is always the weaker one, and takes the place of a displacement along them.
+    capture_mm, capture_deg : float
+        How far each parameter of the start may be off; with zero both, the start is only refined.
+        The published method has no such range.
+    threads : int
+    """
+
+    method: Method = "gauss-newton"
+    scales: bool = False
+    capture_mm: float = 20.0
+    capture_deg: float = 20.0
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(Method):
+            raise InvalidInputError(
+                f"method: expected one of {', '.join(get_args(Method))}, got {self.method!r}"
+            )
+        for name, most in (("capture_mm", 100.0), ("capture_deg", 90.0)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= most:
+                raise InvalidInputError(f"{name}: expected 0 to {most:g}, got {value}")
+        if self.threads < 1:
+            raise InvalidInputError(f"threads: expected at least 1, got {self.threads}")
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """Mean correlation of images with cuts of the other sweep, at the start and at the answer.
+
+    NaN where the sweeps overlap in no image by three tenths.
+    """
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class ImageCalibration:
+    """Where the image is on the sensor, found from two crossing sweeps.
+
+    Attributes
+    ----------
+    sensor_from_image : RigidTransform
+    scales, scale_errors : ndarray, shape (2,)
+        Factors on the pixel sizes across and along the beams, and their standard errors; one and zero
+        where they were not estimated.
+    covariance : ndarray, shape (6, 6)
+        Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
+        then displacements along them in mm. From how the answer changes when one part of the scanned tissue,
+        or one stretch of a sweep, after another is left out, so it knows of speckle, reflections and jitter;
+        not of an error that all of them share, such as an uncorrected delay of the sensor or a wrong speed of
+        sound. Infinite where the sweeps determine nothing.
+    condition_number : float
+        Of the normal matrix's root with columns scaled to unit norm; a large one means that the sweeps leave
+        some motion of the image undetermined.
+    weakest : str
+        The parameter that makes up most of the least determined direction.
+    alike : float
+        Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
+        support; see `LEAST_SIMILARITY`.
+    similarity, held_out : Improvement
+        Of images that were compared, and of frames that were left out of everything.
+    frames_used, frames_held_out : tuple of ndarray of int
+        Frame numbers in either sweep.
+    evaluations : int
+        How many times the sweeps were compared.
+    """
+
+    method: Method
+    start: RigidTransform
+    sensor_from_image: RigidTransform
+    scales: FloatArray
+    scale_errors: FloatArray
+    pixel_mm: FloatArray
+    covariance: FloatArray
+    condition_number: float
+    weakest: str
+    alike: float
+    similarity: Improvement
+    held_out: Improvement
+    frames_used: tuple[tuple[int, ...], tuple[int, ...]]
+    frames_held_out: tuple[tuple[int, ...], tuple[int, ...]]
+    evaluations: int
+    converged: bool
+
+    def covariance_of(self, point_mm: FloatArray) -> FloatArray:
+        """Covariance of where a point of the image lies, along the image's axes, shape (3, 3), mm^2."""
+        return point_covariance(self.covariance, point_mm)
+
+
+def calibrate_images(
+    first: TrackedImages,
+    second: TrackedImages,
+    start: RigidTransform,
+    settings: ImageSettings | None = None,
+    progress: Progress | None = None,
+) -> ImageCalibration:
+    """Find where the image is on the sensor from two crossing sweeps.
+
+    Parameters
+    ----------
+    start : RigidTransform
+        A guess of sensor from image: a ruler's, or an old calibration.
+    progress : callable, optional
+        Called with the stage, and how many of how many of its steps are done.
+
+    Raises
+    ------
+    InvalidInputError, MismatchError
+        If the images, grids and start are not what they must be.
+    InsufficientDataError
+        If there are too few frames, or the sweeps do not overlap or have nothing in common.
+    """
+    return calibrate_crossing(prepare(first, second, progress), start, settings, progress)
+
+
+def calibrate_crossing(
+    crossing: Crossing,
+    start: RigidTransform,
+    settings: ImageSettings | None = None,
+    progress: Progress | None = None,
+) -> ImageCalibration:
+    """Calibrate from sweeps that are prepared already: `calibrate_images` for many starts."""
+    if not start.single:
+        raise InvalidInputError("start: expected a single transform, got a row of them")
+    chosen = settings or ImageSettings()
+    first = Estimate(start, np.ones(2))
+    with ThreadPoolExecutor(chosen.threads) as pool:
+        if chosen.method == "nelder-mead":
+            climbed = climb(crossing, first, chosen.scales, pool, progress)
+            found, evaluations, converged = climbed.estimate, climbed.evaluations, climbed.converged
+            refined = _look(crossing, found, chosen, pool)
+            alike = _require_alike(crossing, found, pool)
+            settled = Settled(refined, curvature(refined, pool))
+        else:
+            found, looks = _within_reach(crossing, first, chosen, pool, progress)
+            refined, steps = _refined(crossing, found, chosen, pool, progress)
+            alike = _require_alike(crossing, refined.estimate, pool)
+            settled = settle(refined, pool)
+            refined = settled.refined
+            found, evaluations, converged = refined.estimate, looks + steps, refined.converged
+    return _result(crossing, chosen, first, found, settled, alike, evaluations, converged)
+
+
+def _within_reach(
+    crossing: Crossing,
+    first: Estimate,
+    settings: ImageSettings,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None,
+) -> tuple[Estimate, int]:
+    if settings.capture_mm == 0.0 and settings.capture_deg == 0.0:
+        return first, 0
+    reach = np.deg2rad(settings.capture_deg)
+    found = search(crossing, first, settings.capture_mm, float(reach), pool, progress)
+    return found.estimate, found.evaluations
+
+
+def _refined(
+    crossing: Crossing,
+    found: Estimate,
+    settings: ImageSettings,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None,
+) -> tuple[Refined, int]:
+    evaluations = 0
+    for number, level in enumerate(FINE):
+        refined = refine(crossing.level(level, found.sensor_from_image), found, _free(settings), pool=pool)
+        found, evaluations = refined.estimate, evaluations + refined.evaluations
+        if progress:
+            progress("refining", number + 1, len(FINE))
+    return refined, evaluations
+
+
+def _look(crossing: Crossing, found: Estimate, settings: ImageSettings, pool: ThreadPoolExecutor) -> Refined:
+    """The derivatives at an answer that was found without them."""
+    comparison = crossing.level(FINE[-1], found.sensor_from_image)
+    return refine(comparison, found, _free(settings), max_steps=1, pool=pool)
+
+
+def _free(settings: ImageSettings) -> tuple[int, ...]:
+    return tuple(range(8 if settings.scales else 6))
+
+
+def _require_alike(crossing: Crossing, found: Estimate, pool: ThreadPoolExecutor) -> float:
+    """How alike the sweeps are at an answer, where speckle is blurred away."""
+    seen = crossing.level(DECIDED, found.sensor_from_image)
+    score = seen.at(found.sensor_from_image, found.scales, pool=pool).score
+    if score < LEAST_SIMILARITY:
+        got = "no overlap" if score < 0 else f"{score:.2f} at best"
+        raise InsufficientDataError(
+            "expected sweeps that show the same structure, with a correlation of at least "
+            f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
+        )
+    return score
+
+
+def _result(
+    crossing: Crossing,
+    settings: ImageSettings,
+    first: Estimate,
+    found: Estimate,
+    settled: Settled,
+    alike: float,
+    evaluations: int,
+    converged: bool,
+) -> ImageCalibration:
+    spread = covariance_at_origin(settled, crossing.unit)
+    near = found.sensor_from_image
+    shown = crossing.whole(SHOWN_SIGMA_MM, 10, near), crossing.check(SHOWN_SIGMA_MM, near)
+    return ImageCalibration(
+        method=settings.method,
+        start=first.sensor_from_image,
+        sensor_from_image=near,
+        scales=found.scales,
+        scale_errors=np.sqrt(np.diag(spread.covariance)[6:8]),
+        pixel_mm=crossing.pixel_mm * found.scales,
+        covariance=spread.covariance[:6, :6],
+        condition_number=spread.condition_number,
+        weakest=spread.weakest,
+        alike=alike,
+        similarity=_improvement(shown[0], first, found),
+        held_out=_improvement(shown[1], first, found),
+        frames_used=_numbers(crossing.frames_used),
+        frames_held_out=_numbers(crossing.frames_held_out),
+        evaluations=evaluations,
+        converged=converged,
+    )
+
+
+def _improvement(comparison: Comparison, first: Estimate, found: Estimate) -> Improvement:
+    before, after = (comparison.at(one.sensor_from_image, one.scales).mean for one in (first, found))
+    return Improvement(before, after)
+
+
+def _numbers(frames: tuple[np.ndarray, np.ndarray]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    a, b = (tuple(int(n) for n in row) for row in frames)
+    return a, b

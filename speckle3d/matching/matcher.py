@@ -1,0 +1,148 @@
+"""Frames made ready for matching, and frame pairs matched: the work every pair of a sweep shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from speckle3d.core.curves import CurveKey
+from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.matching.inplane import (
+    CoarseMatcher,
+    InPlaneMotion,
+    InPlaneSettings,
+    PatchMatch,
+    match_patches,
+)
+from speckle3d.matching.intensity import (
+    Complex64Array,
+    Float32Array,
+    IntensityExtractor,
+    IntensitySettings,
+    intensity_of,
+    two_way_wavenumber,
+)
+from speckle3d.matching.patches import PatchSettings, lay_patches
+
+
+class MatchingSettings(BaseModel):
+    """What of two frames is correlated once their in-plane motion is known."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    correlate: Literal["echo", "intensity"] = Field(
+        "echo",
+        description="echo: the complex echo, whose distances reach the Cramer-Rao bound and in which "
+        "structure that stays weighs less. intensity: as published. B-mode images hold intensity alone.",
+    )
+
+
+@dataclass(frozen=True)
+class Echo:
+    """One frame's intensity, shape (vector, sample), and the analytic signal it comes from, if known."""
+
+    intensity: Float32Array
+    analytic: Complex64Array | None
+
+
+@dataclass(frozen=True)
+class ReadyFrame:
+    """What is kept of a frame while pairs with it may still be measured."""
+
+    image: Float32Array
+    """Equalised intensity, shape (vector, sample)."""
+    spectrum: Complex64Array
+    """For the coarse search."""
+    echo: Float32Array | None = None
+    """Real and imaginary parts of the equalised echo, shape (2, vector, sample)."""
+
+
+class FrameMatcher:
+    """Prepares the frames of one sweep and matches pairs of them."""
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        intensity: IntensitySettings,
+        patches: PatchSettings,
+        inplane: InPlaneSettings,
+        matching: MatchingSettings | None = None,
+    ) -> None:
+        self.extractor = IntensityExtractor.for_sweep(sweep, intensity)
+        self.grid = self.extractor.grid
+        self.centre_mm = sweep.grid.centre_mm
+        self.patches = lay_patches(self.grid, patches)
+        self.at_mm = self.patches.centre_mm - self.centre_mm[:2]
+        self.inplane = inplane
+        self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
+        rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
+        self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"
+        self._wavenumber = two_way_wavenumber(rf) if rf is not None else 0.0
+        self.key = CurveKey(
+            sweep.signal,
+            self.grid.vector_pitch_mm,
+            patches.width_mm,
+            patches.height_mm,
+            intensity.equalise_mm,
+            "echo" if self.of_echo else "intensity",
+        )
+
+    def echo(self, frame: npt.NDArray[Any]) -> Echo:
+        """Echo of a frame as read."""
+        if not self.of_echo:
+            return Echo(self.extractor.intensity(frame), None)
+        analytic = self.extractor.analytic(frame)
+        return Echo(intensity_of(analytic), analytic)
+
+    def prepare(self, echo: Echo) -> ReadyFrame:
+        """Equalise an echo and transform it for the coarse search."""
+        image = self.extractor.equalise(echo.intensity)
+        parts = None
+        if echo.analytic is not None:
+            floor = np.finfo(np.float32).tiny
+            gain = np.sqrt(image / np.maximum(echo.intensity, floor))
+            parts = np.stack([echo.analytic.real * gain, echo.analytic.imag * gain])
+        return ReadyFrame(image, self._coarse.spectrum(image), parts)
+
+    def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:
+        """In-plane motion to the nearest sample, looked for over the whole search range."""
+        shift = self._coarse.shift(fixed.spectrum, moving.spectrum) * self.patches.spacing_mm
+        return InPlaneMotion(float(-shift[0]), float(-shift[1]))
+
+    def match(self, fixed: ReadyFrame, moving: ReadyFrame, start: InPlaneMotion) -> PatchMatch:
+        """In-plane motion and correlation of one pair, from a start that is right to about a sample."""
+        echoes = None
+        if fixed.echo is not None and moving.echo is not None:
+            echoes = fixed.echo, moving.echo
+        return match_patches(
+            fixed.image,
+            moving.image,
+            self.patches,
+            start,
+            self.centre_mm,
+            self.inplane,
+            echoes,
+            self._wavenumber,
+        )
+
+
+def compose(first: InPlaneMotion, then: InPlaneMotion) -> InPlaneMotion:
+    """In-plane motion over two steps, as a start for matching across both."""
+    c, s = np.cos(first.roll_rad), np.sin(first.roll_rad)
+    return InPlaneMotion(
+        first.x_mm + c * then.x_mm - s * then.y_mm,
+        first.y_mm + s * then.x_mm + c * then.y_mm,
+        first.roll_rad + then.roll_rad,
+    )
+
+
+def inverse(motion: InPlaneMotion) -> InPlaneMotion:
+    """In-plane motion the other way round."""
+    c, s = np.cos(motion.roll_rad), np.sin(motion.roll_rad)
+    return InPlaneMotion(
+        -c * motion.x_mm - s * motion.y_mm, s * motion.x_mm - c * motion.y_mm, -motion.roll_rad
+    )

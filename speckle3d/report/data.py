@@ -1,0 +1,252 @@
+"""What the report shows of one sweep, gathered from its folder and, where it is still there, the sweep."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.reconstruction import FramePairs, Reconstruction
+from speckle3d.core.streams import BoolArray
+from speckle3d.core.sweep import Sweep
+from speckle3d.io.calibrations import apply_calibrations
+from speckle3d.io.hdf5 import sha256_of
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.matching.quality import describe
+from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
+from speckle3d.study.job import Reference, find_reference
+
+FORMAT = "speckle3d.study"
+VERSION = 1
+
+QUANTITIES = ("length", "tilt", "yaw", "roll")
+"""What the curves show, in millimetres and then degrees."""
+
+_COVARIANCE_AXES = [2, 3, 4, 5]
+"""Where those are in (x, y, z, tilt, yaw, roll)."""
+
+
+@dataclass(frozen=True)
+class SweepCurves:
+    """Accumulated length (mm), tilt, yaw and roll (degrees) over the frames.
+
+    Attributes
+    ----------
+    modes : dict of str to ndarray, shape (4, n)
+    reference : ndarray, shape (4, n), or None
+        NaN at frames without one.
+    reference_name : str
+    half_width : ndarray, shape (4, n), or None
+        Of the 95 % interval of mode `image`.
+    """
+
+    modes: dict[str, FloatArray]
+    reference: FloatArray | None
+    reference_name: str
+    half_width: FloatArray | None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return int(next(iter(self.modes.values())).shape[1])
+
+
+@dataclass(frozen=True)
+class RejectedPatches:
+    """Share of the frame pairs in which each patch was left out, and of the patches in each frame.
+
+    Attributes
+    ----------
+    centre_mm : ndarray, shape (p, 2)
+    share : ndarray, shape (p,)
+        NaN for a patch that never had a distance.
+    frame_share : ndarray, shape (n,)
+        By the pair's first frame; NaN where it began no pair.
+    """
+
+    centre_mm: FloatArray
+    share: FloatArray
+    frame_share: FloatArray
+
+
+@dataclass(frozen=True)
+class SweepView:
+    """One sweep of a study, ready to be shown.
+
+    Attributes
+    ----------
+    poses : dict of str to RigidTransform, each of length n
+        By mode, in the first frame's image frame; the reference under its own name, if it covers every frame.
+    own_poses : dict
+        The same in their own worlds.
+    sweep : Sweep or None
+        None where the file is gone or changed; `notes` then says so.
+    """
+
+    name: str
+    folder: Path
+    reconstruction: Reconstruction
+    curves: SweepCurves
+    poses: dict[str, RigidTransform]
+    own_poses: dict[str, RigidTransform]
+    rejected: RejectedPatches | None
+    sweep: Sweep | None
+    details: Mapping[str, Any]
+    notes: list[str] = field(default_factory=list)
+
+
+def read_study(directory: Path) -> dict[str, Any]:
+    """Read ``study.json``.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is none, or it is not a study's.
+    """
+    path = directory / "study.json"
+    if not path.is_file():
+        raise InvalidInputError(f"{directory}: expected a study's folder with study.json, got none")
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InvalidInputError(f"{path}: expected JSON, got an error: {error}") from error
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InvalidInputError(f"{path}: expected format {FORMAT!r}, got another")
+    if found.get("version") != VERSION:
+        raise InvalidInputError(f"{path}: expected version {VERSION}, got {found.get('version')!r}")
+    return found
+
+
+def load_view(directory: Path, entry: Mapping[str, Any]) -> SweepView:
+    """Gather what there is to show of a sweep that is done.
+
+    Parameters
+    ----------
+    directory : path
+        The study's folder.
+    entry : mapping
+        Its entry in ``study.json``.
+
+    Raises
+    ------
+    Speckle3DError
+        If its reconstruction cannot be read.
+    """
+    folder = directory / str(entry["folder"])
+    found = read_reconstruction(folder / "reconstruction.h5")
+    details = _read_details(folder)
+    notes: list[str] = []
+    sweep = _open_sweep(directory, entry, found, notes)
+    reference = _open_reference(sweep, details, notes)
+    own = dict(found.poses)
+    if reference is not None and reference.covered.all():
+        own[reference.name] = reference.world_from_image
+    if found.trust is not None:
+        notes += [f"{line}: poses there are guesses" for line in describe(found.trust.flags)]
+    return SweepView(
+        name=str(entry["name"]),
+        folder=folder,
+        reconstruction=found,
+        curves=_curves(found, reference),
+        poses={mode: each[0].inv() * each for mode, each in own.items()},
+        own_poses=own,
+        rejected=None if found.pairs is None else rejected_patches(found.pairs, found.frame_time_s.size),
+        sweep=sweep,
+        details=details,
+        notes=notes,
+    )
+
+
+def rejected_patches(pairs: FramePairs, frames: int) -> RejectedPatches:
+    """Count how often each patch, and each frame's patches, were left out though a distance was there."""
+    measured = np.isfinite(pairs.distance_mm)
+    left_out = measured & ~pairs.used
+    by_frame = [np.bincount(pairs.first, each.sum(axis=1), frames) for each in (left_out, measured)]
+    return RejectedPatches(
+        pairs.patch_centre_mm, _share(left_out.sum(axis=0), measured.sum(axis=0)), _share(*by_frame)
+    )
+
+
+def _share(part: Any, whole: Any) -> FloatArray:
+    counts = np.asarray(whole, dtype=float)
+    return np.asarray(np.divide(part, counts, out=np.full(counts.shape, np.nan), where=counts > 0))
+
+
+def _read_details(folder: Path) -> Mapping[str, Any]:
+    """Read the sweep's summary as a mapping; empty where it is missing or no longer to be read."""
+    try:
+        (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return summary if isinstance(summary, dict) else {}
+
+
+def _open_sweep(
+    directory: Path, entry: Mapping[str, Any], found: Reconstruction, notes: list[str]
+) -> Sweep | None:
+    stored = Path(str(entry["path"]))
+    path = stored if stored.is_file() else directory / stored
+    missing = "so there is no reference in its curves and there are no reslices"
+    if not path.is_file():
+        notes.append(f"The sweep is no longer at {stored}, {missing}.")
+        return None
+    try:
+        if sha256_of(path) != found.provenance.input_sha256:
+            notes.append(f"The sweep at {stored} is no longer the one that was reconstructed, {missing}.")
+            return None
+        return apply_calibrations(load_sweep(path), [c.path for c in found.provenance.calibrations])[0]
+    except Speckle3DError as error:
+        notes.append(f"The sweep cannot be read ({error}), {missing}.")
+        return None
+
+
+def _open_reference(sweep: Sweep | None, details: Mapping[str, Any], notes: list[str]) -> Reference | None:
+    wanted = details.get("reference")
+    if sweep is None or wanted == "none":
+        return None
+    try:
+        return find_reference(sweep, wanted)
+    except Speckle3DError as error:
+        notes.append(f"The reference cannot be read: {error}")
+        return None
+
+
+def _curves(found: Reconstruction, reference: Reference | None) -> SweepCurves:
+    centre = found.grid.centre_mm
+    modes = {mode: _accumulated(each, centre) for mode, each in found.poses.items()}
+    half_width = None
+    if found.trust is not None:
+        deviation = np.sqrt(np.diagonal(found.trust.covariance, axis1=1, axis2=2)).T[_COVARIANCE_AXES]
+        half_width = 1.96 * _in_degrees(deviation)
+    shown = None if reference is None else _reference_curves(reference, modes["image"], centre)
+    return SweepCurves(modes, shown, reference.name if reference else "none", half_width)
+
+
+def _reference_curves(reference: Reference, estimate: FloatArray, centre_mm: FloatArray) -> FloatArray:
+    """Reference's curves; a jittery one starts at the estimate's level over its first few readings."""
+    used: BoolArray = reference.covered
+    poses = reference.world_from_image
+    curves = _accumulated(poses[used] if len(poses) == used.size else poses, centre_mm)
+    if reference.name != "truth":
+        start = (curves - estimate[:, used])[:, :JITTER_FRAMES]
+        curves -= np.median(start, axis=1, keepdims=True)
+    shown = np.full(estimate.shape, np.nan)
+    shown[:, used] = curves
+    return shown
+
+
+def _accumulated(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    motion = accumulated(poses, centre_mm)
+    return _in_degrees(np.stack([motion.length_mm, motion.tilt_rad, motion.yaw_rad, motion.roll_rad]))
+
+
+def _in_degrees(values: FloatArray) -> FloatArray:
+    return np.concatenate([values[:1], np.rad2deg(values[1:])])

@@ -1,0 +1,1 @@
+"""How far a reconstruction is from a reference: lengths, displacements, trajectories, statistics."""

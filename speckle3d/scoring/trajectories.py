@@ -1,0 +1,227 @@
+"""One trajectory against another, whatever files they come from: absolute and relative pose errors.
+
+As `evo` computes them [1]_, the first poses laid on each other (``--align_origin``), no scale and no fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray, relative_poses
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.challenge import Landmarks
+from speckle3d.io.hdf5 import file_format, open_hdf5, reading, sha256_of
+from speckle3d.io.load import load_landmarks, load_sweep, sniff
+from speckle3d.io.reconstructions import FORMAT, read_reconstruction
+from speckle3d.io.tum import LengthUnit, read_tum
+from speckle3d.scoring.displacements import drift_rates
+from speckle3d.scoring.scores import challenge_score, score_row
+from speckle3d.study.job import find_reference
+
+_ROUNDING_S = 0.5e-6
+"""What six decimals, the fewest in common use, take from a time. A probe at 100 mm/s moves 50 nm in it."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses on a clock, and what is known of the images at them.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+    poses : RigidTransform, length n
+        ``world_from_image``, in any world.
+    grid : ImageGrid or None
+        None where the file tells nothing of images; the poses' origin then stands for the image centre.
+    landmarks : Landmarks or None
+    sweep_sha256 : str
+        Of the sweep that the poses are of; empty where the file does not tell.
+    """
+
+    name: str
+    time_s: FloatArray
+    poses: RigidTransform
+    grid: ImageGrid | None = None
+    landmarks: Landmarks | None = None
+    sweep_sha256: str = ""
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Root mean square, mean and largest error of position (mm) and of angle (degrees)."""
+
+    rmse_mm: float
+    mean_mm: float
+    max_mm: float
+    rmse_deg: float
+    mean_deg: float
+    max_deg: float
+
+
+def absolute_pose_error(poses: RigidTransform, reference: RigidTransform) -> PoseError:
+    """APE: the poses of ``T_i^-1 T^_i``, with the first frames laid on each other, over all frames.
+
+    References
+    ----------
+    .. [1] M. Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
+    """
+    found, true = (each[0].inv() * each for each in (poses, reference))
+    return _pose_error(true.inv() * found)
+
+
+def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> PoseError:
+    """RPE: the poses of ``t_i^-1 t^_i`` from each frame to the next, over all steps."""
+    return _pose_error(relative_poses(reference).inv() * relative_poses(poses))
+
+
+def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | None = None) -> Trajectory:
+    """Read TUM text, or one mode of a reconstruction."""
+    if _is_hdf5(path):
+        return load_reconstructed(path, mode)
+    held = read_tum(path, length_unit)
+    return Trajectory(path.name, held.time_s, held.world_from_sensor)
+
+
+def load_reconstructed(path: Path, mode: str) -> Trajectory:
+    """Read one mode of a reconstruction.
+
+    Raises
+    ------
+    InvalidInputError
+        If the reconstruction has no such mode.
+    """
+    found = read_reconstruction(path, with_pairs=False)
+    if mode not in found.poses:
+        raise InvalidInputError(f"--mode: expected one of {', '.join(found.poses)}, got {mode!r}")
+    name, of = f"{path.name}, mode {mode}", found.provenance.input_sha256
+    return Trajectory(name, found.frame_time_s, found.poses[mode], found.grid, sweep_sha256=of)
+
+
+def load_reference(
+    path: Path, wanted: str | None = None, mode: str = "image", length_unit: LengthUnit | None = None
+) -> Trajectory:
+    """Read TUM text, a reconstruction, or the truth or tracker of a sweep.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the sweep has no reference.
+    """
+    if not _is_known(path) or _is_reconstruction(path):
+        return load_estimate(path, mode, length_unit)
+    sweep = load_sweep(path)
+    held = find_reference(sweep, wanted)
+    if held is None:
+        raise InsufficientDataError(f"{path}: expected truth or a calibrated tracker, got neither")
+    marks = load_landmarks(path) if held.covered.all() else None
+    times = sweep.frame_time_s[held.covered]
+    name = f"{path.name}, {held.name}"
+    return Trajectory(name, times, held.world_from_image, sweep.grid, marks, sha256_of(path))
+
+
+def kind_of(path: Path) -> str:
+    """Whether a file is taken for a "reconstruction", another "sweep", or "text"."""
+    if not _is_known(path):
+        return "text"
+    return "reconstruction" if _is_reconstruction(path) else "sweep"
+
+
+def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
+    """Score an estimate: ``poses`` compared, ``APE``, ``RPE``, and the metrics of `study.points`.
+
+    Poses belong together by time: the reference is interpolated at the estimate's times, and times it does
+    not cover are left out. Metrics that need pixels or landmarks are None where the files tell of none.
+    ``same_sweep`` is whether both are of the same bytes, None where a file does not tell.
+
+    Raises
+    ------
+    MismatchError
+        If the two share less than two times, or are of different images.
+    """
+    grid = estimate.grid or reference.grid
+    if estimate.grid and reference.grid and estimate.grid != reference.grid:
+        raise MismatchError(f"{estimate.name} and {reference.name}: expected images of one size, got two")
+    stream = TimedPoses(reference.time_s, reference.poses)
+    times = _snapped(estimate.time_s, reference.time_s)
+    shared = stream.covers(times)
+    if (common := int(shared.sum())) < 2:
+        both = f"{estimate.name} and {reference.name}"
+        raise MismatchError(f"{both}: expected at least 2 times that both have, got {common}")
+    found, true = estimate.poses[shared], stream.at(times[shared])
+    whole = bool(shared.all()) and len(true) == len(reference.poses)
+    marks = reference.landmarks if whole else None
+    of = estimate.sweep_sha256, reference.sweep_sha256
+    return {
+        "estimate": estimate.name,
+        "reference": reference.name,
+        "poses": len(found),
+        "left_out": len(shared) - common,
+        "same_sweep": of[0] == of[1] if all(of) else None,
+        "APE": absolute_pose_error(found, true),
+        "RPE": relative_pose_error(found, true),
+        **_scores(found, true, grid, marks),
+    }
+
+
+def _snapped(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
+    """Times with those that are a time of `onto_s` but for rounding set to it: the ends count, too."""
+    right = np.clip(np.searchsorted(onto_s, time_s), 1, max(onto_s.size - 1, 1))
+    near = [onto_s[np.minimum(each, onto_s.size - 1)] for each in (right - 1, right)]
+    nearest = np.where(np.abs(near[0] - time_s) <= np.abs(near[1] - time_s), *near)
+    return np.where(np.abs(nearest - time_s) <= _ROUNDING_S + np.spacing(nearest), nearest, time_s)
+
+
+def _scores(
+    found: RigidTransform, true: RigidTransform, grid: ImageGrid | None, marks: Landmarks | None
+) -> dict[str, Any]:
+    if grid is not None:
+        row = score_row(found, true, grid, marks)
+        return row | {"score": None if marks is None else challenge_score(found, true, grid, marks)}
+    rates = drift_rates(found, true, np.zeros(3))
+    row = {
+        "FDR": rates.final_drift_rate,
+        "ADR": rates.average_drift_rate,
+        "MD_mm": rates.maximum_drift_mm,
+        "SD_mm": rates.sum_of_drift_mm,
+        "HD_mm": rates.hausdorff_mm,
+        "EA_deg": rates.mean_angle_deg,
+    }
+    return row | dict.fromkeys(("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm", "score"))
+
+
+def _pose_error(errors: RigidTransform) -> PoseError:
+    shift = np.linalg.norm(errors.translation, axis=1)
+    angle = np.rad2deg(errors.rotation.magnitude())
+    values = [float(f(each)) for each in (shift, angle) for f in (_rms, np.mean, np.max)]
+    return PoseError(*values)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _is_known(path: Path) -> bool:
+    """Whether a file is of a kind that says so itself; text does not."""
+    try:
+        sniff(path)
+    except InvalidInputError:
+        return False
+    return True
+
+
+def _is_hdf5(path: Path) -> bool:
+    return _is_known(path) and sniff(path) == "hdf5"
+
+
+def _is_reconstruction(path: Path) -> bool:
+    if not _is_hdf5(path):
+        return False
+    with reading(path), open_hdf5(path) as file:
+        return "format" in file.attrs and file_format(file) == FORMAT

@@ -1,0 +1,159 @@
+"""The delay from images of a motion forward and back: found on simulated tissue, else refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import RigidTransform
+
+from calibration.clock.images import delay_from_images, smoothed
+from calibration.images.stacks import TrackedImages
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.streams import TimedPoses
+from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.study.images import GreyImages
+
+RATE_HZ = 50.0
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Tissue passed forward and back at 10 mm/s, 25 frames/s; the simulated images, not the sensor."""
+    settings = SimulationSettings(
+        preset="reversal", vectors=26, samples=1200, seed=77, length_mm=10.0, frames=50
+    )
+    sweep = simulate(settings)[0].sweep
+    made = GreyImages(sweep, 60.0, clipped=False)
+    return sweep, np.stack([made[i] for i in range(len(sweep))]), made.grid
+
+
+def tracked(recording, offset_s, jitter_mm=0.0, seed=0):
+    """The images with readings of their true poses on another clock; frames at the ends have none."""
+    sweep, images, grid = recording
+    times = np.arange(sweep.frame_time_s[0], sweep.frame_time_s[-1], 1.0 / RATE_HZ)
+    true = TimedPoses(sweep.frame_time_s, sweep.truth).at(times)
+    jitter = jitter_mm * np.random.default_rng(seed).standard_normal((len(times), 3))
+    poses = RigidTransform.from_translation(jitter) * true
+    return TrackedImages(images, grid, sweep.frame_time_s, TimedPoses(times - offset_s, poses))
+
+
+# Two milliseconds is the target; the poses here are interpolated between frames 40 ms apart.
+@pytest.mark.parametrize("offset_s", [0.065, -0.03])
+def test_a_known_delay_is_found(recording, offset_s):
+    found = delay_from_images(tracked(recording, offset_s), RigidTransform.identity(), 0.15)
+    assert found.seconds == pytest.approx(offset_s, abs=0.002)
+    assert found.standard_error_s < 0.002
+
+
+def test_the_standard_error_knows_the_trackers_jitter(recording):
+    exact = delay_from_images(tracked(recording, 0.02), RigidTransform.identity(), 0.1)
+    noisy = [
+        delay_from_images(tracked(recording, 0.02, 0.2, seed), RigidTransform.identity(), 0.1)
+        for seed in (1, 2, 3)
+    ]
+    # 0.2 mm in 100 readings at 10 mm/s: 0.2 * 2 / 10 / 20 = 2 ms, less what counts for the bootstrap too.
+    for found in noisy:
+        assert found.standard_error_s > exact.standard_error_s
+        assert 0.0012 < found.standard_error_s < 0.006
+        assert abs(found.seconds - 0.02) < 3.0 * found.standard_error_s
+
+
+def test_a_rough_mounting_is_enough(recording):
+    turned = RigidTransform.from_translation([3.0, -5.0, 8.0])
+    found = delay_from_images(tracked(recording, 0.03), turned, 0.1)
+    # A centimetre off turns 0.6 degrees of wander into 0.1 mm, at 10 mm/s either way 5 ms; here within 4.
+    assert found.seconds == pytest.approx(0.03, abs=0.004)
+
+
+def test_a_delay_outside_the_range_is_refused(recording):
+    with pytest.raises(InsufficientDataError, match=r"range's end|nearly as good"):
+        delay_from_images(tracked(recording, 0.2), RigidTransform.identity(), 0.08)
+
+
+def rolled(images):
+    """The way back first: what was seen at every place was seen more than a second before or after."""
+    return np.roll(images, 30, axis=0)
+
+
+def noise(images):
+    return np.random.default_rng(0).standard_normal(images.shape)
+
+
+def smooth_noise(images):
+    """As alike from frame to frame as images are."""
+    return gaussian_filter(noise(images), (2.0, 1.0, 4.0))
+
+
+def reversed_in_time(images):
+    return images[::-1]
+
+
+def mixed(images):
+    return images[np.random.default_rng(0).permutation(len(images))]
+
+
+def one_alone(images):
+    return np.repeat(images[:1], len(images), axis=0)
+
+
+@pytest.mark.parametrize("change", [rolled, noise, smooth_noise, reversed_in_time, mixed, one_alone])
+def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change):
+    whole = tracked(recording, 0.0)
+    with pytest.raises(InsufficientDataError, match="--search-s"):
+        delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), 0.4, 20)
+
+
+@pytest.mark.parametrize("offset_s", [0.6, -0.6])
+def test_a_delay_far_outside_the_range_is_refused(recording, offset_s):
+    with pytest.raises(InsufficientDataError, match=r"may lie outside|lies outside|forward and back"):
+        delay_from_images(tracked(recording, offset_s), RigidTransform.identity(), 0.3, 20)
+
+
+def test_noise_twice_the_picture_hides_no_delay(recording):
+    whole = tracked(recording, 0.03)
+    rough = whole.images + 2.0 * whole.images.std() * noise(whole.images)
+    found = delay_from_images(replace(whole, images=rough), RigidTransform.identity(), 0.15)
+    assert found.seconds == pytest.approx(0.03, abs=0.006)
+
+
+def test_images_of_one_plane_are_refused_at_once(recording):
+    whole = tracked(recording, 0.0)
+    times = whole.frame_time_s
+    along = 10.0 * np.sin(np.linspace(0.0, np.pi, times.size))
+    # Tremor of a millimetre across is less than a beam's width.
+    path = np.column_stack([along, 0.5 * along, 0.5 * np.sin(20.0 * times)])
+    readings = TimedPoses(times, RigidTransform.from_translation(path))
+    with pytest.raises(InsufficientDataError, match=r"across the image's plane .* got 0\.9 mm"):
+        delay_from_images(replace(whole, readings=readings, images=None), RigidTransform.identity(), 0.05)
+
+
+def test_a_motion_one_way_is_refused(recording):
+    whole = tracked(recording, 0.0)
+    half = replace(whole, images=whole.images[:25], frame_time_s=whole.frame_time_s[:25])
+    with pytest.raises(InsufficientDataError, match="forward and back"):
+        delay_from_images(half, RigidTransform.identity(), 0.05)
+
+
+def test_a_periodic_motion_is_refused_where_its_period_is_in_range(recording):
+    sweep, images, grid = recording
+    there = np.concatenate([np.arange(25), np.arange(24, -1, -1)])
+    index = np.tile(there, 5)
+    times = 0.04 * np.arange(index.size)
+    again = TrackedImages(images[index], grid, times, TimedPoses(times, sweep.truth[index]))
+    with pytest.raises(InsufficientDataError, match="nearly as good"):
+        delay_from_images(again, RigidTransform.identity(), 2.2, queries=10)
+
+
+def test_smoothing_takes_jitter_away_and_leaves_the_motion():
+    times = np.arange(0.0, 4.0, 0.02)
+    path = np.column_stack([10.0 * np.sin(times), 0.5 * times**2, np.zeros_like(times)])
+    clean = TimedPoses(times, RigidTransform.from_translation(path))
+    left = smoothed(clean, 0.2).world_from_sensor.translation - path
+    # What a parabola misses of 10 sin t over 0.1 s either way: 10 * 0.1**3 / 6 = 0.002 mm, at the ends more.
+    assert np.abs(left).max() < 0.005
+    rng = np.random.default_rng(0)
+    noisy = TimedPoses(times, RigidTransform.from_translation(path + rng.normal(0, 0.1, path.shape)))
+    # Eleven readings, a parabola: the middle's variance is 9/4 of the mean's, 0.1 * sqrt(0.207) = 0.046.
+    scatter = (smoothed(noisy, 0.2).world_from_sensor.translation - path).std()
+    assert 0.035 < scatter < 0.06

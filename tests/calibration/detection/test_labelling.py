@@ -1,0 +1,175 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+from wire_scenes import ENDS_MM, PIXEL_MM, candidates, cut, n_phantom, scene
+
+from calibration.chain import Chain
+from calibration.detection.dots import Dots
+from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
+from calibration.wirefit import linear_fits, rigid_fits
+from speckle3d.core.errors import InvalidInputError, MismatchError
+
+SYMMETRIC_MM = np.array(
+    [
+        [[30, 0, 10], [30, 40, 10]],
+        [[30, 0, 10], [60, 40, 10]],
+        [[60, 0, 10], [60, 40, 10]],
+        [[30, 0, 0], [30, 40, 0]],
+        [[30, 0, 0], [60, 40, 0]],
+        [[60, 0, 0], [60, 40, 0]],
+    ],
+    dtype=float,
+)
+"""Two equal N over each other: turned half round in the image it looks the same."""
+
+
+def away_mm(labelled, shown):
+    """How far each labelled dot is from where its wire is, at most in column or row."""
+    true = shown.pixels[labelled.frame, labelled.wire]
+    return np.abs((labelled.pixels - true) * PIXEL_MM).max(axis=1)
+
+
+NOISE_MM = 0.1
+RIGHT_MM = 5 * NOISE_MM
+"""Farther than this from its wire a dot is another one: ringing is 1.2 mm off."""
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("degrees", "wrong"), [(5.0, 1.0), (15.0, 1.05), (30.0, 0.96)])
+def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degrees, wrong):
+    shown = scene(seed, frames=12, degrees=degrees)
+    dots = Dots(*candidates(shown, seed, NOISE_MM))
+    labelled = label_dots(dots, shown.phantom, PIXEL_MM * wrong)
+    frames, counts = np.unique(labelled.frame, return_counts=True)
+    assert set(counts) == {9}
+    assert set(frames) | set(labelled.dropped) == set(range(12))
+    # Of 1440 such frames none was dropped, and in 7 a wrong dot, stronger and in line, stood for a wire.
+    assert len(frames) >= 11
+    assert (away_mm(labelled, shown).reshape(-1, 9).max(axis=1) > RIGHT_MM).sum() <= 1
+
+
+def test_upside_down_and_from_behind_wires_keep_their_names():
+    shown = scene(3, frames=1, degrees=8.0)
+    for signs in ([-1, 1], [1, -1], [-1, -1]):
+        turned = replace(shown, pixels=(shown.pixels - [220, 160]) * signs + [220, 160])
+        labelled = label_dots(Dots(*candidates(turned, 0, NOISE_MM)), shown.phantom, PIXEL_MM)
+        assert len(labelled) == 9
+        assert away_mm(labelled, turned).max() < RIGHT_MM
+
+
+def test_a_phantom_that_looks_the_same_from_two_sides_is_taken_the_usual_way():
+    shown = scene(4, frames=5, degrees=8.0, ends=SYMMETRIC_MM)
+    labelled = label_dots(Dots(*candidates(shown, 0, NOISE_MM, wrong=0)), shown.phantom, PIXEL_MM)
+    assert len(np.unique(labelled.frame)) == 5
+    assert away_mm(labelled, shown).max() < RIGHT_MM
+    upper, lower = (labelled.pixels[labelled.wire == k] for k in (0, 3))
+    assert (upper[:, 1] < lower[:, 1]).all()
+    assert (upper[:, 0] > labelled.pixels[labelled.wire == 2][:, 0]).all()
+
+
+def test_a_frame_without_one_of_the_wires_is_dropped_for_it():
+    shown = scene(5, frames=6)
+    dots = Dots(*candidates(shown, 0, NOISE_MM, wrong=0, missing={(2, 4), (4, 0)}))
+    labelled = label_dots(dots, shown.phantom, PIXEL_MM)
+    assert set(labelled.frame) == {0, 1, 3, 5}
+    assert set(labelled.dropped) == {2, 4}
+    known = {"no three dots in a line for layer 1", "no parallel lines of dots at the layers' distances"}
+    assert set(labelled.dropped.values()) <= {*known, "no dots fit the wires"}
+
+
+def truth(shown):
+    return Chain(PIXEL_MM, shown.sensor_from_image, shown.phantom.world_from_phantom.inv())
+
+
+def test_a_calibration_finds_the_wires_that_show_and_no_others():
+    shown = scene(6, frames=6)
+    missing = {(2, 4), (4, 0), (4, 1), (4, 2)}
+    dots = Dots(*candidates(shown, 0, NOISE_MM, missing=missing))
+    labelled = label_by_calibration(dots, shown.phantom, truth(shown), shown.world_from_sensor)
+    pairs = set(zip(labelled.frame.tolist(), labelled.wire.tolist(), strict=True))
+    right = away_mm(labelled, shown) < RIGHT_MM
+    assert right.sum() == 6 * 9 - 4
+    # Ringing under a wire stays within the gate of no other; a wrong dot may fall where a wire is missing.
+    assert {pair for pair, r in zip(sorted(pairs), right, strict=True) if not r} <= missing
+
+
+def test_a_calibration_takes_no_dot_beyond_the_gate():
+    shown = scene(7, frames=2)
+    dots = Dots(*candidates(shown, 0, noise_mm=0.0, wrong=0))
+    apart = replace(
+        truth(shown), sensor_from_image=shown.sensor_from_image * RigidTransform.from_translation([0, -3, 0])
+    )
+    none = label_by_calibration(
+        dots, shown.phantom, apart, shown.world_from_sensor, LabelSettings(gate_mm=1.0)
+    )
+    assert (away_mm(none, shown) > 1.0).all()
+    wide = label_by_calibration(
+        dots, shown.phantom, apart, shown.world_from_sensor, LabelSettings(gate_mm=3.3)
+    )
+    assert len(wide) == 18
+
+
+def test_no_dots_are_no_wires():
+    nothing = Dots(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0), {0: "no dot"})
+    shown = scene(8, frames=1)
+    for labelled in (
+        label_dots(nothing, shown.phantom, PIXEL_MM),
+        label_by_calibration(nothing, shown.phantom, truth(shown), shown.world_from_sensor),
+    ):
+        assert len(labelled) == 0
+        assert labelled.dropped == {0: "no dot"}
+
+
+def test_points_carry_the_poses_of_their_frames():
+    poses = RigidTransform.from_translation(np.arange(12.0).reshape(4, 3))
+    labelled = LabelledDots(np.array([1, 3]), np.ones((2, 2)), np.array([0, 1]))
+    points = labelled.points(poses)
+    np.testing.assert_array_equal(points.world_from_sensor.translation, [[3, 4, 5], [9, 10, 11]])
+    np.testing.assert_array_equal(points.wire, [0, 1])
+    with pytest.raises(MismatchError, match="expected a pose for frame 3, got 3 poses"):
+        labelled.points(poses[:3])
+
+
+@pytest.mark.parametrize(
+    ("ends", "patterns", "message"),
+    [
+        (ENDS_MM[:3], ((0, 1, 2),), "expected two N of wires or more, got 1"),
+        (ENDS_MM[:, :, [1, 0, 2]], (), "expected two N of wires or more, got 0"),
+    ],
+)
+def test_phantoms_whose_wires_cannot_be_told_apart_are_refused(ends, patterns, message):
+    dots = Dots(np.zeros(1, dtype=int), np.ones((1, 2)), np.ones(1))
+    with pytest.raises(InvalidInputError, match=message):
+        label_dots(dots, n_phantom(ends=ends, patterns=patterns), PIXEL_MM)
+
+
+def test_layers_that_are_askew_are_refused():
+    ends = ENDS_MM[:6].copy()
+    ends[3:] = Rotation.from_euler("z", 20, degrees=True).apply(ends[3:].reshape(-1, 3)).reshape(3, 2, 3)
+    dots = Dots(np.zeros(1, dtype=int), np.ones((1, 2)), np.ones(1))
+    with pytest.raises(InvalidInputError, match=r"expected parallel N, got one askew \(d\)"):
+        label_dots(dots, n_phantom(ends=ends, patterns=((0, 1, 2), (3, 4, 5))), PIXEL_MM)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=15)
+def test_an_image_that_cuts_wires_is_found_among_them(seed):
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)) * Rotation.from_euler("x", -90, degrees=True)
+    pose = RigidTransform.from_components([10.0, rng.uniform(15, 25), 30.0], turn)
+    scale = rng.uniform(0.97, 1.03, 2)
+    positions = (cut(ENDS_MM, pose) * PIXEL_MM / scale)[None]
+    wires = np.arange(9)[None]
+    # The ridge on axes that are left open keeps a hundredth of a millimetre.
+    assert linear_fits(positions - positions.mean(axis=1, keepdims=True), wires, n_phantom())[1] < 0.03
+    fits = rigid_fits(positions, wires, n_phantom(), scale_tolerance=0.05)
+    # The prior on the pixel size, three hundredths off at most, pulls; that costs a fifth of what noise does.
+    assert fits.rms_mm[0] < 0.06
+    found = fits.phantom_from_image[0].apply(np.column_stack([positions[0] * fits.scale[0], np.zeros(9)]))
+    assert n_phantom().distances_mm(found, wires[0]).max() < 0.15
+    wrong = rigid_fits(positions, wires[:, ::-1], n_phantom(), scale_tolerance=0.05)
+    assert wrong.rms_mm[0] > 0.5

@@ -1,0 +1,405 @@
+"""Lines of a floor's echo in images made from scatterers by a beam: no edge, no line, no model of either."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.path import Path as Polygon
+from pydantic import ValidationError
+
+from calibration.detection.columns import lay_columns
+from calibration.detection.lines import EchoLines, LineSettings, NoLineError, detect_line, detect_lines
+from speckle3d.core.errors import InvalidInputError
+
+PIXEL_MM = (0.25, 0.08)
+FRONT = LineSettings(place="front")
+"""The steadiest place in speckle; where a scatterer's echo is, is known for it."""
+SHAPE = (160, 300)
+WAVELENGTH_MM = 0.3
+BEAM_MM, PULSE_MM = 0.45, 0.16
+RANGE_DB = 60.0
+
+LEAD_MM = PULSE_MM * np.sqrt(2 * np.log(10 ** (RANGE_DB / 2 / 20)))
+"""How far above a scatterer its echo has half of all grey levels: 0.42 mm."""
+
+
+def echoes(shape, groups):
+    """Amplitude of scatterers seen by Gaussian beams and pulses; groups of (points in mm, strength, beam)."""
+    points = np.concatenate([group[0] for group in groups])
+    strength = np.concatenate([group[1] for group in groups])
+    beam = np.concatenate([np.full(len(group[0]), group[2]) for group in groups])
+    x, y = (np.arange(n)[:, None] * pixel for n, pixel in zip(shape, PIXEL_MM, strict=True))
+    across = np.exp(-(((x - points[:, 0]) / beam) ** 2) / 2)
+    along = np.exp(-(((y - points[:, 1]) / PULSE_MM) ** 2) / 2)
+    return (across * strength * np.exp(-4j * np.pi / WAVELENGTH_MM * points[:, 1])) @ along.T
+
+
+def floor_echo(
+    seed,
+    depth_mm=10.0,
+    degrees=5.0,
+    shape=SHAPE,
+    rough_mm=0.3,
+    lit=None,
+    reverberation=0.3,
+    lobes=0.02,
+    haze=0.05,
+    noise=0.003,
+):
+    """Amplitude (column, row) of a floor through `depth_mm` in the image's middle, sinking by `degrees`.
+
+    Its scatterers lie from the floor to some `rough_mm` beneath; `lit` says how strongly each place across
+    (0 to 1) answers. Echoes come again beneath, the wide side lobes show the floor above it, and there are
+    echoes of anything in the water.
+    """
+    rng = np.random.default_rng(seed)
+    width, height = shape[0] * PIXEL_MM[0], shape[1] * PIXEL_MM[1]
+    x = rng.uniform(-2.0, width + 2.0, int(12 * width))
+    y = depth_mm + np.tan(np.radians(degrees)) * (x - (shape[0] - 1) * PIXEL_MM[0] / 2)
+    strength = (rng.normal(size=x.size) + 1j * rng.normal(size=x.size)) * (
+        1 if lit is None else lit(x / width)
+    )
+    floor = np.stack([x, y + rng.exponential(rough_mm, x.size)], axis=1)
+    dust = rng.uniform([0, 0], [width, height], (int(width * height / 4), 2))
+    groups = [
+        (floor, strength, BEAM_MM),
+        (floor * [1, 1.35], reverberation * strength, BEAM_MM),
+        (floor * [1, 1.7], reverberation**2 * strength, BEAM_MM),
+        (floor * [1, 0.8], lobes * strength, 2.0),
+        (dust, haze * rng.normal(size=len(dust)), BEAM_MM),
+    ]
+    return np.abs(echoes(shape, groups) + noise * (rng.normal(size=shape) + 1j * rng.normal(size=shape))) / 4
+
+
+def grey(amplitude, range_db=RANGE_DB):
+    return np.clip(255 * (1 + 20 * np.log10(amplitude + 1e-12) / range_db), 0, 255).astype(np.uint8)
+
+
+def floor_image(seed, *arguments, **keywords):
+    return grey(floor_echo(seed, *arguments, **keywords))
+
+
+def too_deep_mm(line, depth_mm, degrees, columns=SHAPE[0]):
+    """How far each of the line's two points lies beneath the floor."""
+    x, y = (line.points_px * PIXEL_MM).T
+    return y - depth_mm - np.tan(np.radians(degrees)) * (x - (columns - 1) * PIXEL_MM[0] / 2)
+
+
+def error_degrees(line, degrees):
+    x, y = np.diff(line.points_px * PIXEL_MM, axis=0)[0]
+    return np.degrees(np.arctan2(y, x)) - degrees
+
+
+def assert_on_floor(line, depth_mm, degrees):
+    off = too_deep_mm(line, depth_mm, degrees)
+    # Ahead of the floor by no more than its own pulse, and by four standard errors (0.02 mm).
+    assert -LEAD_MM - 0.08 < off.mean() < 0.08
+    assert abs(error_degrees(line, degrees)) < 0.3  # four standard errors of a rough floor's, 0.07
+
+
+@pytest.mark.parametrize("degrees", [-14.0, -3.0, 0.0, 12.0])
+@pytest.mark.parametrize(
+    "conditions",
+    [
+        {},
+        {"noise": 0.05},
+        {"haze": 0.15},
+        {"lobes": 0.04, "reverberation": 0.1},
+        {"reverberation": 1.0},
+        {"lit": lambda place: np.where(np.abs(place - 0.4) > 0.12, 1.0, 0.0)},
+        {"lit": lambda place: 10 ** (-1.2 * place)},
+    ],
+    ids=["clean", "noise", "haze", "side lobes", "reverberations as bright", "drop-out", "fading by 24 dB"],
+)
+def test_a_floor_is_found_where_it_is(conditions, degrees):
+    line = detect_line(floor_image(1, 10.0, degrees, **conditions), PIXEL_MM, FRONT)
+    assert_on_floor(line, 10.0, degrees)
+    assert 0.7 * line.possible <= line.consensus <= line.possible <= 61
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int16, np.uint16, "grey of 40 dB"])
+def test_a_floor_is_found_in_levels_of_any_kind(kind):
+    amplitude = floor_echo(2, 10.0, 4.0)
+    image = grey(amplitude, 40.0) if isinstance(kind, str) else (1000 * amplitude).astype(kind)
+    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 10.0, 4.0)
+
+
+def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independently():
+    lines = [detect_line(floor_image(seed, 8.0, 5.0, (128, 220), lobes=0.0), PIXEL_MM) for seed in range(120)]
+    off = np.array([too_deep_mm(line, 8.0, 5.0, 128) for line in lines])
+    angle = np.radians([error_degrees(line, 5.0) for line in lines])
+    claimed, turned = (
+        np.sqrt(np.mean([getattr(line, name) ** 2 for line in lines]))
+        for name in ("point_sd_mm", "direction_sd_rad")
+    )
+    # A standard deviation of 240 (120) draws is itself known to 5 % (7 %).
+    assert 1 / 1.3 < off.std() / claimed < 1.3
+    assert 1 / 1.3 < angle.std() / turned < 1.3
+    assert abs(np.corrcoef(off.T)[0, 1]) < 0.3  # three standard errors
+
+
+def test_neighbouring_columns_likeness_counts():
+    image = floor_image(3, 10.0, 0.0)
+    few, many = (
+        detect_line(image, PIXEL_MM, LineSettings(columns=n, place="front")).point_sd_mm for n in (40, 160)
+    )
+    # Beams 0.45 mm wide: columns 0.25 mm apart tell little that those 1 mm apart do not, which as independent
+    # ones would halve the error.
+    assert many > 0.7 * few
+
+
+def test_where_on_the_echo_the_line_is_put():
+    image = floor_image(4, 10.0, 3.0, rough_mm=0.1)
+    depths = [
+        too_deep_mm(detect_line(image, PIXEL_MM, LineSettings(place=place)), 10.0, 3.0).mean()
+        for place in ("slope", "front", "peak")
+    ]
+    assert -0.7 - LEAD_MM / 2 < depths[0] < depths[1] < depths[2]
+    assert abs(depths[1] + LEAD_MM) < 0.2
+    assert abs(depths[2]) < 0.2  # a rough floor's own depth and half
+
+
+def test_a_threshold_decides_what_counts_as_an_echo():
+    image = floor_image(5, 12.0, 0.0, lobes=0.04, haze=0.0, rough_mm=0.1)
+    low, high = (detect_line(image, PIXEL_MM, LineSettings(threshold=t, place="front")) for t in (20.0, 90.0))
+    assert abs(too_deep_mm(low, 0.8 * 12.0, 0.0).mean() + LEAD_MM) < 0.5
+    assert_on_floor(high, 12.0, 0.0)
+    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 12.0, 0.0)
+
+
+def test_noise_has_no_line():
+    for seed in range(20):
+        image = np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8)
+        with pytest.raises(NoLineError, match=r"^no line: \d+ of \d+ possible columns agree, \d+ needed$"):
+            detect_line(image, PIXEL_MM, FRONT)
+
+
+@pytest.mark.parametrize(
+    ("image", "reason"),
+    [
+        (np.zeros(SHAPE, np.uint8), "of one level all over"),
+        (np.full(SHAPE, 255, np.uint8), "of one level all over"),
+        (np.where(np.eye(*SHAPE) > 0, np.nan, floor_echo(0)), "values that are not finite"),
+        (np.tile(np.arange(300, 0, -1.0), (160, 1)), "0 of 60 possible columns agree, 42 needed"),
+    ],
+    ids=["black", "saturated", "not a number", "no edge in any column"],
+)
+def test_a_frame_without_content_says_so(image, reason):
+    with pytest.raises(NoLineError, match=f"^no line: .*{re.escape(reason)}"):
+        detect_line(image, PIXEL_MM, FRONT)
+
+
+class TestRegion:
+    """A line as in TR 303's Figure 15: eleven columns, of which the first and the last two cannot meet it."""
+
+    REGION = ((0, 0), (100, 0), (100, 50), (85, 70), (82, 100), (8, 110), (0, 70))
+
+    def image(self):
+        # Rows 100, 98, ... in columns 0, 10, ... 100 but for the second, which is elsewhere in the region.
+        rows = np.array([50, 30, 96, 94, 92, 90, 88, 86, 84, 55, 40])
+        image = np.zeros((101, 140))
+        for column, row in zip(range(0, 101, 10), rows, strict=True):
+            image[column, row:] = 100.0
+        return image
+
+    def detected(self, consensus):
+        s = LineSettings(columns=11, consensus=consensus, place="slope", tolerance_mm=1.0)
+        return detect_line(self.image(), (1.0, 1.0), s, self.REGION)
+
+    def test_columns_the_line_cannot_meet_are_not_asked(self):
+        line = self.detected(7 / 8)
+        assert (line.consensus, line.possible) == (7, 8)
+        assert line.inlier_px[:, 0].tolist() == [20, 30, 40, 50, 60, 70, 80]
+        # An edge lies between the last dark row and the first bright one.
+        np.testing.assert_allclose(np.diff(line.points_px, axis=0)[0] @ [0.2, 1.0], 0.0, atol=1e-3)
+
+    def test_of_those_it_can_meet_enough_must_agree(self):
+        with pytest.raises(NoLineError, match="7 of 8 possible columns agree, 8 needed"):
+            self.detected(7 / 8 + 0.01)
+
+
+def test_only_what_is_inside_a_region_that_is_not_convex_counts():
+    image = floor_image(6, 12.0, 2.0)
+    image[20:140, 40:70] = 255  # a bar across the water
+    image[60:90, 40:160] = 0  # and no floor in the middle
+    around = [(0, 80), (0, 290), (159, 290), (159, 80), (95, 80), (90, 250), (60, 250), (55, 80)]
+    line = detect_line(image, PIXEL_MM, FRONT, region_px=around)
+    assert_on_floor(line, 12.0, 2.0)
+    assert line.possible < 50
+    assert not ((line.inlier_px[:, 0] > 61) & (line.inlier_px[:, 0] < 89)).any()
+    with pytest.raises(NoLineError):
+        detect_line(image, PIXEL_MM, FRONT, region_px=[(0, 0), (159, 0), (159, 60), (0, 60)])
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), corners=st.integers(3, 9))
+def test_any_simple_polygon_holds_the_rows_it_should(seed, corners):
+    rng = np.random.default_rng(seed)
+    turn = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    star = np.stack([np.cos(turn), np.sin(turn)], axis=1) * rng.uniform(10, 60, (corners, 1)) + [50, 40]
+    try:
+        columns = lay_columns((90, 80), 90, star)
+    except InvalidInputError:
+        return
+    at = np.stack(np.meshgrid(columns.column, np.arange(80), indexing="ij"), axis=-1).reshape(-1, 2)
+    held = Polygon(star).contains_points(at).reshape(columns.inside.shape)
+    assert (held != columns.inside).sum() <= 1  # rounding at a side
+    for place, first, last in columns.spans:
+        assert columns.inside[place, first : last + 1].all()
+        assert not columns.inside[place, [k for k in (first - 1, last + 1) if 0 <= k < 80]].any()
+    assert columns.inside.sum() == (columns.spans[:, 2] - columns.spans[:, 1] + 1).sum()
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    seed=st.integers(0, 1000),
+    degrees=st.floats(-12, 12),
+    gain=st.floats(0.01, 1e3),
+    level=st.floats(-100, 100),
+    down=st.integers(0, 20),
+    right=st.integers(0, 30),
+)
+def test_mirrored_shifted_and_amplified_images_have_mirrored_shifted_and_equal_lines(
+    seed, degrees, gain, level, down, right
+):
+    image = floor_image(seed, 9.0, degrees, (100, 240), haze=0.0).astype(float)
+    line = detect_line(image, PIXEL_MM, FRONT)
+    other = detect_line(image[::-1], PIXEL_MM, FRONT)
+    np.testing.assert_allclose(other.points_px[::-1], line.points_px * [-1, 1] + [99, 0], atol=1e-3)
+    assert other.point_sd_mm == pytest.approx(line.point_sd_mm, rel=1e-3)
+    other = detect_line(gain * image + level, PIXEL_MM, FRONT)
+    np.testing.assert_allclose(other.points_px, line.points_px, atol=0.02)  # float32 levels
+    dark = np.pad(image, ((right, 5), (down, 0)), constant_values=0.0)
+    corners = np.array([(0, 10), (99, 10), (99, 239), (0, 239)])
+    inside, moved = (
+        detect_line(im, PIXEL_MM, FRONT, region_px=corners + by)
+        for im, by in ((image, (0, 0)), (dark, (right, down)))
+    )
+    np.testing.assert_allclose(moved.points_px, inside.points_px + np.array([right, down]), atol=1e-3)
+
+
+class Reading:
+    """Frames that can be read one at a time only."""
+
+    def __init__(self, images):
+        self.images = images
+        self.shape = (len(images), *images[0].shape)
+        self.dtype = images[0].dtype
+
+    def __getitem__(self, index):
+        assert isinstance(index, int)
+        return self.images[index]
+
+
+def moving_floor(count=12, **keywords):
+    depths, degrees = np.linspace(9.0, 13.0, count), np.linspace(-8.0, 8.0, count)
+    images = [floor_image(k, d, a, **keywords) for k, (d, a) in enumerate(zip(depths, degrees, strict=True))]
+    return images, depths, degrees
+
+
+def assert_on_floors(found, depths, degrees):
+    for k, points in zip(found.frame, found.points_px, strict=True):
+        assert_on_floor(type("Line", (), {"points_px": points}), depths[k], degrees[k])
+
+
+def test_a_sequence_has_its_lines_and_its_reasons():
+    images, depths, degrees = moving_floor(8)
+    images[3] = np.zeros_like(images[3])
+    images[5] = np.random.default_rng(0).integers(0, 256, SHAPE, dtype=np.uint8)
+    calls = []
+    found = detect_lines(Reading(images), PIXEL_MM, FRONT, progress=lambda *done: calls.append(done))
+    assert isinstance(found, EchoLines)
+    assert found.frame.tolist() == [0, 1, 2, 4, 6, 7]
+    assert len(found) == 6
+    assert found.points_px.shape == (6, 2, 2)
+    assert (found.point_sd_mm > 0).all()
+    assert (found.direction_sd_rad > 0).all()
+    assert_on_floors(found, depths, degrees)
+    assert set(found.dropped) == {3, 5}
+    assert found.dropped[3] == "no line: the image is of one level all over"
+    assert re.fullmatch(r"no line: \d+ of \d+ possible columns agree, \d+ needed", found.dropped[5])
+    assert calls == [(k + 1, 8) for k in range(8)]
+
+
+def test_a_sequence_without_lines_is_empty_not_an_error():
+    found = detect_lines(np.zeros((3, 50, 60), np.uint8), PIXEL_MM)
+    assert found.frame.shape == (0,)
+    assert found.points_px.shape == (0, 2, 2)
+    assert set(found.dropped) == {0, 1, 2}
+
+
+def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
+    images, depths, degrees = moving_floor()
+    ring = 255 * (np.sin(np.arange(36) / 36 * 6 * np.pi) ** 2)
+    letters = np.random.default_rng(1).integers(0, 2, (60, 12)) * 255
+    screens = []
+    for k, image in enumerate(images):
+        flicker = np.random.default_rng(k).normal(0, 6, (SHAPE[0], 36))
+        image[:, :36] = np.clip(np.maximum(image[:, :36], ring + flicker), 0, 255)
+        screen = np.zeros((SHAPE[0] + 140, SHAPE[1] + 60), np.uint8)
+        screen[70:-70, 40:-20] = image
+        screen[5:65, 100:112] = letters
+        screen[100:160, 10:22] = letters
+        screen[-60:, 150:162] = letters
+        screens.append(screen)
+    found = detect_lines(Reading(screens), PIXEL_MM, FRONT)
+    found.points_px[:] -= [70, 40]
+    assert found.dropped == {}
+    assert_on_floors(found, depths, degrees)
+
+
+def test_a_probe_held_still_does_not_hide_the_floor():
+    images = [floor_image(7, 10.0, 3.0, noise=0.0)] * 4 + [floor_image(7, 10.0, 3.0, noise=0.01)]
+    for sequence in (images[:4], images):
+        found = detect_lines(Reading(sequence), PIXEL_MM, FRONT)
+        assert found.dropped == {}
+        assert_on_floors(found, [10.0] * 5, [3.0] * 5)
+
+
+def test_a_region_is_taken_as_it_is():
+    images, *_ = moving_floor(4)
+    region = [(20, 60), (140, 60), (140, 290), (20, 290)]
+    found = detect_lines(Reading(images), PIXEL_MM, FRONT, region_px=region)
+    each = [detect_line(image, PIXEL_MM, FRONT, region_px=region) for image in images]
+    np.testing.assert_array_equal(found.points_px, [line.points_px for line in each])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((0.25,),), r"pixel_mm: expected two values above zero, got \[0\.25\]"),
+        (((0.25, -1.0),), "pixel_mm: expected two values above zero"),
+        (
+            (PIXEL_MM, None, [(0, 0), (1, 1)]),
+            r"expected shape \(k, 2\) with k of 3 or more, got \(2, 2\)",
+        ),
+        ((PIXEL_MM, None, [(0, 0), (9, np.nan), (9, 9)]), r"region_px\[\(1, 1\)\]: expected a finite value"),
+        ((PIXEL_MM, None, [(900, 0), (950, 0), (950, 90)]), "covers part of the 160 x 300 pixels, got none"),
+        ((PIXEL_MM, None, [(0, -90), (90, -90), (90, -5)]), "covers part of the 160 x 300 pixels, got none"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(arguments, message):
+    image = floor_image(0)
+    for detect, given_image in ((detect_line, image), (detect_lines, image[None])):
+        with pytest.raises(InvalidInputError, match=message):
+            detect(given_image, *arguments)
+
+
+def test_images_of_another_kind_are_refused():
+    with pytest.raises(InvalidInputError, match=r"expected shape \(column, row\), got \(2, 160, 300\)"):
+        detect_line(np.zeros((2, *SHAPE)), PIXEL_MM)
+    with pytest.raises(InvalidInputError, match="expected real values, got complex128"):
+        detect_line(np.zeros(SHAPE, complex), PIXEL_MM, FRONT)
+    for frames in (np.zeros(SHAPE), np.zeros((2, *SHAPE), complex)):
+        with pytest.raises(InvalidInputError, match=r"expected real values of shape \(n, column, row\), got"):
+            detect_lines(frames, PIXEL_MM, FRONT)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"columns": 2}, {"smoothing_mm": 0}, {"tolerance_mm": -1}, {"consensus": 1.1}, {"sigma": 1}]
+)
+def test_settings_out_of_range_or_misspelt_are_refused(setting):
+    with pytest.raises(ValidationError):
+        LineSettings(**setting)

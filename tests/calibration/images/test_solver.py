@@ -1,0 +1,247 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
+from scipy.spatial.transform import RigidTransform
+
+from calibration.images.curves import AXES, similarity_curves, similarity_map
+from calibration.images.solver import ImageSettings, calibrate_crossing, calibrate_images, prepare
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import ImageGrid
+
+REFINE = ImageSettings(capture_mm=0.0, capture_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return crossing_sweeps(0, frames=36)
+
+
+@pytest.fixture(scope="module")
+def crossing(scene):
+    return prepare(*scene[:2])
+
+
+@pytest.fixture(scope="module")
+def found(scene, crossing):
+    start = displaced(scene[2], np.random.default_rng(0))
+    return calibrate_crossing(crossing, start)
+
+
+@pytest.fixture(scope="module")
+def others():
+    """Sweeps of something else."""
+    return crossing_sweeps(1, frames=20)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_far_starts_reach_the_truth(scene, crossing, found, seed):
+    start = displaced(scene[2], np.random.default_rng(seed))
+    result = found if seed == 0 else calibrate_crossing(crossing, start)
+    error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
+    # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.
+    assert np.linalg.norm(error) < 0.5
+    assert np.linalg.norm(error[[0, 2]]) < 0.1
+    turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
+    assert np.rad2deg(turned) < 0.5
+
+
+def test_result_says_what_was_gained(found):
+    # No overlap at all at such a start, or less alike.
+    assert not found.similarity.before >= found.similarity.after
+    assert found.similarity.after > 0.9
+    assert found.held_out.after > 0.9
+    assert found.converged
+    assert found.evaluations > 1000
+    for used, held in zip(found.frames_used, found.frames_held_out, strict=True):
+        assert sorted(used + held) == list(range(36))
+        assert len(held) == 3
+
+
+def test_errors_are_within_what_the_covariance_says(scene, found):
+    grid, truth = scene[0].grid, scene[2]
+    spread = np.sqrt(np.diag(found.covariance_of(grid.centre_mm)))
+    assert (np.abs(centre_error_mm(found.sensor_from_image, truth, grid)) < 4.0 * spread).all()
+    turned = (truth.inv() * found.sensor_from_image).rotation.as_rotvec()
+    assert (np.abs(turned) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
+    # Neither is it a bound that anything keeps.
+    assert (spread < 0.2).all()
+
+
+def test_covariance_of_a_point_is_that_of_its_place(found):
+    rng, point = np.random.default_rng(0), np.array([10.0, 20.0, 0.0])
+    pose = rng.multivariate_normal(np.zeros(6), found.covariance, 100_000)
+    moved = np.cross(pose[:, :3], point) + pose[:, 3:]
+    # A covariance from n samples is known to sqrt(2 / n), here half a per cent; six times that.
+    np.testing.assert_allclose(np.diag(found.covariance_of(point)), moved.var(axis=0), rtol=0.03)
+
+
+def test_held_out_frames_have_no_say(scene, crossing):
+    first, second, truth = scene
+    spoilt = first.images.copy()
+    spoilt[crossing.frames_held_out[0]] = 255 - spoilt[crossing.frames_held_out[0]]
+    start = displaced(truth, np.random.default_rng(3), 2.0, 2.0)
+    plain = calibrate_crossing(crossing, start, REFINE)
+    other = calibrate_images(dataclasses.replace(first, images=spoilt), second, start, REFINE)
+    np.testing.assert_array_equal(other.sensor_from_image.as_matrix(), plain.sensor_from_image.as_matrix())
+    assert other.held_out.after < plain.held_out.after - 0.3
+
+
+def test_pixel_sizes_are_found():
+    # Two that fan alike turn about one point, and about it everything could be larger.
+    first, second, truth = crossing_sweeps(0, frames=30, fan_deg=(0.0, 40.0))
+    grid = first.grid
+    wrong = ImageGrid(grid.vectors, grid.samples, grid.vector_pitch_mm / 1.03, grid.sample_spacing_mm / 0.98)
+    views = [dataclasses.replace(view, grid=wrong) for view in (first, second)]
+    start = displaced(truth, np.random.default_rng(4), 2.0, 2.0)
+    result = calibrate_images(*views, start, dataclasses.replace(REFINE, scales=True))
+    assert (result.scale_errors > 0).all()
+    # The size across the beams, three per cent off at first; that along them stays uncertain.
+    assert abs(result.scales[0] - 1.03) < min(0.01, 4.0 * result.scale_errors[0])
+    assert result.scale_errors[1] > 3.0 * result.scale_errors[0]
+    np.testing.assert_allclose(
+        result.pixel_mm / result.scales, [wrong.vector_pitch_mm, wrong.sample_spacing_mm]
+    )
+    held = calibrate_images(first, second, start, REFINE)
+    assert (held.scales == 1.0).all()
+    assert (held.scale_errors == 0.0).all()
+
+
+def test_published_method_reaches_the_same_from_nearby(others):
+    first, second, truth = others
+    start = displaced(truth, np.random.default_rng(5), 4.0, 4.0)
+    result = calibrate_images(first, second, start, ImageSettings(method="nelder-mead"))
+    error = centre_error_mm(result.sensor_from_image, truth, first.grid)
+    # Published: 2.4 mm at the centre.
+    assert np.linalg.norm(error) < 2.4
+    assert result.similarity.after > result.similarity.before
+    assert np.isfinite(result.covariance).all()
+
+
+def test_what_never_changes_is_not_compared(scene):
+    first, second, truth = scene
+    start = displaced(truth, np.random.default_rng(6), 3.0, 3.0)
+    plain = calibrate_images(first, second, start, REFINE)
+    views = []
+    for view in (first, second):
+        images = view.images.copy()
+        images[:, :10], images[:, -10:], images[:, :, 215:] = 0, 0, 20  # a sector's sides, and writing
+        views.append(dataclasses.replace(view, images=images))
+    masked = calibrate_images(*views, start, REFINE)
+    error = centre_error_mm(masked.sensor_from_image, truth, first.grid)
+    assert np.linalg.norm(error) < 0.5
+    # Less of the image is left, so less is known.
+    assert np.trace(masked.covariance) > np.trace(plain.covariance)
+
+
+def test_frames_without_readings_are_left_out(scene):
+    first, second, truth = scene
+    kept = slice(6, None)
+    few = TimedPoses(first.readings.time_s[kept], first.readings.world_from_sensor[kept])
+    start = displaced(truth, np.random.default_rng(7), 3.0, 3.0)
+    result = calibrate_images(dataclasses.replace(first, readings=few), second, start, REFINE)
+    assert min(result.frames_used[0] + result.frames_held_out[0]) == 6
+    assert np.linalg.norm(centre_error_mm(result.sensor_from_image, truth, first.grid)) < 0.5
+
+
+def test_delay_of_the_sensor_counts(scene):
+    first, second, truth = scene
+    views = []
+    for view in (first, second):
+        late = TimedPoses(view.readings.time_s + 0.06, view.readings.world_from_sensor)
+        views.append(dataclasses.replace(view, readings=late, time_offset_s=-0.06))
+    start = displaced(truth, np.random.default_rng(8), 3.0, 3.0)
+    one, other = calibrate_images(*views, start, REFINE), calibrate_images(first, second, start, REFINE)
+    np.testing.assert_allclose(
+        one.sensor_from_image.as_matrix(), other.sensor_from_image.as_matrix(), atol=1e-3
+    )
+
+
+def test_parallel_sweeps_leave_translation_undetermined():
+    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=0.0)
+    second, *_ = crossing_sweeps(2, frames=20, fan_deg=0.0, crossing_deg=4.0)
+    start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
+    parallel = calibrate_images(first, second, start, REFINE)
+    # Sweeps that cross know it to 0.1 mm.
+    assert np.sqrt(parallel.covariance[4, 4]) > 1.0
+
+
+def test_similarity_falls_from_the_answer_whichever_parameter_moves(crossing, found):
+    curves = similarity_curves(crossing, found.sensor_from_image, span=6.0, points=13)
+    assert curves.similarity.shape == (len(AXES), 13)
+    best = curves.offset[np.nanargmax(curves.similarity, axis=1)]
+    assert (np.abs(best) <= 0.5).all()
+    assert (curves.similarity[:, 6] - np.nanmin(curves.similarity, axis=1) > 0.05).all()
+
+
+def test_similarity_map_contains_the_curves(crossing, found):
+    curves = similarity_curves(crossing, found.sensor_from_image, span=4.0, points=5)
+    surface = similarity_map(crossing, found.sensor_from_image, ("x", "yaw"), span=4.0, points=5)
+    np.testing.assert_allclose(surface.similarity[:, 2], curves.similarity[AXES.index("x")])
+    np.testing.assert_allclose(surface.similarity[2], curves.similarity[AXES.index("yaw")])
+    with pytest.raises(InvalidInputError, match="expected two of tilt, yaw"):
+        similarity_map(crossing, found.sensor_from_image, ("x", "sideways"))
+
+
+def test_progress_is_told(scene, others):
+    told = []
+    start = displaced(others[2], np.random.default_rng(10), 1.0, 1.0)
+    calibrate_images(*others[:2], start, progress=lambda *step: told.append(step))
+    stages = [stage for stage, *_ in told]
+    order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
+    order += ["looking beside", "deciding", "refining"]
+    assert list(dict.fromkeys(stages)) == order
+    assert all(1 <= done <= total for _, done, total in told)
+
+
+def test_sweeps_of_different_things_are_refused(scene, others):
+    with pytest.raises(
+        InsufficientDataError, match=r"expected sweeps that (show the same structure|agree within)"
+    ):
+        calibrate_images(scene[0], others[1], scene[2])
+
+
+def test_sweeps_apart_are_refused(scene):
+    first, second, truth = scene
+    away = RigidTransform.from_translation([500.0, 0.0, 0.0]) * second.readings.world_from_sensor
+    apart = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, away))
+    with pytest.raises(InsufficientDataError, match="got no overlap anywhere"):
+        calibrate_images(first, apart, truth)
+    with pytest.raises(InsufficientDataError, match="got no overlap"):
+        calibrate_images(first, apart, truth, REFINE)
+
+
+def test_bad_input_is_named(scene):
+    first, second, truth = scene
+    still = dataclasses.replace(second, images=np.zeros_like(second.images))
+    with pytest.raises(InsufficientDataError, match="sweep 2: expected images that change"):
+        calibrate_images(first, still, truth)
+    short = TimedPoses(second.readings.time_s[:4], second.readings.world_from_sensor[:4])
+    with pytest.raises(InsufficientDataError, match="sweep 2: expected at least 10 frames"):
+        calibrate_images(first, dataclasses.replace(second, readings=short), truth)
+    coarse = dataclasses.replace(second, grid=dataclasses.replace(second.grid, vector_pitch_mm=0.5))
+    with pytest.raises(MismatchError, match="expected the pixels of sweep 1"):
+        calibrate_images(first, coarse, truth)
+    with pytest.raises(MismatchError, match="expected 30 frame times for 30 images, got 36"):
+        calibrate_images(first, dataclasses.replace(second, images=second.images[:30]), truth)
+    with pytest.raises(InvalidInputError, match="start: expected a single transform"):
+        calibrate_images(first, second, RigidTransform.concatenate([truth, truth]))
+    with pytest.raises(InvalidInputError, match="method: expected one of"):
+        ImageSettings(method="amoeba")
+    with pytest.raises(InvalidInputError, match="capture_mm: expected 0 to 100"):
+        ImageSettings(capture_mm=-1.0)
+    with pytest.raises(InvalidInputError, match="threads"):
+        ImageSettings(threads=0)
+
+
+def test_no_bias_along_the_beams():
+    errors = []
+    for seed in range(4):
+        first, second, truth = crossing_sweeps(seed, frames=36, jitter=(0.0, 0.0))
+        start = displaced(truth, np.random.default_rng(seed), 0.5, 0.5)
+        result = calibrate_images(first, second, start, REFINE)
+        errors.append(centre_error_mm(result.sensor_from_image, truth, first.grid)[1])
+    # Published: 2 mm. The issue's bound; of a scene's own reflections 0.1 mm remain, half as much of four.
+    assert abs(np.mean(errors)) < 0.15

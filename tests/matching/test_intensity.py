@@ -1,0 +1,241 @@
+import numpy as np
+import pytest
+import speckle
+import sweep_examples
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import fft
+from scipy.signal import hilbert
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
+
+RF = RFSettings(66.67e6, 1540.0, 7e6, (5e6, 10e6))
+GRID = ImageGrid(6, 1800, 0.3, RF.sample_spacing_mm)
+BANDS = [(RF, 1800), (sweep_examples.RF, 1001), (RFSettings(40e6, 1540.0, 10e6, (3e6, 15e6)), 640)]
+
+
+def extractor(signal=RF, samples=1800, vectors=6, **settings_):
+    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm)
+    return IntensityExtractor(signal, grid, IntensitySettings(**settings_))
+
+
+def decimation(made, signal):
+    return round(made.grid.sample_spacing_mm / signal.sample_spacing_mm)
+
+
+def pulse(signal, samples, at, vectors=6):
+    """RF of one echo whose envelope's peak is at sample `at`, well inside the band."""
+    t = (np.arange(samples) - at) / signal.sampling_rate_hz
+    low, high = signal.bandwidth_hz
+    envelope = np.exp(-((t * (high - low)) ** 2))
+    return np.tile(envelope * np.cos(np.pi * (low + high) * t + 0.7), (vectors, 1))
+
+
+def noise(samples, seed=0, vectors=6):
+    return np.random.default_rng(seed).normal(0, 1000, (vectors, samples)).astype(np.float32)
+
+
+def plain_intensity(rf, signal, edge_fraction=0.1):
+    """Band-pass and analytic signal at the full rate, in double precision, far from the wrap-around."""
+    n = 8 * rf.shape[1]
+    f = fft.fftfreq(n, 1 / signal.sampling_rate_hz)
+    low, high = signal.bandwidth_hz
+    edge = edge_fraction * (high - low)
+    off = np.maximum(low - f, f - high)
+    weight = np.where(off <= 0, 1, np.where(off < edge, 0.5 + 0.5 * np.cos(np.pi * off / edge), 0)) * (f > 0)
+    return np.abs(fft.ifft(2 * weight * fft.fft(rf.astype(float), n, axis=1), axis=1)[:, : rf.shape[1]]) ** 2
+
+
+@pytest.mark.parametrize(("signal", "samples"), BANDS)
+def test_decimated_intensity_is_the_full_rate_one_at_the_shared_samples(signal, samples):
+    made = extractor(signal, samples)
+    rf = noise(samples)
+    expected = plain_intensity(rf, signal)[:, :: decimation(made, signal)]
+    got = made.intensity(rf)
+    assert got.shape == (6, made.grid.samples) == expected.shape
+    # The filter's tail, cut where the package pads and the plain one does not, is 1e-4 of the amplitude.
+    np.testing.assert_allclose(got, expected, rtol=2e-3, atol=1e-3 * expected.mean())
+
+
+@pytest.mark.parametrize(("signal", "samples"), BANDS)
+def test_nothing_of_the_intensity_is_lost_between_its_samples(signal, samples):
+    """At the rate it is kept, the intensity's band ends before half that rate."""
+    made = extractor(signal, samples)
+    low, high = signal.bandwidth_hz
+    assert 1.2 * (high - low) <= signal.sampling_rate_hz / decimation(made, signal) / 2 + 1e-6
+
+
+@settings(deadline=None, max_examples=40)
+@given(at=st.floats(200.0, 1600.0))
+def test_an_echo_stays_where_it_is(at):
+    made = extractor()
+    got = made.intensity(pulse(RF, 1800, at).astype(np.float32))[0].astype(float)
+    depth = np.arange(made.grid.samples) * made.grid.sample_spacing_mm
+    centroid = (got * depth).sum() / got.sum()
+    # Float32 alone costs a thousandth; a causal filter would delay by several samples.
+    assert abs(centroid / RF.sample_spacing_mm - at) < 0.1
+
+
+@pytest.mark.parametrize("where", [3.0, 1795.0])
+def test_an_echo_at_an_end_does_not_come_back_at_the_other(where):
+    got = extractor().intensity(pulse(RF, 1800, where).astype(np.float32))[0]
+    far = got[len(got) // 2 :] if where < 900 else got[: len(got) // 2]
+    assert far.max() < 1e-4 * got.max()
+
+
+@pytest.mark.parametrize("frequency_hz", [1e6, 3.5e6, 12e6, 25e6])
+def test_a_tone_outside_the_band_is_rejected(frequency_hz):
+    t = np.arange(1800) / RF.sampling_rate_hz
+    levels = {
+        f: extractor()
+        .intensity(np.tile(np.cos(2 * np.pi * f * t), (6, 1)).astype(np.float32))[:, 150:-150]
+        .mean()
+        for f in (frequency_hz, 7e6)
+    }
+    # In the band the intensity is one. Outside only the cut ends leak in.
+    assert abs(levels[7e6] - 1) < 1e-3
+    assert levels[frequency_hz] < 1e-5
+
+
+def test_a_constant_offset_is_rejected_even_by_a_band_that_begins_near_zero():
+    signal = RFSettings(40e6, 1540.0, 7e6, (0.5e6, 14e6))
+    echo = pulse(signal, 1800, 900.0).astype(np.float32)
+    made = extractor(signal)
+    np.testing.assert_allclose(
+        made.intensity(echo + 5.0)[:, 300:500], made.intensity(echo)[:, 300:500], atol=1e-2
+    )
+
+
+@pytest.mark.parametrize(("signal", "samples"), BANDS)
+def test_complex_samples_give_what_the_real_ones_they_stand_for_give(signal, samples):
+    made = extractor(signal, samples)
+    rf = pulse(signal, samples, 0.4 * samples) + 0.3 * pulse(signal, samples, 0.7 * samples)
+    analytic = hilbert(rf, axis=1)
+    from_real, from_complex = (
+        made.intensity(rf.astype(np.float32)),
+        made.intensity(analytic.astype(np.complex64)),
+    )
+    # float32 throughout, relative to the strongest echo.
+    np.testing.assert_allclose(from_complex, from_real, atol=1e-4 * from_real.max())
+
+
+def test_integers_and_floats_are_the_same_samples():
+    rf = noise(1800).astype(np.int16)
+    np.testing.assert_array_equal(extractor().intensity(rf), extractor().intensity(rf.astype(np.float32)))
+
+
+def test_analytic_signal_is_the_root_of_intensity_and_turns_with_the_echo():
+    made = extractor()
+    first, later = (made.analytic(pulse(RF, 1800, at).astype(np.float32)) for at in (900.0, 901.0))
+    np.testing.assert_allclose(
+        np.abs(first) ** 2, made.intensity(pulse(RF, 1800, 900.0).astype(np.float32)), rtol=1e-5
+    )
+    # One sample of delay turns an echo at the band's centre by 2 pi times cycles per sample; the echo's
+    # envelope, at its top, changes by nothing to first order.
+    at = round(900 / decimation(made, RF))
+    turned = np.angle(later[0, at] * np.conj(first[0, at]))
+    assert abs(turned + 2 * np.pi * 7.5e6 / RF.sampling_rate_hz) < 0.01
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    decibel=st.floats(-59.0, 0.0),
+    dynamic_range=st.sampled_from([60.0, 72.5]),
+    full=st.sampled_from([255.0, 250.0, 1.0]),
+)
+def test_log_compression_is_undone(decibel, dynamic_range, full):
+    made = IntensityExtractor(BModeSettings(dynamic_range, full), ImageGrid(2, 3, 0.1, 0.1))
+    grey = full * (1 + decibel / dynamic_range)
+    got = made.intensity(np.full((2, 3), grey))
+    np.testing.assert_allclose(got, 10 ** (decibel / 10), rtol=1e-4)  # float32 of a 60 dB range
+
+
+def test_full_white_is_one_and_black_is_the_bottom_of_the_range():
+    made = IntensityExtractor(BModeSettings(60.0, 255.0), ImageGrid(1, 2, 0.1, 0.1))
+    np.testing.assert_allclose(made.intensity(np.array([[255, 0]], np.uint8)), [[1.0, 1e-6]], rtol=1e-5)
+    assert made.grid == ImageGrid(1, 2, 0.1, 0.1)
+
+
+@pytest.mark.parametrize("shape", [(6, 1799), (5, 1800), (1800, 6), (1800,), (1, 6, 1800)])
+def test_frames_of_another_shape_are_refused(shape):
+    with pytest.raises(InvalidInputError, match=r"expected a frame of shape \(6, 1800\), got"):
+        extractor().intensity(np.zeros(shape, np.float32))
+    bmode = IntensityExtractor(BModeSettings(60.0), ImageGrid(6, 1800, 0.1, 0.1))
+    with pytest.raises(InvalidInputError, match=r"\(6, 1800\)"):
+        bmode.intensity(np.zeros(shape, np.uint8))
+
+
+def test_grey_levels_have_no_phase():
+    bmode = IntensityExtractor(BModeSettings(60.0), ImageGrid(6, 18, 0.1, 0.1))
+    with pytest.raises(InvalidInputError, match="B-mode"):
+        bmode.analytic(np.zeros((6, 18), np.uint8))
+
+
+@pytest.mark.parametrize(
+    "bad", [{"edge_fraction": 0.0}, {"edge_fraction": 0.6}, {"equalise_mm": -1.0}, {"typo": 1}]
+)
+def test_settings_out_of_range_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        IntensitySettings(**bad)
+
+
+# ---- equalising ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_views():
+    rng = np.random.default_rng(5)
+    field, other = speckle.Speckle(rng).seen(), speckle.Speckle(rng).seen()
+    return speckle.intensity(field), speckle.intensity(speckle.decorrelated(field, other, 0.4))
+
+
+@pytest.fixture(scope="module")
+def ramp():
+    """40 dB over depth and a factor of three across."""
+    g = speckle.GRID
+    x, y = np.linspace(0, 1, g.vectors), np.linspace(0, 1, g.samples)
+    return np.asarray(np.outer(3.0**x, 10 ** (-4 * y)), dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def equaliser():
+    return IntensityExtractor(BModeSettings(60.0), speckle.GRID)
+
+
+def correlation(a, b):
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+
+def test_a_ramp_in_brightness_is_made_flat(two_views, ramp, equaliser):
+    flat = equaliser.equalise(two_views[0] * ramp)
+    rows = flat.reshape(flat.shape[0], 10, -1).mean(axis=(0, 2))
+    # A band of 2.5 mm across the image holds some 400 speckles: 5 % each, three of which is 15 %.
+    assert np.abs(rows - 1).max() < 0.15
+
+
+def test_equalising_leaves_the_correlation_of_speckle_and_takes_away_that_of_brightness(
+    two_views, ramp, equaliser
+):
+    a, b = two_views
+    plain, ramped = correlation(a, b), correlation(a * ramp, b * ramp)
+    assert abs(correlation(equaliser.equalise(a * ramp), equaliser.equalise(b * ramp)) - plain) < 0.04
+    assert ramped > plain + 0.1
+
+
+def test_equalising_does_not_depend_on_gain(two_views, equaliser):
+    a = two_views[0]
+    np.testing.assert_allclose(equaliser.equalise(1e6 * a), equaliser.equalise(a), rtol=1e-4)
+
+
+def test_no_echo_stays_no_echo(equaliser):
+    image = np.zeros((speckle.GRID.vectors, speckle.GRID.samples), np.float32)
+    assert np.array_equal(equaliser.equalise(image), image)
+    image[:, :200] = 1.0
+    assert np.isfinite(equaliser.equalise(image)).all()
+
+
+def test_zero_switches_equalising_off(two_views):
+    made = IntensityExtractor(BModeSettings(60.0), speckle.GRID, IntensitySettings(equalise_mm=0))
+    assert np.array_equal(made.equalise(two_views[0]), two_views[0])

@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.matching.patches import PatchSettings, lay_patches
+
+
+@settings(deadline=None)
+@given(
+    vectors=st.integers(24, 300),
+    samples=st.integers(200, 900),
+    pitch=st.floats(0.15, 0.4),
+    spacing=st.floats(0.03, 0.1),
+    first=st.floats(-1.0, 6.0),
+)
+def test_whole_patches_tile_the_image_without_overlap(vectors, samples, pitch, spacing, first):
+    grid = ImageGrid(vectors, samples, pitch, spacing, first)
+    try:
+        patches = lay_patches(grid)
+    except InvalidInputError:
+        assert grid.width_mm < 3.6 + pitch or grid.depth_mm < 2.0 + 2 * 3.0 + 3 * spacing
+        return
+    taken = np.zeros((vectors, samples), int)
+    for v, s in patches.first:
+        taken[v : v + patches.size[0], s : s + patches.size[1]] += 1
+    assert taken.max() == 1
+    assert taken.sum() == len(patches) * patches.size.prod()
+    assert (patches.first >= 0).all()
+    assert (patches.first + patches.size <= (vectors, samples)).all()
+    sides = patches.size * patches.spacing_mm
+    assert (np.abs(sides - [3.6, 3.0]) <= patches.spacing_mm / 2 + 1e-9).all()
+    assert (first + patches.first[:, 1] * spacing >= 2.0 - 1e-9).all()
+    expected = (patches.first + patches.first + patches.size - 1) / 2 * patches.spacing_mm + [0, first]
+    np.testing.assert_allclose(patches.centre_mm, expected, atol=1e-9)
+    left = taken.any(axis=1).argmax()
+    right = vectors - len(taken) + taken.any(axis=1)[::-1].argmax()
+    assert abs(left - right) <= 1
+
+
+def test_a_wider_image_has_more_patches_of_the_same_size():
+    narrow, wide = (lay_patches(ImageGrid(n, 700, 0.3, 0.05)) for n in (64, 192))
+    assert np.array_equal(narrow.size, wide.size)
+    assert len(wide) > 2.5 * len(narrow)
+
+
+def test_an_image_too_small_is_refused_with_both_sizes_named():
+    with pytest.raises(InvalidInputError, match=r"1 x 2 patches of 3\.6 x 3 mm below 2 mm, got 3\.0 mm wide"):
+        lay_patches(ImageGrid(11, 700, 0.3, 0.05))
+    with pytest.raises(InvalidInputError, match=r"and 6\.0 mm deep"):
+        lay_patches(ImageGrid(64, 121, 0.3, 0.05))
+
+
+def test_a_patch_is_never_less_than_three_samples():
+    patches = lay_patches(ImageGrid(64, 100, 0.3, 0.3), PatchSettings(width_mm=0.2, height_mm=0.2))
+    assert patches.size.tolist() == [3, 3]

@@ -1,0 +1,140 @@
+"""The report as a person meets it: opened, clicked through and printed in a browser without a window."""
+
+import shutil
+import subprocess
+
+import pytest
+from report_examples import small_study
+
+from speckle3d.report.page import write_report
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright to drive a browser")
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+ARGUMENTS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium on the path")
+
+VISIBLE = "element => element.getClientRects().length > 0"
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory, shipped):
+    folder = small_study(tmp_path_factory.getbasetemp() / "report-study", shipped / "curves.h5")
+    path = folder / "report.html"
+    return path if path.is_file() else write_report(folder)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def opened(browser, report):
+    """The page in a browser, and what it complained of and asked for."""
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    # Slow machines draw in software.
+    page.set_default_timeout(60_000)
+    page.complaints, page.requests = [], []
+    page.on("console", lambda m: page.complaints.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    page.on("request", lambda r: page.requests.append(r.url) if not r.url.startswith("data:") else None)
+    page.goto(report.as_uri())
+    page.wait_for_selector("#sweep-1 figure.drawn .legend")
+    yield page
+    page.close()
+
+
+def shows(page, selector):
+    return [element.evaluate(VISIBLE) for element in page.query_selector_all(selector)]
+
+
+def test_it_opens_without_complaint_or_network(opened, report):
+    assert opened.complaints == []
+    assert opened.requests == [report.as_uri()]
+    assert opened.locator(".lead").bounding_box()["y"] < 200
+    # What is wider than the screen scrolls by itself.
+    assert opened.evaluate("document.documentElement.scrollWidth") <= 1280
+
+
+def test_the_interactive_figures_take_the_place_of_the_pictures(opened):
+    figures = opened.query_selector_all("#sweep-1 figure[data-plot]")
+    assert len(figures) == 3
+    for figure in figures:
+        assert figure.query_selector(".plot").evaluate(VISIBLE)
+        assert not figure.query_selector("img").evaluate(VISIBLE)
+    assert opened.query_selector_all("#sweep-1 canvas")
+
+
+def test_clicking_chooses_sweeps_and_differences(opened):
+    curves = '#sweep-1 figure[data-plot$="curves"] .plot'
+    before = opened.eval_on_selector(curves, "plot => plot.data.map(trace => trace.visible)")
+    opened.click(f"{curves} .updatemenu-button >> text=minus truth")
+    opened.wait_for_function(f"document.querySelector('{curves}').data[0].visible === false")
+    after = opened.eval_on_selector(curves, "plot => plot.data.map(trace => trace.visible)")
+    assert after == [not visible for visible in before]
+
+    opened.click("#chooser button >> text=gone")
+    assert shows(opened, ".sweep") == [False, True]
+    assert "no longer at" in opened.inner_text("#sweep-2 .note")
+    assert opened.query_selector_all("#sweep-1 canvas") == []
+
+    opened.keyboard.press("ArrowLeft")
+    assert shows(opened, ".sweep") == [True, False]
+    opened.click("#parts ~ .wide a >> text=gone >> nth=0")
+    assert shows(opened, ".sweep") == [False, True]
+
+    assert not opened.locator("pre").is_visible()
+    opened.click("summary")
+    assert opened.locator("pre").is_visible()
+    assert opened.complaints == []
+
+
+def test_screenshots_are_not_blank(opened, tmp_path):
+    from matplotlib.image import imread
+
+    opened.click("#chooser button >> text=forward")
+    opened.wait_for_selector("#sweep-1 figure.drawn .legend")
+    for i, figure in enumerate(opened.query_selector_all("#sweep-1 figure")):
+        path = tmp_path / f"{i}.png"
+        figure.screenshot(path=path)
+        # A page of white is 0; these figures are several per cent ink.
+        assert (imread(path)[:, :, :3].min(axis=2) < 0.9).mean() > 0.01
+
+
+def test_without_scripts_and_in_print_every_sweep_shows_its_pictures(browser, report):
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(report.as_uri())
+    page.emulate_media(media="print")
+    assert page.locator(".sweep").count() == 2
+    for figure in page.locator("figure").all():
+        assert figure.locator("img").is_visible()
+    assert page.locator(".plot").first.is_hidden()
+    assert page.locator("#chooser").is_hidden()
+    context.close()
+
+
+def test_print_shows_pictures_even_after_scripts_drew(opened):
+    opened.emulate_media(media="print")
+    assert all(shows(opened, "figure img"))
+    assert not any(shows(opened, ".plot"))
+    assert all(shows(opened, ".sweep"))
+    opened.emulate_media(media="screen")
+
+
+def test_printing_gives_a_short_document(report, tmp_path):
+    target = tmp_path / "report.pdf"
+    subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--print-to-pdf={target}",
+         report.as_uri()],
+        capture_output=True, timeout=120, check=True,
+    )  # fmt: skip
+    data = target.read_bytes()
+    assert data.startswith(b"%PDF")
+    # Two sweeps of two to three pages each, the tables before, configuration and provenance behind.
+    assert 5 <= data.count(b"/Type /Page\n") <= 14

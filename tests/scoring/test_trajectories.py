@@ -1,0 +1,157 @@
+"""Pose errors against evo's on the same files, and trajectories of different kinds against each other."""
+
+import challenge_examples as examples
+import numpy as np
+import pytest
+import sweep_examples
+from drifting import drifted, hand_sweep
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.load import load_landmarks, load_sweep
+from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.tum import write_tum
+from speckle3d.scoring.displacements import drift_rates
+from speckle3d.scoring.scores import challenge_score, score_row
+from speckle3d.scoring.trajectories import (
+    Trajectory,
+    absolute_pose_error,
+    compare_trajectories,
+    load_estimate,
+    load_reference,
+    relative_pose_error,
+)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    rng = np.random.default_rng(7)
+    truth = hand_sweep(rng, 40)
+    return drifted(truth, rng), truth
+
+
+@pytest.fixture(scope="module")
+def texts(pair, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("texts")
+    for name, poses in zip(("estimate.tum", "reference.tum"), pair, strict=True):
+        write_tum(folder / name, np.arange(40) / 30.0, poses)
+    return folder / "estimate.tum", folder / "reference.tum"
+
+
+def test_pose_errors_are_evos(texts):
+    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed")
+    files = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    found, true = (files.read_tum_trajectory_file(str(path)) for path in texts)
+    found.align_origin(true)
+    ours = compare_trajectories(load_estimate(texts[0]), load_reference(texts[1]))
+    for name, metric, extra in (("APE", metrics.APE, ()), ("RPE", metrics.RPE, (1, metrics.Unit.frames))):
+        for relation, scale, unit in (("translation_part", 1000.0, "mm"), ("rotation_angle_deg", 1.0, "deg")):
+            theirs = metric(metrics.PoseRelation[relation], *extra)
+            theirs.process_data((true, found))
+            for statistic in ("rmse", "mean", "max"):
+                expected = scale * theirs.get_statistic(metrics.StatisticsType[statistic])
+                # Of 20 mm, printed in metres and back.
+                assert getattr(ours[name], f"{statistic}_{unit}") == pytest.approx(expected, abs=1e-9)
+                assert expected > 1e-3
+
+
+def test_pose_errors_by_hand():
+    still = RigidTransform.identity(3)
+    turns = Rotation.from_rotvec(np.deg2rad([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 0.0, 0.0]]))
+    moved = RigidTransform.from_components([[5.0, 5.0, 5.0], [5.0, 8.0, 9.0], [5.0, 8.0, 9.0]], turns)
+    absolute, relative = absolute_pose_error(moved, still), relative_pose_error(moved, still)
+    assert (absolute.mean_mm, absolute.max_mm) == pytest.approx(((0 + 5 + 5) / 3, 5.0))
+    assert absolute.rmse_mm == pytest.approx(np.sqrt(50 / 3))
+    assert (absolute.mean_deg, relative.mean_deg) == pytest.approx((20.0, 15.0))
+    assert (relative.mean_mm, relative.rmse_deg) == pytest.approx((2.5, 30 / np.sqrt(2)))
+
+
+def test_text_without_images_is_scored_at_its_origin(texts, pair):
+    found = compare_trajectories(load_estimate(texts[0]), load_reference(texts[1]))
+    rates = drift_rates(*pair, np.zeros(3))
+    assert (found["FDR"], found["HD_mm"]) == pytest.approx((rates.final_drift_rate, rates.hausdorff_mm))
+    assert (found["poses"], found["left_out"], found["GPE_mm"], found["score"]) == (40, 0, None, None)
+
+
+def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
+    sweep = sweep_examples.rf_sweep()
+    write_sweep(tmp_path / "s.h5", sweep)
+    rng = np.random.default_rng(2)
+    poses = {"image": drifted(sweep.truth, rng), "pose": sweep.truth}
+    with ReconstructionWriter(tmp_path / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
+        writer.finish(poses, Provenance("s.h5", "ab", "0.1.0"))
+    reference = load_reference(tmp_path / "s.h5")
+    found = compare_trajectories(load_estimate(tmp_path / "r.h5"), reference)
+    expected = score_row(poses["image"], sweep.truth, sweep.grid)
+    assert {key: found[key] for key in expected if expected[key] is not None} == pytest.approx(
+        {key: value for key, value in expected.items() if value is not None}, abs=1e-9
+    )
+    # Its provenance names other bytes.
+    assert found["same_sweep"] is False
+    exact = compare_trajectories(load_estimate(tmp_path / "r.h5", "pose"), reference)
+    assert (exact["GPE_mm"], exact["APE"].max_mm) == pytest.approx((0.0, 0.0), abs=1e-9)
+    # A reconstruction may be the reference, too.
+    twice = compare_trajectories(
+        load_estimate(tmp_path / "r.h5"), load_reference(tmp_path / "r.h5", mode="pose")
+    )
+    assert twice["same_sweep"] is True
+    assert twice["GPE_mm"] == pytest.approx(found["GPE_mm"], abs=1e-9)
+    with pytest.raises(InvalidInputError, match="expected one of image, pose, got 'orientation'"):
+        load_estimate(tmp_path / "r.h5", "orientation")
+
+
+def test_a_text_is_scored_against_a_scan_of_the_challenge(tmp_path):
+    path, *_ = examples.write_data_set(tmp_path)
+    sweep = load_sweep(path)
+    true = sweep.tracker.world_from_image(sweep.frame_time_s)
+    estimate = drifted(true, np.random.default_rng(1))
+    write_tum(tmp_path / "e.tum", sweep.frame_time_s, estimate, "mm")
+    found = compare_trajectories(load_estimate(tmp_path / "e.tum", length_unit="mm"), load_reference(path))
+    marks = load_landmarks(path)
+    expected = score_row(estimate, true, sweep.grid, marks)
+    assert {key: found[key] for key in expected} == pytest.approx(expected, abs=1e-9)
+    assert found["score"] == pytest.approx(challenge_score(estimate, true, sweep.grid, marks), abs=1e-9)
+
+
+def test_poses_meet_by_time_and_those_without_a_reference_are_left_out():
+    z = np.linspace(0.0, 10.0, 101)
+    times = np.linspace(0.0, 1.0, 101)
+    line = RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z]))
+    # Every 0.01 s against readings every 0.04 s that begin later and end earlier.
+    reference = Trajectory("r", times[10:91:4], line[10:91:4])
+    found = compare_trajectories(Trajectory("e", times, line), reference)
+    assert (found["poses"], found["left_out"]) == (81, 20)
+    assert found["APE"].max_mm == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("digits", [6, 9])
+def test_times_rounded_in_text_lose_no_pose(tmp_path, digits):
+    rng = np.random.default_rng(4)
+    true = hand_sweep(rng, 40)
+    # Beginning and end are between decimals, and a pause that is not bridged has ends of its own.
+    times = 100.0 + np.arange(40) / 30.0 + 1e-7 / 3 + 5.0 * (np.arange(40) > 20)
+    reference = Trajectory("r", times, true)
+    estimate = Trajectory("e", np.round(times, digits), true)
+    found = compare_trajectories(estimate, reference)
+    assert (found["poses"], found["left_out"]) == (40, 0)
+    assert found["APE"].max_mm == pytest.approx(0.0, abs=1e-9)
+    # What is not rounding is no pose of the reference.
+    aside = compare_trajectories(Trajectory("e", times + np.linspace(-2e-6, 2e-6, 40), true), reference)
+    assert aside["left_out"] == 2
+
+
+def test_what_does_not_belong_together_is_refused(tmp_path):
+    poses = hand_sweep(np.random.default_rng(0), 5)
+    early, late = (Trajectory(name, np.arange(5) + t, poses) for name, t in (("early", 0.0), ("late", 4.0)))
+    with pytest.raises(MismatchError, match=r"early and late: expected at least 2 times .* got 1"):
+        compare_trajectories(early, late)
+    one, two = (Trajectory("a", np.arange(5.0), poses, ImageGrid(5, 5, pitch, 1.0)) for pitch in (1.0, 2.0))
+    with pytest.raises(MismatchError, match="images of one size"):
+        compare_trajectories(one, two)
+    path, *_ = examples.write_data_set(tmp_path, landmarks=False)
+    (tmp_path / "transfs" / examples.SUBJECT / path.name).unlink()
+    with pytest.raises(InsufficientDataError, match="expected truth or a calibrated tracker, got neither"):
+        load_reference(path)

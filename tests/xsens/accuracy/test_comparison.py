@@ -1,0 +1,65 @@
+"""Two streams of orientation: known turns are told apart into heading and inclination."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.streams import TimedRotations
+from xsens.accuracy.comparison import compare_orientations
+from xsens.fusion.orient import orient
+from xsens.logs.samples import ImuLog
+
+TIME_S = np.arange(0.0, 5.0, 0.05)
+
+
+def streams(turned):
+    """A moving sensor, and the same seen through a turn of the world."""
+    moving = Rotation.from_euler("ZYX", np.column_stack([TIME_S, 0.4 * np.sin(TIME_S), 0.3 * np.cos(TIME_S)]))
+    return TimedRotations(TIME_S, turned * moving), TimedRotations(TIME_S, moving)
+
+
+def test_a_turn_about_up_is_heading_alone():
+    found = compare_orientations(*streams(Rotation.from_rotvec([0.0, 0.0, 0.2])))
+    np.testing.assert_allclose(found.heading_rad, 0.2, atol=1e-12)
+    np.testing.assert_allclose(found.inclination_rad, 0.0, atol=1e-7)
+    assert found.heading_rms_without_offset_rad == pytest.approx(0.0, abs=1e-9)
+    assert found.heading_offset_rad == pytest.approx(0.2)
+
+
+def test_a_turn_about_north_is_inclination_alone():
+    found = compare_orientations(*streams(Rotation.from_rotvec([-0.15, 0.0, 0.0])))
+    np.testing.assert_allclose(found.inclination_rad, 0.15, atol=1e-9)
+    np.testing.assert_allclose(found.heading_rad, 0.0, atol=1e-9)
+    assert found.total_rms_rad == pytest.approx(0.15)
+
+
+def test_half_turns_do_not_wrap():
+    found = compare_orientations(*streams(Rotation.from_rotvec([0.0, 0.0, np.pi - 0.01])))
+    np.testing.assert_allclose(np.abs(found.heading_rad), np.pi - 0.01, atol=1e-9)
+
+
+def test_the_other_stream_is_interpolated_and_must_overlap():
+    one, other = streams(Rotation.identity())
+    later = TimedRotations(TIME_S[10:] + 0.0, other.world_from_sensor[10:])
+    assert len(compare_orientations(one, later).time_s) == len(TIME_S) - 10
+    with pytest.raises(InsufficientDataError, match="expected streams that overlap"):
+        compare_orientations(one, TimedRotations(TIME_S + 100.0, other.world_from_sensor))
+
+
+def test_what_orient_gives_is_taken_and_a_log_is_not():
+    one, _ = streams(Rotation.from_rotvec([0.0, 0.0, 0.2]))
+    n = len(TIME_S)
+    level = np.tile([0.0, 0.0, 9.80665], (n, 1))
+    log = ImuLog(TIME_S, level, np.zeros((n, 3)), np.tile([0.5, 0.0, -0.86], (n, 1)), one.world_from_sensor)
+    found = orient(log)
+    assert compare_orientations(found, found).total_rms_rad == 0.0
+    assert compare_orientations(log.rotations(), found).total_rms_rad > 0.1
+    for wrong in (log, "log.csv"):
+        with pytest.raises(InvalidInputError, match="expected TimedRotations or an Orientation"):
+            compare_orientations(found, wrong)
+
+
+def test_the_type_of_a_stream_is_a_public_name(python):
+    code = "import sys, xsens; assert 'numpy' not in sys.modules; print(xsens.TimedRotations.__module__)"
+    assert python(code).strip() == TimedRotations.__module__

@@ -1,0 +1,211 @@
+"""Orientation from gyroscope, accelerometer and magnetometer: exact cases, disturbances, BROAD beside VQF."""
+
+import numpy as np
+import pytest
+from broad import TRIALS, east_first, errors_deg, read_trial
+from scipy.spatial.transform import Rotation
+from vqf import VQF
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from xsens.fusion.orient import orient
+from xsens.fusion.settings import FusionSettings
+from xsens.logs.samples import ImuLog
+from xsens.logs.textlogs import parse_text
+
+RATE_HZ = 100.0
+FIELD = np.array([0.5, 0.0, -0.86])
+
+
+def static(seconds, seed=0, field=None):
+    """A sensor at rest: white noise, bias that flickers and drifts with temperature, quantised readings."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
+    turn = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3])
+    octaves = [
+        np.interp(time_s, np.arange(0, seconds + p, p), rng.standard_normal(int(np.ceil(seconds / p)) + 1))
+        for p in (5.0, 20.0, 80.0, 320.0)
+    ]
+    flicker = np.deg2rad(0.004) * np.sum(octaves, axis=0)
+    warming = np.deg2rad(0.02) * (1.0 - np.exp(-time_s / 200.0))
+    bias = np.deg2rad([0.3, -0.2, 0.25]) + np.column_stack(
+        [flicker + warming, flicker[::-1], flicker - warming]
+    )
+    gyroscope = bias + np.deg2rad(0.05) * np.sqrt(RATE_HZ) * rng.standard_normal((time_s.size, 3)) * 0.2
+    step = np.deg2rad(0.015)
+    gyroscope = np.round(gyroscope / step) * step
+    force = turn.inv().apply([0.0, 0.0, 9.80665]) + 0.02 * rng.standard_normal((time_s.size, 3))
+    world = np.tile(FIELD, (time_s.size, 1)) if field is None else field(time_s)
+    magnetometer = turn.inv().apply(world) + 0.004 * rng.standard_normal((time_s.size, 3))
+    return turn, ImuLog(time_s, force, gyroscope, magnetometer, source="static")
+
+
+def heading_deg(truth, orientation):
+    turned = (orientation.rotations.world_from_sensor * truth.inv()).as_rotvec()
+    return np.rad2deg(turned[:, 2])
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_heading_of_a_static_sensor_stays(smooth):
+    truth, log = static(600.0)
+    heading = heading_deg(truth, orient(log, smooth=smooth))
+    settled = heading[int(30 * RATE_HZ) :]
+    # The target: 0.2 degrees over ten minutes after initialisation.
+    assert np.abs(settled - settled[0]).max() < 0.2
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_step_of_the_field_moves_the_heading_little(smooth):
+    def stepped(time_s):
+        # Fifty microtesla, as much as the earth's field, for five seconds, across.
+        return FIELD + np.outer((time_s > 60.0) & (time_s < 65.0), [0.0, 1.0, 0.0])
+
+    truth, log = static(120.0, field=stepped)
+    heading = heading_deg(truth, orient(log, smooth=smooth))
+    part = (log.time_s > 55.0) & (log.time_s < 90.0)
+    assert np.ptp(heading[part]) < 1.0
+
+
+def test_iron_cannot_tilt_the_answer():
+    _, clean = static(60.0)
+    _, spoilt = static(60.0, field=lambda t: np.tile([0.1, 0.7, 0.9], (t.size, 1)))
+    one, other = (orient(log).rotations.world_from_sensor for log in (clean, spoilt))
+    up = [r.inv().apply([0.0, 0.0, 1.0]) for r in (one, other)]
+    apart = np.rad2deg(np.arccos(np.clip(np.sum(up[0] * up[1], axis=1), -1, 1)))
+    assert apart[500:].max() < 0.05
+
+
+def test_without_a_magnetometer_the_heading_starts_at_zero():
+    truth, log = static(30.0)
+    found = orient(log, FusionSettings(use_magnetometer=False))
+    turns = found.rotations.world_from_sensor
+    first = turns[0].as_matrix()
+    # Tilted by 0.36 rad, heading by the x axis and by the shortest turn differ by up to 0.36^2 / 4 rad: 1.9.
+    assert abs(np.arctan2(first[1, 0], first[0, 0])) < np.deg2rad(2.0)
+    up = [turn.inv().apply([0.0, 0.0, 1.0]) for turn in (turns[-1], truth)]
+    assert up[0] @ up[1] > 0.9999
+
+
+def test_a_log_without_gyroscope_or_in_other_units_is_refused():
+    _, log = static(5.0)
+    with pytest.raises(InsufficientDataError, match="gyroscope"):
+        orient(ImuLog(log.time_s, log.accelerometer_m_s2))
+    with pytest.raises(InvalidInputError, match="m/s"):
+        orient(ImuLog(log.time_s, log.accelerometer_m_s2 / 9.81, log.gyroscope_rad_s))
+
+
+def beside_iron(seconds=60.0, seed=4):
+    """A sensor at rest beside a magnet for 5 s, then carried away and turned to and fro about all axes."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
+    moved = np.clip(time_s - 5.0, 0.0, None)
+    swing = (
+        0.8 * np.column_stack([np.sin(f * moved) for f in (1.1, 1.7, 1.3)]) * (1 - np.exp(-moved))[:, None]
+    )
+    truth = Rotation.from_euler("ZYX", swing)
+    turns = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
+    gyroscope = np.vstack([turns[:1], turns]) + np.deg2rad(0.2) * rng.standard_normal((time_s.size, 3))
+    force = truth.inv().apply([0.0, 0.0, 9.80665]) + 0.05 * rng.standard_normal((time_s.size, 3))
+    # From 8 cm to 35 cm off it: the field of a dipole falls with the third power.
+    distance = 0.08 + 0.27 * (1.0 - np.exp(-moved))
+    magnet = np.outer((0.08 / distance) ** 3, [-0.8, 0.6, 0.4])
+    field = truth.inv().apply(FIELD + magnet) + 0.004 * rng.standard_normal((time_s.size, 3))
+    return truth, ImuLog(time_s, force, gyroscope, field)
+
+
+def test_a_start_beside_iron_is_taken_back():
+    truth, log = beside_iron()
+    filtered, smoothed = (heading_deg(truth, orient(log, smooth=smooth)) for smooth in (False, True))
+    # The magnet turns the first heading by 117 degrees. After 5 s of turning the filter knows another field
+    # to be the room's; what is left of the magnet at 35 cm turns that by 0.8 degrees. Measured 1.4 and 1.2.
+    assert np.abs(filtered[log.time_s < 5.0]).min() > 100.0
+    assert np.abs(filtered[log.time_s > 13.0]).max() < 2.5
+    assert np.abs(smoothed).max() < 2.5
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("steady", [False, True])
+def test_broad_trials_beside_vqf(realdata, steady):
+    gains = []
+    for name in TRIALS:
+        log, true, moving = read_trial(realdata / "broad", name)
+        peer = VQF(1.0 / log.rate_hz)
+        theirs = peer.updateBatch(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)["quat9D"]
+        vqf = errors_deg(theirs, true, moving, steady)[0]
+        ours = []
+        for smooth in (False, True):
+            found = east_first(orient(log, smooth=smooth).rotations.world_from_sensor)
+            ours.append(errors_deg(found, true, moving, steady)[0])
+        # The filter is no worse than VQF on any trial; measured 3.1, 0.8 and 2.2 against 4.0, 2.3 and 4.0,
+        # and without a constant heading 1.12, 0.76 and 1.93 against 1.16, 1.24 and 3.47.
+        assert ours[0] <= vqf, name
+        gains.append(1.0 - ours[1] / vqf)
+        if "magnet" in name:
+            # Measured 1.70 against 4.04, or 1.63 against 3.47; the filter alone is at 0.53 and 0.56 of VQF.
+            assert ours[1] <= 0.5 * vqf
+    assert np.mean(gains) >= 0.2
+
+
+def with_field(log, field):
+    return ImuLog(log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s, field)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_magnetometer_that_reads_zero_is_none(smooth):
+    truth, log = static(20.0)
+    found = orient(with_field(log, np.zeros((len(log), 3))), smooth=smooth)
+    assert "magnetometer reads zero in 2000 of 2000 samples: left out" in found.notes
+    assert "no magnetometer: the heading is relative to the start" in found.notes
+    some = log.magnetometer_au.copy()
+    some[::3] = 0.0
+    found = orient(with_field(log, some), smooth=smooth)
+    assert "magnetometer reads zero in 667 of 2000 samples: left out" in found.notes
+    assert abs(heading_deg(truth, found)[-1]) < 3.0
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 0.004])
+def test_a_field_straight_down_tells_no_heading(smooth, noise):
+    turn, log = static(20.0)
+    off = noise * np.random.default_rng(4).standard_normal((len(log), 3))
+    found = orient(
+        with_field(log, np.tile(turn.inv().apply([0.0, 0.0, -1.0]), (len(log), 1)) + off), smooth=smooth
+    )
+    assert np.rad2deg(np.median(found.standard_deviation_rad[:, 2])) > 45.0
+    assert any(note.startswith("the heading is not known") for note in found.notes)
+    assert np.isfinite(found.rotations.world_from_sensor.as_quat()).all()
+
+
+def test_times_in_milliseconds_are_refused():
+    _, log = static(5.0)
+    with pytest.raises(InvalidInputError, match="got a median of 10 s: times in milliseconds"):
+        orient(ImuLog(1e3 * log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s))
+
+
+def test_a_gyroscope_in_degrees_is_refused_or_told():
+    time_s = np.arange(0.0, 20.0, 1 / RATE_HZ)
+    truth = Rotation.from_rotvec(np.outer(0.5 * np.sin(time_s), [1.0, 0.0, 0.0]))
+    rate = np.outer(0.5 * np.cos(time_s), [1.0, 0.0, 0.0])
+    force = truth.inv().apply([0.0, 0.0, 9.80665])
+    assert not any("contradict" in note for note in orient(ImuLog(time_s, force, rate)).notes)
+    # 28 degrees per second are no reading that no sensor gives, but gravity follows a 57th of it.
+    told = [note for note in orient(ImuLog(time_s, force, np.rad2deg(rate))).notes if "contradict" in note]
+    assert len(told) == 1
+    assert "shows 2 %" in told[0]
+    with pytest.raises(InvalidInputError, match="expected a gyroscope in rad/s"):
+        orient(ImuLog(time_s, force, 5.0 * np.rad2deg(rate)))
+
+
+def test_what_is_missing_is_named():
+    _, log = static(5.0)
+    with pytest.raises(InsufficientDataError, match=r"got no gyroscope$"):
+        orient(ImuLog(log.time_s, log.accelerometer_m_s2))
+    with pytest.raises(InsufficientDataError, match=r"got no accelerometer$"):
+        orient(ImuLog(log.time_s, None, log.gyroscope_rad_s))
+    with pytest.raises(InvalidInputError, match=r"expected an ImuLog, as read_log\(path\) gives, got str"):
+        orient("log.csv")
+
+
+def test_columns_that_were_not_understood_are_named_where_they_are_missed():
+    text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_g\n0,0,0,0,1\n0.01,0,0,0,1\n"
+    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_g \(expected accelerometer_x_m_s2\)$"):
+        orient(parse_text(text))

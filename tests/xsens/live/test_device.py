@@ -1,0 +1,140 @@
+import os
+
+import pytest
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from xsens.live.device import DeviceError, DeviceSettings, connect, open_port, prepare
+from xsens.messages.catalogue import Configuration, Message, MessageId
+
+pytest.importorskip("serial", reason="needs pyserial")
+if not hasattr(os, "openpty"):
+    pytest.skip("needs pseudo-terminals", allow_module_level=True)
+
+from simulated_device import DEVICE_ID, KINDS, SimulatedDevice, wait_until
+
+BAUD = 115200
+
+
+@pytest.fixture
+def sensor(tmp_path, request):
+    """A simulated sensor of the kind that the test is parametrised with, an MT9-B by default."""
+    with SimulatedDevice(tmp_path / "port", **getattr(request, "param", {})) as simulated:
+        yield simulated
+
+
+def of_kind(*kinds, **more):
+    return pytest.mark.parametrize(
+        "sensor", [{"kind": kind, **more} for kind in kinds], indirect=True, ids=kinds
+    )
+
+
+class TestDevice:
+    @of_kind(*KINDS)
+    def test_is_found_and_described_whatever_it_is_doing(self, sensor):
+        sensor.wake_s = 0.0
+        wait_until(lambda: sensor.state == "measurement")  # of its own accord
+        with connect(str(sensor.path)) as device:
+            assert device.baud == BAUD
+            info = prepare(device, DeviceSettings())
+        assert info.device_id == DEVICE_ID
+        assert info.kind == {"mt9": "MT9-B", "legacy": "legacy", "mtdata2": "MTData2"}[sensor.kind]
+        assert info.header[0].mid == MessageId.CONFIGURATION
+        assert (MessageId.EMTS in [message.mid for message in info.header]) == (sensor.kind == "mt9")
+
+    @of_kind("mt9", "legacy")
+    def test_a_rate_is_set_and_read_back(self, sensor):
+        with connect(str(sensor.path), BAUD) as device:
+            info = prepare(device, DeviceSettings(rate_hz=256.0))
+        assert info.rate_hz == sensor.rate_hz == 256.0
+        assert Configuration.from_message(info.header[0]).period == 450
+
+    def test_one_that_knows_no_configuration_is_described_by_its_calibration(self, sensor, monkeypatch):
+        monkeypatch.setattr("xsens.live.device.ANSWER_S", 0.1)
+        sensor.deaf_to = {0x0C, 0xC0}
+        with connect(str(sensor.path), BAUD) as device:
+            info = prepare(device, DeviceSettings(rate_hz=100.0))
+        assert (info.kind, info.rate_hz) == ("MT9-B", 100.0)
+        assert [message.mid for message in info.header] == [MessageId.EMTS]
+
+    @of_kind("legacy")
+    @pytest.mark.parametrize(("content", "mode"), [("raw", 0x4000), ("calibrated", 2), ("orientation", 6)])
+    def test_a_legacy_sensor_sends_what_it_is_told_with_its_counter(self, sensor, content, mode):
+        with connect(str(sensor.path), BAUD) as device:
+            prepare(device, DeviceSettings(content))
+        assert (sensor.mode, sensor.settings, sensor.skip) == (mode, 1, 0)
+
+    @of_kind("mtdata2")
+    def test_an_mtdata2_sensor_is_told_item_by_item(self, sensor):
+        with connect(str(sensor.path), BAUD) as device:
+            info = prepare(device, DeviceSettings("orientation", rate_hz=80.0))
+        items = dict(sensor.outputs)
+        assert {0x1020, 0x1060, 0xE020} == {each for each, rate in items.items() if rate == 0xFFFF}
+        assert {0x2010, 0x4020, 0x8020, 0xC020} == {each for each, rate in items.items() if rate == 80}
+        assert info.rate_hz == 80.0
+
+    @of_kind("legacy", "mtdata2")
+    def test_as_set_changes_nothing(self, sensor):
+        before = (sensor.mode, sensor.settings, sensor.outputs, sensor.rate_hz)
+        with connect(str(sensor.path), BAUD) as device:
+            prepare(device, DeviceSettings("as set"))
+        assert (sensor.mode, sensor.settings, sensor.outputs, sensor.rate_hz) == before
+
+    def test_one_that_wakes_up_is_told_to_stay(self, sensor):
+        sensor.wake_s = 5.0
+        with connect(str(sensor.path), BAUD):
+            assert sensor.state == "configuration"
+
+    def test_nobody_there_is_told_with_the_rates_that_were_tried(self, sensor):
+        sensor.mute = True
+        with pytest.raises(DeviceError, match=r"port: expected a sensor, got no answer at 57600 baud"):
+            connect(str(sensor.path), 57600)
+
+    def test_a_missing_port_is_a_file_error_in_one_line(self, tmp_path):
+        with pytest.raises(FileError, match=r"none: cannot be opened as a serial port") as caught:
+            connect(str(tmp_path / "none"))
+        assert "\n" not in str(caught.value)
+
+    def test_a_port_belongs_to_one_program(self, sensor):
+        with connect(str(sensor.path), BAUD), pytest.raises(DeviceError, match="cannot be opened"):
+            open_port(str(sensor.path), BAUD)
+
+    def test_a_refusal_names_the_message_and_the_error(self, sensor):
+        with (
+            connect(str(sensor.path), BAUD) as device,
+            pytest.raises(DeviceError, match=r"message 0xa4 was answered by error 4"),
+        ):
+            device.request(Message(MessageId.RESET_ORIENTATION, b"\0\1"))
+
+    def test_an_answer_that_came_too_late_is_none_to_the_next_request(self, sensor):
+        with connect(str(sensor.path), BAUD) as device:
+            device.send(Message(MessageId.REQ_CONFIGURATION))
+            wait_until(lambda: MessageId.REQ_CONFIGURATION in sensor.requests)
+            sensor.settle()
+            sensor.rate_hz = 50.0
+            told = Configuration.from_message(device.request(Message(MessageId.REQ_CONFIGURATION)))
+        assert told.rate_hz == 50.0
+
+    def test_an_unplugged_port_is_a_device_error(self, sensor):
+        with connect(str(sensor.path), BAUD) as device:
+            sensor.unplug()
+            with pytest.raises(DeviceError, match="the port is gone"):
+                device.request(Message(MessageId.REQ_DID))
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"content": "all"}, "content: expected one of as set, raw"),
+            ({"rate_hz": 0.0}, "rate_hz: expected 1 to 2000"),
+        ],
+    )
+    def test_settings_are_checked(self, settings, message):
+        with pytest.raises(InvalidInputError, match=message):
+            DeviceSettings(**settings)
+
+    def test_without_pyserial_it_says_what_to_install(self, python):
+        code = (
+            "import sys; sys.modules['serial'] = None\n"
+            "from xsens.live.device import open_port\n"
+            "try: open_port('none', 115200)\nexcept OSError as error: print(error)"
+        )
+        assert python(code).strip() == "a live sensor needs pyserial: pip install 'speckle3d[live]'"

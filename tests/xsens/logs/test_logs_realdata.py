@@ -1,0 +1,296 @@
+"""Recordings of others, against what their own or the vendor's software says of them."""
+
+import re
+from datetime import datetime
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from xsens.logs.read import parse_stream, read_log, write_csv
+from xsens.messages.catalogue import Configuration, Message, MessageId, output_configuration
+from xsens.messages.framing import decode, find_frames
+from xsens.messages.mtdata2 import decode_items, encode_items, kind_of, number_format, world_of
+from xsens.messages.rawcounts import RawCalibration
+
+pytestmark = pytest.mark.realdata
+
+STANDARD_GRAVITY = 9.80665
+
+
+# An MT9-B at 256 Hz, at rest
+
+
+@pytest.fixture(scope="module")
+def mt9b(realdata):
+    return realdata / "mt9b" / "MT9_data.bin"
+
+
+def test_every_record_of_the_mt9_after_the_truncated_one(mt9b):
+    data = mt9b.read_bytes()
+    log = read_log(mt9b)
+    # What is left of the file after the block (173 bytes) and the truncated record (15), in records of 27.
+    assert len(log) == (len(data) - 173 - 15) / 27 == 21162
+    np.testing.assert_array_equal(np.diff(log.counter), 1)
+    assert (log.rate_hz, log.gaps) == (256.0, ())
+    assert log.notes[0] == "15 bytes in 1 places, first at byte 173, belong to no message"
+
+
+def test_the_mt9s_calibration_block(mt9b):
+    frames = find_frames(mt9b.read_bytes())
+    unit = RawCalibration.from_message(frames.message(0))
+    assert (unit.device_id, unit.rate_hz) == (0x7154, 256.0)
+    assert unit.offsets.ravel().tolist() == [29232, 33453, 31626, 32611, 32545, 32542, 30349, 33547, 33016]
+    expected = [[1268.19, 1269.53, 1287.17], [1249.81, 1272.94, 1249.13], [8825.30, 7365.49, 7753.23]]
+    np.testing.assert_allclose(unit.gains, expected, atol=0.005)
+    record = "faff32168553716c8580ac7e7f4e7f377f26631489d776b0205040"  # of the same unit, from another log
+    log = parse_stream(frames.data[:173].tobytes() + bytes.fromhex(record))
+    np.testing.assert_allclose(log.accelerometer_m_s2, [[-0.121, 0.592, 9.742]], atol=5e-4)
+    np.testing.assert_allclose(log.gyroscope_rad_s, [[-0.0169, 0.0171, 0.0064]], atol=1e-4)
+    np.testing.assert_allclose(log.magnetometer_au, [[-0.558, 0.216, -0.353]], atol=5e-4)
+
+
+def test_the_mt9_at_rest_feels_gravity(mt9b):
+    """Within what is not compensated, 1.2 % of standard gravity here, and steady to a twelfth of that."""
+    log = read_log(mt9b)
+    size = np.linalg.norm(log.accelerometer_m_s2, axis=1)
+    assert size.mean() == pytest.approx(STANDARD_GRAVITY, rel=0.0125)
+    seconds = size[: size.size // 256 * 256].reshape(-1, 256).mean(axis=1)
+    assert seconds.std() < 1e-3 * STANDARD_GRAVITY
+    # Bias of an uncorrected rate sensor of 900 deg/s; the field is of the order of 1 by its unit.
+    assert np.degrees(np.abs(log.gyroscope_rad_s.mean(axis=0))).max() < 1.5
+    assert 0.5 < np.linalg.norm(log.magnetometer_au, axis=1).mean() < 2.0
+
+
+# MTData2 of an MTi-G, with the decoding of einride/xsens-go
+
+
+WORLDS = {"ENU": "EastNorthUp", "NED": "NorthEastDown", "NWU": "NorthWestUp"}
+FORMATS = ("Float32", "FP1220", "FP1632", "Float64")
+NAMES = {
+    "packet_counter": "PacketCounter",
+    "sample_time_fine": "SampleTimeFine",
+    "utc": "UTCTime",
+    "status_word": "StatusWord",
+    "status_byte": "StatusByte",
+    "acceleration_m_s2": "Acceleration",
+    "delta_v_m_s": "DeltaV",
+    "rate_of_turn_rad_s": "RateOfTurn",
+    "delta_q_wxyz": "DeltaQ",
+    "euler_deg": "EulerAngles",
+    "latitude_longitude_deg": "LatLon",
+    "altitude_above_ellipsoid_m": "AltitudeEllipsoid",
+    "velocity_m_s": "VelocityXYZ",
+    "gnss_position_velocity_time": "GNSSPVTData",
+}
+SEEN_FROM_A_WORLD = ("euler_deg", "velocity_m_s")
+PVT = (
+    *("ITOW", "Year", "Month", "Day", "Hour", "Min", "Sec", "Valid", "TAcc", "Nano", "FixType", "Flags"),
+    *("NumSV", "Reserved1", "Lon", "Lat", "Height", "HMSL", "HAcc", "VAcc", "VelN", "VelE", "VelD"),
+    *(
+        "GSpeed",
+        "HeadMot",
+        "SAcc",
+        "HeadAcc",
+        "HeadVeh",
+        "GDOP",
+        "PDOP",
+        "TDOP",
+        "VDOP",
+        "HDOP",
+        "NDOP",
+        "EDOP",
+    ),
+)
+FIELDS = {3: ("X", "Y", "Z"), 4: ("Q0", "Q1", "Q2", "Q3"), 2: ("Lat", "Lon"), 1: ("",)}
+
+
+def golden_items(text):
+    """Items of each message as (heading, values); the golden text separates messages by a blank line."""
+    for block in text.strip("\n").split("\n\n"):
+        items = []
+        for line in block.split("\n"):
+            if not line.startswith(" "):
+                items.append((line.rstrip(":"), []))
+            else:
+                items[-1][1].append(line.strip())
+        yield items
+
+
+def as_golden(item):
+    """Heading and values of an item as the golden text has them; real numbers stay numbers."""
+    name = kind_of(item.identifier).name
+    heading, values = NAMES[name], item.values
+    if name in SEEN_FROM_A_WORLD:
+        heading += f"({WORLDS[world_of(item.identifier)]},{FORMATS[number_format(item.identifier)]})"
+    elif kind_of(item.identifier).reals:
+        heading += f"({FORMATS[number_format(item.identifier)]})"
+    if name == "utc":
+        return heading, [utc(values)]
+    if name in ("status_word", "status_byte"):
+        return heading, [f"{values[0]:0{32 if name == 'status_word' else 8}b}"]
+    if name == "gnss_position_velocity_time":
+        return heading, [f"{field}:{value}" for field, value in zip(PVT, values, strict=True)]
+    if not kind_of(item.identifier).reals:
+        return heading, [str(values[0])]
+    return heading, list(zip(FIELDS[len(values)], values, strict=True))
+
+
+def utc(values):
+    nanosecond, *date, _ = values
+    fraction = f".{nanosecond:09d}".rstrip("0").rstrip(".")
+    return datetime(*date).isoformat() + fraction + "Z"
+
+
+@pytest.mark.parametrize("which", ["1", "2"])
+def test_messages_of_an_mti_g_are_the_golden_ones(realdata, which):
+    folder = realdata / "xsens-go" / which
+    found = decode((folder / "output.bin").read_bytes())
+    golden = list(golden_items((folder / "output.golden").read_text()))
+    assert len(found) == len(golden) == 100
+    for message, expected in zip(found, golden, strict=True):
+        items = [as_golden(item) for item in decode_items(message.payload)]
+        assert [heading for heading, _ in items] == [heading for heading, _ in expected]
+        for (_, values), (_, lines) in zip(items, expected, strict=True):
+            for value, line in zip(values, lines, strict=True):
+                if isinstance(value, str):
+                    assert value == line
+                else:
+                    field, _, number = line.rpartition(":")
+                    # The text has all digits of a double.
+                    assert (field, float(number)) == value
+
+
+@pytest.mark.parametrize("which", ["1", "2"])
+def test_messages_of_an_mti_g_are_cut_and_made_as_recorded(realdata, which):
+    folder = realdata / "xsens-go" / which
+    data = (folder / "output.bin").read_bytes()
+    frames = find_frames(data)
+    recorded = (folder / "messages.golden").read_text().split()
+    assert [data[a:b].hex() for a, b in zip(frames.start, frames.end, strict=True)] == recorded
+    assert all(encode_items(decode_items(m.payload)) == m.payload for m in frames.messages())
+
+
+@pytest.mark.parametrize("which", ["1", "2"])
+def test_output_configurations_are_the_golden_ones(realdata, which):
+    folder = realdata / "xsens-go" / which
+    payload = (folder / "outputconfig.bin").read_bytes()
+    items = output_configuration(Message(MessageId.OUTPUT_CONFIGURATION_ACK, payload))
+    lines = (folder / "outputconfig.golden").read_text().strip().split("\n")
+    for item, heading, rate in zip(items, lines[::2], lines[1::2], strict=True):
+        assert heading.split("(")[0].rstrip(":") == NAMES[kind_of(item.identifier).name]
+        assert rate.strip() == ("Max" if item.rate_hz == 0xFFFF else f"{item.rate_hz} Hz")
+
+
+@pytest.mark.parametrize("which", ["1", "2"])
+def test_a_log_of_an_mti_g(realdata, which):
+    log = read_log(realdata / "xsens-go" / which / "output.bin")
+    # Four of the hundred messages are the satellite receiver's.
+    assert (len(log), log.gaps) == (96, ())
+    assert log.rate_hz == pytest.approx(100.0)
+    assert "4 messages without a measurement or its time are no samples" in log.notes
+    up = log.world_from_sensor[log.oriented].apply(log.accelerometer_m_s2[log.oriented])
+    np.testing.assert_allclose(up.mean(axis=0), [0.0, 0.0, STANDARD_GRAVITY], atol=0.05)
+
+
+# Single packets of an MTi-300, with the vendor's decoding
+
+
+def vendor_packets(text):
+    """Payload and decoded items (name, values) of every packet in the notes."""
+    for data, decoded in re.findall(
+        r"Raw Data\n\n```\n([0-9A-F \n]+)```\n\n## Decoded Info\n\n```\n\{(.*?)\}\n", text
+    ):
+        items = re.findall(r"\((\w+)(?:\|Float)?(?:\|ENU)?, \d+ bytes, (.*?)\)(?:, (?=\()|$)", decoded)
+        yield (
+            bytes.fromhex(data),
+            [(name, re.findall(r"(?<![\w.])-?\d+\.?\d*(?![\w:])", v)) for name, v in items],
+        )
+
+
+VENDOR_NAMES = {
+    "PacketCounter": "packet_counter",
+    "SampleTimeFine": "sample_time_fine",
+    "Quaternion": "quaternion_wxyz",
+    "Acceleration": "acceleration_m_s2",
+    "DeltaV": "delta_v_m_s",
+    "FreeAcceleration": "free_acceleration_m_s2",
+    "RateOfTurn": "rate_of_turn_rad_s",
+    "DeltaQ": "delta_q_wxyz",
+    "MagneticField": "magnetic_field_au",
+    "Temperature": "temperature_c",
+    "BaroPressure": "pressure_pa",
+    "StatusWord": "status_word",
+}
+
+
+def test_packets_of_an_mti_are_as_the_vendors_program_decodes_them(realdata):
+    text = (realdata / "xsens-mti" / "mtmanager_packets.md").read_text()
+    packets = list(vendor_packets(text))
+    assert len(packets) == 6
+    for payload, decoded in packets:
+        items = decode_items(payload)
+        assert [item.name for item in items] == [VENDOR_NAMES[name] for name, _ in decoded]
+        for item, (name, numbers) in zip(items, decoded, strict=True):
+            expected = [int(numbers[0], 2)] if name == "StatusWord" else [float(n) for n in numbers]
+            # The program shows eight decimals.
+            np.testing.assert_allclose(item.values, expected, rtol=0, atol=5.1e-9)
+        assert encode_items(items) == payload
+
+
+def test_the_configuration_of_an_mti_is_as_the_vendors_program_decodes_it(realdata):
+    text = (realdata / "xsens-mti" / "mtmanager_packets.md").read_text()
+    (data,) = re.findall(r"## Configuration - 0x0D\n\n76\n([0-9A-F ]+)\n", text)
+    c = Configuration.from_message(Message(MessageId.CONFIGURATION, bytes.fromhex(data)))
+    assert (c.device_id, c.period, c.skip_factor) == (0x037003F8, 1152, 0)
+    assert [(u.device_id, u.output_mode, u.output_settings) for u in c.units] == [(0x037003F8, 0, 1)]
+    assert c.message().payload == bytes.fromhex(data)
+
+
+# Text
+
+
+@pytest.mark.parametrize(("unit", "lines"), [("00B421E6", 2432), ("00B421EF", 2469)])
+def test_exports_of_mt_manager(realdata, unit, lines):
+    path = realdata / "mtmanager-text" / "opensim-core" / f"MT_012005D6_009-001_{unit}.txt"
+    log = read_log(path)
+    assert (len(log), log.rate_hz, log.gaps) == (lines, pytest.approx(100.0), ())
+    assert log.gyroscope_rad_s is None
+    assert log.oriented.all()
+    up = log.world_from_sensor.apply(log.accelerometer_m_s2)
+    # A walking person: upright on average, not at every sample.
+    np.testing.assert_allclose(np.median(up, axis=0), [0.0, 0.0, STANDARD_GRAVITY], atol=0.1)
+    row = path.read_text().splitlines()[6].split("\t")
+    matrix = np.array(row[-9:], dtype=float).reshape(3, 3).T  # column after column
+    east_north_up = Rotation.from_euler("z", 90.0, degrees=True) * log.world_from_sensor[0]
+    np.testing.assert_allclose(east_north_up.as_matrix(), matrix, atol=2e-6)
+    assert log.counter[0] == int(row[0])
+
+
+def test_exports_of_xsens_dot_with_and_without_losses(realdata):
+    folder = realdata / "mtmanager-text" / "xsens-dot"
+    whole = read_log(folder / "Pelvis_20210820_202113_836.csv")
+    assert (len(whole), whole.gaps) == (382, ())
+    assert whole.rate_hz == pytest.approx(60.0, rel=1e-4)
+    path = folder / "LFemur_20210820_202113_831.csv"
+    lossy = read_log(path)
+    counter = np.array([int(line.split(",")[0]) for line in path.read_text().splitlines()[12:]])
+    np.testing.assert_array_equal(lossy.counter, counter)
+    assert lossy.lost == counter[-1] - counter[0] + 1 - counter.size > 0
+    for gap in lossy.gaps:
+        assert gap.duration_s == pytest.approx((gap.lost + 1) / 60.0, rel=1e-3)
+    assert any("without gravity" in note for note in whole.notes)
+
+
+def test_every_recording_comes_back_from_a_plain_file(realdata, tmp_path):
+    paths = [realdata / "xsens-go" / "1" / "output.bin"]
+    paths += sorted((realdata / "mtmanager-text").glob("*/MT_*.txt"))[:1]
+    paths += sorted((realdata / "mtmanager-text").glob("*/*.csv"))
+    assert len(paths) == 4
+    for path in paths:
+        log = read_log(path)
+        write_csv(tmp_path / "log.csv", log)
+        back = read_log(tmp_path / "log.csv")
+        np.testing.assert_array_equal(back.time_s, log.time_s)
+        np.testing.assert_array_equal(back.counter, log.counter)
+        assert back.gaps == log.gaps

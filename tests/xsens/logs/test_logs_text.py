@@ -1,0 +1,322 @@
+"""Logs as text, of every program that writes them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from imu_logs import WORLDS, samples
+
+from speckle3d.core.errors import InvalidInputError
+from xsens.logs.decimals import read_decimals
+from xsens.logs.read import Hints, parse_text, read_log
+from xsens.logs.texttables import read_table
+
+VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+
+
+@pytest.fixture(scope="module")
+def s():
+    return samples(60)
+
+
+def lines(columns, separator="\t", digits=6):
+    rows = np.column_stack(columns)
+    return "\n".join(separator.join(f"{value:.{digits}f}" for value in row) for row in rows.tolist()) + "\n"
+
+
+def angle_to(log, world_from_sensor):
+    return (log.world_from_sensor * world_from_sensor.inv()).magnitude().max()
+
+
+# The MT9 software's exports
+
+
+def test_angles_of_the_mt9_software(s):
+    angles = s["world_from_sensor"].as_euler("xyz", degrees=True)
+    log = parse_text(lines([s["time_s"], angles]))
+    assert angle_to(log, s["world_from_sensor"]) < 1e-6
+    np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-6)
+    assert (log.accelerometer_m_s2, log.counter, log.gaps) == (None, None, ())
+
+
+@pytest.mark.parametrize("temperature", [True, False])
+def test_vectors_of_the_mt9_software_with_and_without_temperature(s, temperature):
+    columns = [s["time_s"], *(s[name] for name in VECTORS), np.full(60, 31.25)]
+    log = parse_text(lines(columns if temperature else columns[:-1]))
+    for name in VECTORS:
+        np.testing.assert_allclose(getattr(log, name), s[name], atol=1e-6)
+    assert log.world_from_sensor is None
+
+
+def test_matrices_of_the_mt9_software_are_told_from_vectors(s):
+    log = parse_text(lines([s["time_s"], s["world_from_sensor"].as_matrix().reshape(-1, 9)]))
+    assert angle_to(log, s["world_from_sensor"]) < 2e-6
+    assert any("row by row" in note for note in log.notes)
+
+
+def test_samples_missing_from_an_export_are_gaps(s):
+    text = lines([s["time_s"], s["world_from_sensor"].as_euler("xyz", degrees=True)]).split("\n")
+    del text[20:23]
+    log = parse_text("\n".join(text))
+    assert [(g.after_index, g.lost) for g in log.gaps] == [(19, 3)]
+
+
+def test_times_rounded_to_hundredths_are_no_gaps():
+    time_s = np.round(np.arange(100) / 64, 2)
+    log = parse_text(lines([time_s, np.zeros((100, 3))], digits=2))
+    assert log.gaps == ()
+
+
+# MT Manager's
+
+
+MATRIX = [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
+HEAD = """// Start Time: Unknown
+// Update Rate: 100.0Hz
+// Filter Profile: human (46.1)
+// Firmware Version: 4.0.2
+"""
+
+
+def mt_manager(s, separator="\t", blank=("SampleTimeFine", "UTC_Nano"), decimal="."):
+    acc, turned = s["accelerometer_m_s2"], (WORLDS["ENU"] * s["world_from_sensor"]).as_matrix()
+    columns = {"PacketCounter": [f"{i:05d}" for i in range(100, 160)]}
+    columns |= {name: [""] * 60 for name in blank}
+    columns |= {f"Acc_{axis}": [f"{v:.6f}" for v in acc[:, i]] for i, axis in enumerate("XYZ")}
+    columns |= {name: [f"{v:.6f}" for v in turned[:, int(name[4]) - 1, int(name[7]) - 1]] for name in MATRIX}
+    table = [list(columns), *map(list, zip(*columns.values(), strict=True))]
+    return HEAD + "\n".join(separator.join(row).replace(".", decimal) for row in table) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal"), [("\t", "."), (";", "."), (",", "."), (";", ","), ("\t", ",")]
+)
+def test_column_major_matrices_and_blank_cells_whatever_the_separator(s, separator, decimal):
+    log = parse_text(mt_manager(s, separator, decimal=decimal))
+    assert angle_to(log, s["world_from_sensor"]) < 2e-6
+    np.testing.assert_allclose(log.accelerometer_m_s2, s["accelerometer_m_s2"], atol=1e-6)
+    np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
+    assert log.notes == ("orientation: taken as seen from east, north, up, the program's default",)
+
+
+def test_matrices_listed_the_other_way_are_turned_by_gravity(s):
+    text = mt_manager(s)
+    for row, column in ((1, 2), (1, 3), (2, 3)):
+        one, other = f"Mat[{row}][{column}]", f"Mat[{column}][{row}]"
+        text = text.replace(one, "swapped").replace(other, one).replace("swapped", other)
+    log = parse_text(text)
+    assert angle_to(log, s["world_from_sensor"]) < 2e-6
+    assert any("taken by columns" in note for note in log.notes)
+
+
+def test_lines_between_and_after_are_left_out_and_counted(s):
+    text = mt_manager(s).split("\n")
+    text[12] = text[12][:40]  # truncated
+    log = parse_text("\n".join([*text[:20], "", *text[20:-1], "001"]))
+    assert len(log) == 59
+    assert log.notes[0] == "3 lines of another length were left out"
+    assert [(g.after_index, g.lost) for g in log.gaps] == [(6, 1)]
+
+
+def test_cells_that_are_no_number_are_missing(s):
+    text = mt_manager(s).split("\n")
+    cells = text[10].split("\t")
+    cells[3] = "-nan(ind)"
+    text[10] = "\t".join(cells)
+    log = parse_text("\n".join(text))
+    assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [5]
+
+
+def test_windows_line_ends_and_wide_characters(s, tmp_path):
+    text = mt_manager(s).replace("\n", "\r\n")
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        (tmp_path / "log.txt").write_bytes(text.encode(encoding))
+        assert angle_to(read_log(tmp_path / "log.txt"), s["world_from_sensor"]) < 2e-6
+
+
+def test_a_clock_of_ten_thousandths_and_its_wrap(s):
+    turned = (WORLDS["ENU"] * s["world_from_sensor"]).as_quat(scalar_first=True)
+    ticks = (2**32 - 3000 + 100 * np.delete(np.arange(60), [30, 31])) % 2**32
+    names = "SampleTimeFine\tQuat_q0\tQuat_q1\tQuat_q2\tQuat_q3\n"
+    log = parse_text(names + lines([ticks, np.delete(turned, [30, 31], axis=0)]))
+    assert [(g.after_index, g.lost) for g in log.gaps] == [(29, 2)]
+    assert log.duration_s == pytest.approx(0.59)
+    assert angle_to(log, s["world_from_sensor"][np.delete(np.arange(60), [30, 31])]) < 2e-6
+
+
+@pytest.mark.parametrize("world", ["ENU", "NED", "NWU"])
+def test_the_world_may_be_told(s, world):
+    turned = (WORLDS[world] * s["world_from_sensor"]).as_euler("xyz", degrees=True)
+    text = "Counter\tRoll\tPitch\tYaw\n" + lines([np.arange(60), turned])
+    log = parse_text(text, Hints(rate_hz=100.0, world=world))
+    assert angle_to(log, s["world_from_sensor"]) < 1e-6
+    assert log.notes == ()
+    with pytest.raises(InvalidInputError, match="world: expected NWU, ENU, NED, got 'EDN'"):
+        parse_text(text, Hints(rate_hz=100.0, world="EDN"))
+
+
+# Xsens DOT's
+
+
+DOT = """sep=,
+DeviceTag:,zdt
+FirmwareVersion:,2.0.0
+OutputRate:,60Hz
+Measurement Mode:,Rate quantities (with mag)
+ © Xsens Technologies B. V. 2005-2021
+
+"""
+
+
+def test_rates_of_turn_of_a_dot_are_degrees_and_its_clock_microseconds(s):
+    names = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z,Mag_X,Mag_Y,Mag_Z,Status\n"
+    ticks = (2**32 - 500_000 + np.round(np.arange(60) * 1e6 / 60)) % 2**32
+    vectors = [s["accelerometer_m_s2"], np.degrees(s["gyroscope_rad_s"]), s["magnetometer_au"]]
+    rows = lines([1 + np.arange(60), ticks, *vectors, np.zeros(60)], ",").split("\n")
+    del rows[10:12]
+    log = parse_text(DOT + names + "\n".join(rows))
+    kept = np.delete(np.arange(60), [10, 11])
+    for name in VECTORS:
+        np.testing.assert_allclose(getattr(log, name), s[name][kept], atol=1e-6)
+    assert [(g.after_index, g.lost) for g in log.gaps] == [(9, 2)]
+    assert log.duration_s == pytest.approx(59 / 60, abs=1e-5)
+
+
+# Plain files
+
+
+def test_a_plain_file_by_hand():
+    names = "; ".join(f"gyroscope_{axis}_rad_s" for axis in "xyz")
+    log = parse_text(f"# of a bench\n{names}; time_s\n0;0;1;0.5\n;;;0.6\n0;0;2;0.7\n")
+    assert log.time_s.tolist() == [0.5, 0.6, 0.7]
+    np.testing.assert_array_equal(log.gyroscope_rad_s[:, 2], [1.0, np.nan, 2.0])
+    assert log.accelerometer_m_s2 is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("nothing here\n", "expected a table of numbers, got none"),
+        ("1\t2\t3\t4\t5\n", "expected 4, 10 or 11 columns where none has a name, got 5"),
+        ("time_s,counter\n0,1\n", "expected columns of acceleration, rate of turn, field or orientation"),
+        ("acc_x,acc_y,acc_z\n", "expected lines of 3 numbers, got none"),
+        ("acc_x,acc_y,acc_z\n1,2,3\n", "expected samples with a clock or a counter, or a sampling rate"),
+        ("counter,acc_x,acc_y,acc_z\n1,1,2,3\n", "a counter, but no sampling rate"),
+        ("time_s,acc_x,acc_y,acc_z\nnan,1,2,3\n", "expected samples with a clock"),
+        ("counter,time_s,acc_x,acc_y,acc_z\n-1,0,1,2,3\n", "expected lines with a time, got none"),
+        ("time_s,counter" + 300 * "," + "\n", "at most 256 columns, got 302"),
+    ],
+)
+def test_text_that_is_no_log_says_why(text, message):
+    with pytest.raises(InvalidInputError, match=rf"^text: .*{message}"):
+        parse_text(text)
+
+
+# Tables
+
+
+cells = st.one_of(st.just(""), st.floats(-1e6, 1e6).map(lambda v: f"{v:.6g}"), st.integers(-99, 99).map(str))
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    st.lists(st.lists(cells, min_size=3, max_size=3), min_size=1, max_size=12),
+    st.sampled_from(["\t", ";", ","]),
+    st.sampled_from(["\n", "\r\n"]),
+)
+def test_tables_are_read_quickly_as_they_are_read_cell_by_cell(rows, separator, end):
+    text = end.join(separator.join(row) for row in [["ab", "cd", "ef"], *rows])
+    expected = [[float(cell) if cell else np.nan for cell in row] for row in rows]
+    table = read_table(text, frozenset({"ab", "cd", "ef"}))
+    np.testing.assert_array_equal(table.values, expected)
+    assert (table.names, table.left_out) == (("ab", "cd", "ef"), 0)
+
+
+@st.composite
+def decimals(draw):
+    """Columns of numbers with a few decimals, some blank, as text."""
+    places = draw(st.lists(st.integers(0, 9), min_size=2, max_size=4))
+    rows = draw(st.integers(1, 20))
+    blank = st.booleans() if draw(st.booleans()) else st.just(False)
+    return [
+        ["" if draw(blank) else f"{draw(st.floats(-9999, 9999)):.{n}f}" for n in places] for _ in range(rows)
+    ]
+
+
+@settings(deadline=None, max_examples=100)
+@given(decimals())
+def test_plain_decimals_are_to_the_bit_what_they_are_one_by_one(rows):
+    body = "\n".join(";".join(row) for row in rows).encode()
+    found = read_decimals(body, ";", len(rows[0]))
+    if found is not None:
+        np.testing.assert_array_equal(found, [[float(cell or "nan") for cell in row] for row in rows])
+    if all(cell for row in rows for cell in row):
+        assert found is not None
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        "-",
+        ".",
+        "-.",
+        "1e3",
+        "nan",
+        "1-",
+        "--1",
+        "1.2.3",
+        "+1",
+        "0x1",
+        "1 2",
+        "é",
+        "12345678901234567.8",
+        "12.34",
+    ],
+)
+def test_cells_that_are_no_plain_decimals_are_left_to_others(cell):
+    """12.34 because its point lies elsewhere than its column's others."""
+    assert read_decimals(f"1.5,2.5\n{cell},3.5\n0.5,1.5".encode(), ",", 2) is None
+    assert read_decimals(b"12345678901234567,2", ",", 2) is None
+    assert read_decimals(b"1.5,2.5\n1.5\n1.5,2.5,1.0", ",", 2) is None
+
+
+# Columns that are not understood, and readings that are none
+
+
+def test_columns_that_are_not_understood_are_named_with_what_was_expected():
+    text = (
+        "time_s,gyroscope_x_rad_s,gyroscope_y_rad_s,gyroscope_z_rad_s,accelerometer_x_g,remark\n0,0,0,0,1,7\n"
+    )
+    notes = parse_text(text).notes
+    assert notes == ("columns not understood: accelerometer_x_g (expected accelerometer_x_m_s2), remark",)
+    with pytest.raises(InvalidInputError, match=r"gyr_y_deg_s \(expected gyroscope_y_rad_s\)"):
+        parse_text("time_s,counter,gyr_x_deg_s,gyr_y_deg_s\n0,1,2,3\n")
+    # Four or ten columns are no unnamed export of the MT9 software if they have names.
+    with pytest.raises(InvalidInputError, match="columns not understood: acc_x_g"):
+        parse_text("time_s,acc_x_g,acc_y_g,acc_z_g\n0,0,0,1\n1,0,0,1\n")
+
+
+def test_an_axis_that_is_missing_is_told():
+    text = "time_s,acc_x,acc_y,gyr_x,gyr_y,gyr_z\n0,0,0,0,0,0\n1,0,0,0,0,0\n"
+    assert parse_text(text).notes == ("acc_x, acc_y left out: expected acc_z beside",)
+
+
+def test_readings_out_of_range_are_counted():
+    rows = "".join(f"{i},{1e9 if i in (3, 5) else 0},0,9.8\n" for i in range(9))
+    log = parse_text("time_s,acc_x,acc_y,acc_z\n" + rows)
+    assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [3, 5]
+    assert log.notes == ("2 accelerometer readings out of range were left out",)
+
+
+@pytest.mark.parametrize(
+    ("data", "kind"),
+    [
+        (b"\x89HDF\r\n\x1a\n" + bytes(100), "an HDF5 file"),
+        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64" + bytes(100), "a MATLAB file"),
+        (bytes(1000), "nothing but zeros"),
+    ],
+)
+def test_files_of_other_kinds_are_named(tmp_path, data, kind):
+    (tmp_path / "log").write_bytes(data)
+    with pytest.raises(InvalidInputError, match=f"expected a sensor log .*, got {kind}$"):
+        read_log(tmp_path / "log")

@@ -1,0 +1,258 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d.core.errors import InvalidInputError
+from xsens.messages.catalogue import (
+    Configuration,
+    MessageId,
+    OutputItem,
+    State,
+    UnitConfiguration,
+    device_id,
+    error_of,
+    output_configuration,
+    reply_to,
+    request_of,
+    set_output_configuration,
+    state_after,
+    valid_in,
+)
+from xsens.messages.framing import MOST_PAYLOAD, Framer, Message, decode, encode, find_frames
+
+FEW = settings(deadline=None, max_examples=40)
+
+messages = st.builds(
+    Message,
+    mid=st.integers(0, 255),
+    payload=st.binary(max_size=300),
+    bid=st.integers(0, 255),
+)
+
+
+@FEW
+@given(messages)
+def test_what_is_encoded_is_decoded(message):
+    assert decode(encode(message)) == [message]
+
+
+@pytest.mark.parametrize("size", [0, 1, 254, 255, 256, 1320, MOST_PAYLOAD])
+def test_every_length_comes_back_and_255_bytes_need_the_long_form(size):
+    message = Message(0x91, bytes(size))
+    data = encode(message)
+    assert len(data) == size + (5 if size < 255 else 7)
+    assert decode(data) == [message]
+
+
+def test_messages_too_long_or_of_impossible_ids_are_refused():
+    with pytest.raises(InvalidInputError, match="at most 8192 bytes, got 8193"):
+        Message(0x36, bytes(MOST_PAYLOAD + 1))
+    with pytest.raises(InvalidInputError, match="ids of one byte"):
+        Message(256)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("faff3000d1", Message(MessageId.GO_TO_CONFIG)),
+        ("faff3100d0", Message(MessageId.GO_TO_CONFIG_ACK)),
+        ("faff420104ba", Message(MessageId.ERROR, b"\x04")),
+        ("faff0304037003f88c", Message(MessageId.INIT_MT_RESULTS, bytes.fromhex("037003f8"))),
+        ("faff1000f1", Message(MessageId.GO_TO_MEASUREMENT)),
+        ("fa013000cf", Message(MessageId.GO_TO_CONFIG, bid=1)),
+    ],
+)
+def test_the_vendors_examples(data, message):
+    assert encode(message).hex() == data
+    assert decode(bytes.fromhex(data)) == [message]
+
+
+def test_errors_and_device_ids_are_read():
+    assert error_of(Message(MessageId.ERROR, b"\x04")).startswith("error 4: the message is not valid")
+    assert device_id(Message(MessageId.DEVICE_ID, bytes.fromhex("037003f8"))) == 0x037003F8
+    with pytest.raises(InvalidInputError, match="0x42: expected 1 bytes, got 0"):
+        error_of(Message(MessageId.ERROR))
+    with pytest.raises(InvalidInputError, match="0x01: expected at least 4 bytes, got 2"):
+        device_id(Message(MessageId.DEVICE_ID, b"ab"))
+
+
+# Framing in the presence of damage
+
+
+def stream(count=50, size=22):
+    rng = np.random.default_rng(1)
+    return [Message(MessageId.MT_DATA, rng.integers(0, 256, size, np.uint8).tobytes()) for _ in range(count)]
+
+
+@pytest.mark.parametrize("cut", range(1, 27))
+def test_a_stream_that_starts_in_mid_message_loses_that_message_only(cut):
+    sent = stream()
+    data = b"".join(map(encode, sent))[cut:]
+    frames = find_frames(data)
+    assert list(frames.messages()) == sent[1:]
+    assert frames.skipped() == [(0, 27 - cut)]
+
+
+def test_a_bad_checksum_and_lost_bytes_cost_the_messages_they_hit():
+    sent = stream()
+    pieces = [bytearray(encode(m)) for m in sent]
+    pieces[10][8] ^= 0x40
+    del pieces[20][5:9]
+    frames = find_frames(b"".join(pieces))
+    assert list(frames.messages()) == [m for i, m in enumerate(sent) if i not in (10, 20)]
+    assert frames.skipped() == [(270, 27), (540, 23)]
+
+
+def test_a_false_message_across_true_ones_does_not_swallow_them():
+    """Stray bytes that begin a longer message, whose checksum happens to hold."""
+    sent = stream(6)
+    head, data = bytes([0xFA, 0xFF, 0x77, 60]), b"".join(map(encode, sent))
+    stray = head + bytes([-sum(head[1:] + data[:60]) & 0xFF])
+    alone = (stray + data)[:65]
+    assert [m.mid for m in decode(alone[:5] + bytes(59) + bytes([-sum(stray[1:]) & 0xFF]))] == [0x77]
+    assert sum(alone[1:]) % 256 == 0
+    assert decode(stray + data) == sent
+
+
+@pytest.mark.parametrize("length", ["ffff", "2001"])
+def test_a_hostile_length_does_not_hide_what_follows(length):
+    sent = stream(20)
+    data = bytes.fromhex("faff32ff" + length) + b"".join(map(encode, sent))
+    assert decode(data) == sent
+
+
+def test_lengths_that_claim_more_than_is_there_do_not_hide_the_last_messages():
+    sent = stream(20)
+    data = b"".join(map(encode, sent[:-2])) + bytes.fromhex("faff32ff1f00") + b"".join(map(encode, sent[-2:]))
+    assert decode(data) == sent
+
+
+@FEW
+@given(st.binary(max_size=2000))
+def test_frames_lie_in_order_within_the_data_and_their_checksums_hold(data):
+    frames = find_frames(data)
+    assert (frames.start[1:] >= frames.end[:-1]).all()
+    covered = sum(frames.end - frames.start) + sum(size for _, size in frames.skipped())
+    assert covered == len(data)
+    for start, end in zip(frames.start, frames.end, strict=True):
+        assert sum(data[start + 1 : end]) % 256 == 0
+
+
+@FEW
+@given(st.lists(messages, max_size=8), st.lists(st.integers(1, 400), max_size=40))
+def test_a_framer_finds_the_same_whatever_pieces_a_stream_comes_in(sent, pieces):
+    data = b"".join(map(encode, sent))
+    framer, found, at = Framer(), [], 0
+    for piece in pieces:
+        found += framer.feed(data[at : at + piece])
+        at += piece
+    found += framer.feed(data[at:]) + framer.close()
+    # A payload may itself hold a message; those a framer cannot tell apart before more bytes come.
+    if not any(0xFA in m.payload or 0xFA in (m.mid, m.bid) or m.mid == 0 for m in sent):
+        assert found == sent
+        assert framer.skipped_bytes == 0
+
+
+def test_a_framer_delivers_a_message_with_its_last_byte_and_counts_what_it_skips():
+    data = encode(Message(MessageId.MT_DATA, bytes(22)))
+    framer = Framer()
+    assert framer.feed(b"junk" + data[:-1]) == []
+    assert framer.feed(data[-1:]) == [Message(MessageId.MT_DATA, bytes(22))]
+    assert framer.skipped_bytes == 4
+
+
+def test_a_framer_waits_for_no_more_bytes_than_a_message_can_have():
+    framer = Framer()
+    assert framer.feed(bytes.fromhex("faff32ffffff")) == []
+    assert framer.feed(encode(Message(MessageId.WAKE_UP))) == [Message(MessageId.WAKE_UP)]
+
+
+def test_a_framer_holds_a_long_message_until_it_is_whole():
+    long = Message(MessageId.EMTS, bytes(1320))
+    data = encode(long)
+    framer = Framer()
+    assert [m for at in range(0, len(data), 64) for m in framer.feed(data[at : at + 64])] == [long]
+
+
+def test_blocks_of_a_large_file_join_without_a_seam(monkeypatch):
+    sent = stream(200)
+    data = b"x" + b"".join(map(encode, sent))
+    monkeypatch.setattr("xsens.messages.framing._BLOCK", 1000)
+    assert decode(data) == sent
+
+
+# What short messages say
+
+
+def test_the_configuration_of_a_real_unit():
+    """MTi-300, recorded with the vendor's program: 100 Hz, one unit, no legacy output."""
+    payload = (
+        bytes.fromhex("037003f80480") + bytes(90) + bytes.fromhex("0001037003f8000000000000000100270108")
+    )
+    payload += bytes.fromhex("02490501")
+    assert len(payload) == 118
+    c = Configuration.from_message(Message(MessageId.CONFIGURATION, payload))
+    assert (c.device_id, c.period, c.rate_hz) == (0x037003F8, 1152, 100.0)
+    assert c.units == (UnitConfiguration(0x037003F8, 0, 0, 1, bytes.fromhex("0027010802490501")),)
+    assert c.message().payload == payload
+
+
+units = st.builds(
+    UnitConfiguration,
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 2**16 - 1),
+    st.integers(0, 2**16 - 1),
+    st.integers(0, 2**32 - 1),
+    st.binary(min_size=8, max_size=8),
+)
+
+
+@FEW
+@given(st.integers(0, 2**32 - 1), st.integers(0, 65535), st.integers(0, 65535), st.lists(units, max_size=4))
+def test_configurations_come_back(number, period, skip, several):
+    c = Configuration(number, period, skip, tuple(several), date=b"20200102", time=b"03040506")
+    assert Configuration.from_message(c.message()) == c
+    assert not c.rate_hz > 0 or c.rate_hz * period * (skip + 1) == pytest.approx(115200)
+
+
+@pytest.mark.parametrize("size", [0, 97, 99, 117, 119])
+def test_configurations_of_another_length_are_refused(size):
+    payload = (bytes(97) + b"\x01" + bytes(40))[:size]
+    with pytest.raises(InvalidInputError, match="expected"):
+        Configuration.from_message(Message(MessageId.CONFIGURATION, payload))
+
+
+def test_output_configurations_come_back():
+    items = (OutputItem(0x1020, 0xFFFF), OutputItem(0x2010, 400), OutputItem(0xC020, 100))
+    message = set_output_configuration(items)
+    assert encode(message).hex().startswith("faffc00c1020ffff20100190c0200064")
+    assert output_configuration(message) == items
+    assert set_output_configuration(()).payload == b""
+    with pytest.raises(InvalidInputError, match="4 bytes, got 5"):
+        output_configuration(Message(MessageId.OUTPUT_CONFIGURATION_ACK, bytes(5)))
+
+
+def test_states_follow_the_sensors_answers():
+    state = state_after(Message(MessageId.GO_TO_MEASUREMENT_ACK), State.CONFIGURATION)
+    assert state is State.MEASUREMENT
+    assert state_after(Message(MessageId.DEVICE_ID), state) is State.MEASUREMENT
+    assert state_after(Message(MessageId.GO_TO_CONFIG_ACK), state) is State.CONFIGURATION
+    assert state_after(Message(MessageId.MT_DATA2), State.CONFIGURATION) is State.MEASUREMENT
+    assert state_after(Message(0x77), state) is State.MEASUREMENT
+
+
+def test_settings_are_taken_in_one_state_only():
+    assert valid_in(MessageId.OUTPUT_MODE, State.CONFIGURATION)
+    assert not valid_in(MessageId.OUTPUT_MODE, State.MEASUREMENT)
+    assert valid_in(MessageId.REQ_DATA, State.MEASUREMENT)
+    assert not valid_in(MessageId.REQ_DATA, State.CONFIGURATION)
+    for state in State:
+        assert valid_in(MessageId.GO_TO_CONFIG, state)
+
+
+def test_answers_are_matched_to_requests():
+    assert reply_to(MessageId.REQ_CONFIGURATION) == MessageId.CONFIGURATION
+    assert request_of(Message(MessageId.EMTS)) == MessageId.REQ_EMTS
+    for unasked in (MessageId.MT_DATA, MessageId.MT_DATA2, MessageId.ERROR, MessageId.WAKE_UP):
+        assert request_of(Message(unasked)) is None

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+from imu_logs import calibration, samples
+
+from speckle3d.core.errors import InvalidInputError
+from xsens.messages.catalogue import MessageId
+from xsens.messages.framing import Message
+from xsens.messages.rawcounts import RawCalibration
+
+REAL = RawCalibration(
+    0x00007154,
+    450,
+    np.array([[29232, 33453, 31626], [32611, 32545, 32542], [30349, 33547, 33016]], dtype=float),
+    np.array([[1268.19, 1269.53, 1287.17], [1249.81, 1272.94, 1249.13], [8825.30, 7365.49, 7753.23]]),
+    np.tile(np.eye(3), (3, 1, 1)),
+    np.eye(3),
+)
+"""Offsets and gains of a real unit, its axes taken as square."""
+
+
+def test_counts_of_a_real_unit():
+    """Within what its axes are off square, 0.04: 0.04 x 9.8 m/s² at most, less for the others."""
+    counts = [[[29036, 34176, 44158], [32590, 32567, 32550], [25364, 35287, 30384]]]
+    acceleration, rate, field = REAL.to_units(counts)
+    np.testing.assert_allclose(acceleration, [[-0.121, 0.592, 9.742]], atol=0.1)
+    np.testing.assert_allclose(rate, [[-0.0169, 0.0171, 0.0064]], atol=0.002)
+    np.testing.assert_allclose(field, [[-0.558, 0.216, -0.353]], atol=0.03)
+    assert REAL.rate_hz == 256.0
+
+
+def test_units_made_counts_come_back_to_half_a_count():
+    unit, s = calibration(), samples(5000)
+    sent = np.stack([s[name] for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")])
+    back = unit.to_units(unit.to_counts(sent))
+    # Half a count over the gain, and as much again for axes that are not square (0.03 at most).
+    assert (np.abs(back - sent) < 0.6 / unit.gains[:, None]).all()
+
+
+def test_the_formula_is_the_one_in_the_docstring():
+    unit = calibration(3)
+    counts = np.random.default_rng(0).integers(0, 65536, (7, 3, 3))
+    for k, values in enumerate(unit.to_units(counts)):
+        for u, s in zip(counts[:, k], values, strict=True):
+            np.testing.assert_allclose(
+                unit.misalignments[k] @ s, (u - unit.offsets[k]) / unit.gains[k], rtol=0, atol=1e-9
+            )
+
+
+def test_blocks_come_back():
+    unit = calibration(1)
+    back = RawCalibration.from_message(unit.message())
+    for name in ("device_id", "period", "offsets", "gains", "misalignments", "housing"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(unit, name))
+
+
+def test_blocks_of_other_sensors_and_nonsense_are_refused():
+    with pytest.raises(InvalidInputError, match="expected message 0x91 of 168 bytes, got 0x91 of 1320"):
+        RawCalibration.from_message(Message(MessageId.EMTS, bytes(1320)))
+    with pytest.raises(InvalidInputError, match="expected gains above 0"):
+        RawCalibration.from_message(Message(MessageId.EMTS, bytes(168)))
+    payload = bytearray(calibration().message().payload)
+    payload[8:26] = bytes(18)
+    with pytest.raises(InvalidInputError, match="expected axes nearly square, got determinant 0"):
+        RawCalibration.from_message(Message(MessageId.EMTS, bytes(payload)))

@@ -1,0 +1,1 @@
+"""Errors of orientation against a reference."""

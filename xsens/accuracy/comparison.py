@@ -1,0 +1,116 @@
+"""How far two streams of orientation are apart, as a total angle, in heading and in inclination."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import FloatArray
+from speckle3d.core.streams import TimedRotations
+
+if TYPE_CHECKING:
+    from xsens.fusion.orient import Orientation
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences of one stream from another.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (m,)
+        Samples of the first stream that the second covers.
+    total_rad, heading_rad, inclination_rad : ndarray, shape (m,)
+        The whole angle, the signed angle about up, and what is left without it (Laidig et al. 2021); as
+        the streams are.
+    heading_offset_rad : float
+        Mean difference in heading.
+    """
+
+    time_s: FloatArray
+    total_rad: FloatArray
+    heading_rad: FloatArray
+    inclination_rad: FloatArray
+    heading_offset_rad: float
+
+    @property
+    def total_rms_rad(self) -> float:
+        """Root mean square of the whole angle."""
+        return _rms(self.total_rad)
+
+    @property
+    def heading_rms_rad(self) -> float:
+        """Root mean square of the heading's difference."""
+        return _rms(self.heading_rad)
+
+    @property
+    def heading_rms_without_offset_rad(self) -> float:
+        """The same if both agreed on where north is."""
+        off = np.angle(np.exp(1j * (self.heading_rad - self.heading_offset_rad)))
+        return _rms(off)
+
+    @property
+    def inclination_rms_rad(self) -> float:
+        """Root mean square of the inclination's difference."""
+        return _rms(self.inclination_rad)
+
+
+def compare_orientations(
+    one: TimedRotations | Orientation, other: TimedRotations | Orientation
+) -> Comparison:
+    """Compare two streams on one clock, the sensor's own orientation with the filter's, say.
+
+    Parameters
+    ----------
+    one, other : TimedRotations or Orientation
+        In worlds whose z is up; `other` is interpolated at the samples of `one`.
+
+    Raises
+    ------
+    InsufficientDataError
+        If they have no time in common.
+    InvalidInputError
+        If one is no stream of orientation.
+
+    References
+    ----------
+    .. [1] D. Laidig et al., "BROAD - A benchmark for robust inertial orientation estimation", Data 6(7),
+    2021.
+    """
+    one, other = _stream(one), _stream(other)
+    common = other.covers(one.time_s)
+    if not common.any():
+        raise InsufficientDataError(
+            f"expected streams that overlap, got {one.time_s[0]:.3f} to {one.time_s[-1]:.3f} s "
+            f"and {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s"
+        )
+    time_s = one.time_s[common]
+    w, x, y, z = _difference(one.world_from_sensor[common], other.at(time_s)).T
+    heading = 2.0 * np.arctan2(z, w)
+    heading = np.angle(np.exp(1j * heading))
+    inclination = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
+    total = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
+    offset = float(np.angle(np.exp(1j * heading).mean()))
+    return Comparison(time_s, total, heading, inclination, offset)
+
+
+def _stream(given: object) -> TimedRotations:
+    given = getattr(given, "rotations", given)
+    if not isinstance(given, TimedRotations):
+        raise InvalidInputError(
+            f"expected TimedRotations or an Orientation, as orient(log) gives, got {type(given).__name__}: "
+            "a log's own orientation is log.rotations()"
+        )
+    return given
+
+
+def _difference(one: Rotation, other: Rotation) -> FloatArray:
+    return np.asarray((one * other.inv()).as_quat(scalar_first=True))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

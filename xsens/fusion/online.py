@@ -1,0 +1,199 @@
+"""Orientation while the samples come: the filter behind a method that takes one sample or many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import FloatArray
+from xsens.fusion.errorstate import ErrorStateFilter
+from xsens.fusion.increments import Samples, blocks_of
+from xsens.fusion.plausible import FASTEST_RAD_S, real_field, require_metres
+from xsens.fusion.quaternions import turn_matrix
+from xsens.fusion.settings import BRIDGED_S, FusionSettings
+
+_JUDGED_S = 0.99
+"""The accelerometer's unit is judged by the median of the first second; less rounding."""
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """What the filter believes after the last sample.
+
+    Attributes
+    ----------
+    world_from_sensor : Rotation, single
+        x magnetic north, y west, z up. Until the magnetometer has spoken, x is where it was at the start.
+    standard_deviation_rad : ndarray, shape (3,)
+        About the world's axes: two of inclination, one of heading; of the last whole increment.
+    gyro_bias_rad_s : ndarray, shape (3,)
+    disturbed : bool
+        Whether the magnetic field is not trusted.
+    resting : bool
+    started : bool
+        Whether the first second, in which up and north are found, is over.
+    """
+
+    world_from_sensor: Rotation
+    standard_deviation_rad: FloatArray
+    gyro_bias_rad_s: FloatArray
+    disturbed: bool
+    resting: bool
+    started: bool
+
+
+class OnlineFilter:
+    """The filter of `xsens.orient`, fed as the sensor speaks.
+
+    Samples are gathered to increments of `FusionSettings.block_s`; between two of them the gyroscope alone
+    carries the orientation, so `state` is always that of the last sample.
+
+    Parameters
+    ----------
+    settings : FusionSettings, optional
+    """
+
+    def __init__(self, settings: FusionSettings | None = None) -> None:
+        self._settings = settings or FusionSettings()
+        self._kalman: ErrorStateFilter | None = None
+        self._pending: list[Samples] = []
+        self._pending_s = self._skipped_s = self._pause_s = 0.0
+        self._force = np.full(3, np.nan)
+        self._first: list[FloatArray] = []
+        self._judged_s = 0.0
+
+    def push(
+        self,
+        step_s: npt.ArrayLike,
+        gyroscope_rad_s: npt.ArrayLike,
+        accelerometer_m_s2: npt.ArrayLike,
+        magnetometer_au: npt.ArrayLike | None = None,
+    ) -> None:
+        """Take in samples.
+
+        Parameters
+        ----------
+        step_s : float or array_like, shape (m,)
+            Time from the sample before to each sample; more than 0.1 s is a pause, after which up and north
+            are found again.
+        gyroscope_rad_s, accelerometer_m_s2 : array_like, shape (3,) or (m, 3)
+            A sample without gyroscope (NaN) is left out, one without accelerometer takes the last there was.
+        magnetometer_au : array_like, shape (3,) or (m, 3), optional
+            Rows may be NaN; rows of zeros count as such.
+
+        Raises
+        ------
+        MismatchError
+            If the shapes do not fit together.
+        InvalidInputError
+            If a step is not positive and finite, the gyroscope cannot be in rad/s or, by its median over the
+            first second, the accelerometer in m/s^2.
+        """
+        steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
+        for step, rate, force, field in zip(steps, rates, forces, fields, strict=True):
+            self._judge(float(step), force)
+            self._take(float(step), rate, force, field)
+
+    @property
+    def state(self) -> OnlineState | None:
+        """What is believed after the last sample; None before there is a first increment."""
+        kalman = self._kalman
+        if kalman is None:
+            return None
+        snapshot = kalman.snapshot()
+        matrix = snapshot.matrix
+        if not snapshot.resting:
+            for each in self._pending:
+                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - snapshot.bias_rad_s) * each.step_s[0])
+        return OnlineState(
+            Rotation.from_matrix(matrix),
+            snapshot.sd_rad,
+            snapshot.bias_rad_s,
+            snapshot.disturbed,
+            snapshot.resting,
+            kalman.started,
+        )
+
+    def _judge(self, step_s: float, force: FloatArray) -> None:
+        """Refuse an accelerometer in other units when there is a second of it."""
+        if self._judged_s >= _JUDGED_S or not np.isfinite(force).all():
+            return
+        self._first.append(force)
+        self._judged_s += min(step_s, BRIDGED_S)
+        if self._judged_s >= _JUDGED_S:
+            try:
+                require_metres(np.array(self._first), "accelerometer_m_s2")
+            except InvalidInputError:
+                self._judged_s = 0.0  # nor may what comes next pass unjudged
+                raise
+            finally:
+                self._first = []
+
+    def _take(self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
+        if np.isfinite(force).all():
+            self._force = force
+        if not (np.isfinite(rate).all() and np.isfinite(self._force).all()):
+            self._skipped_s += step_s
+            return
+        step_s += self._skipped_s
+        self._skipped_s = 0.0
+        if step_s > BRIDGED_S and self._kalman is not None:
+            self._advance()
+            self._pause_s = step_s
+        # How the sensor turned in a pause is not known; the first sample's own step is not either.
+        step_s = step_s if step_s <= BRIDGED_S else self._settings.block_s
+        self._pending.append(Samples(np.array([step_s]), rate[None], self._force[None], field[None]))
+        self._pending_s += step_s
+        # Half a sample too short is as near to the block's length as half a sample too long.
+        if self._pending_s + 0.5 * step_s >= self._settings.block_s:
+            self._advance()
+
+    def _advance(self) -> None:
+        """Make an increment of what is pending."""
+        if not self._pending:
+            return
+        bias = np.zeros(3) if self._kalman is None else self._kalman.bias
+        (increment,) = blocks_of(_joined(self._pending), len(self._pending), bias)
+        self._pending, self._pending_s = [], 0.0
+        if self._kalman is None:
+            self._kalman = ErrorStateFilter(self._settings, increment)
+        elif self._pause_s:
+            self._kalman.resume(increment, self._pause_s)
+        self._pause_s = 0.0
+        self._kalman.advance(increment)
+
+
+def _checked(
+    step_s: npt.ArrayLike,
+    gyroscope_rad_s: npt.ArrayLike,
+    accelerometer_m_s2: npt.ArrayLike,
+    magnetometer_au: npt.ArrayLike | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    step = np.atleast_1d(np.asarray(step_s, dtype=float))
+    if not (np.isfinite(step) & (step > 0.0)).all():
+        raise InvalidInputError("step_s: expected positive numbers, got one that is not")
+    field = np.full((step.size, 3), np.nan) if magnetometer_au is None else magnetometer_au
+    vectors = []
+    for name, values in (
+        ("gyroscope_rad_s", gyroscope_rad_s),
+        ("accelerometer_m_s2", accelerometer_m_s2),
+        ("magnetometer_au", field),
+    ):
+        rows = np.atleast_2d(np.asarray(values, dtype=float))
+        if rows.shape != (step.size, 3):
+            raise MismatchError(f"{name}: expected shape {(step.size, 3)}, got {rows.shape}")
+        vectors.append(rows)
+    fast = np.linalg.norm(np.where(np.isfinite(vectors[0]), vectors[0], 0.0), axis=1).max(initial=0.0)
+    if fast > FASTEST_RAD_S:
+        raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
+    vectors[2], _ = real_field(vectors[2])
+    return step, vectors[0], vectors[1], vectors[2]
+
+
+def _joined(samples: list[Samples]) -> Samples:
+    names = ("step_s", "rate_rad_s", "force_m_s2", "field_au")
+    return Samples(*(np.concatenate([getattr(each, name) for each in samples]) for name in names))

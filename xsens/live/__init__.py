@@ -1,0 +1,1 @@
+"""From a port to a crash-safe file."""

@@ -1,0 +1,340 @@
+"""A live sensor on a serial port: asked, configured, started and stopped.
+
+The sensor is in one of two states: it takes settings in the one and sends data in the other. Whatever state
+it is found in, it is first brought to take settings; data still on their way are passed over.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Literal
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from xsens.messages.catalogue import (
+    BASE_RATE_HZ,
+    Configuration,
+    Framer,
+    Message,
+    MessageId,
+    OutputItem,
+    device_id,
+    encode,
+    error_of,
+    output_configuration,
+    reply_to,
+    set_output_configuration,
+)
+from xsens.messages.mtdata import OutputMode, OutputSettings
+from xsens.messages.rawcounts import RawCalibration
+
+if TYPE_CHECKING:
+    from serial import Serial
+
+Content = Literal["as set", "raw", "calibrated", "orientation"]
+
+CONTENTS: tuple[Content, ...] = ("as set", "raw", "calibrated", "orientation")
+
+COMMON_BAUD = (115200, 921600, 460800, 230400, 57600)
+"""Tried in turn: the factory setting first, then faster ones, which are set more often than slower ones."""
+
+ANSWER_S = 0.5
+"""Time for an answer: a sensor gives it within a few milliseconds, an adapter's driver may hold it for 16."""
+
+_POLL_S = 0.05
+_TRIES = 3
+_EVERY = 0xFFFF
+
+_MODES = {
+    "raw": OutputMode.RAW,
+    "calibrated": OutputMode.CALIBRATED,
+    "orientation": OutputMode.CALIBRATED | OutputMode.ORIENTATION,
+}
+_CALIBRATED_ITEMS = (0x4020, 0x8020, 0xC020)
+_ITEMS = {
+    "raw": (0xA010,),
+    "calibrated": _CALIBRATED_ITEMS,
+    "orientation": (0x2010, *_CALIBRATED_ITEMS),
+}
+_STAMPS = (OutputItem(0x1020, _EVERY), OutputItem(0x1060, _EVERY))
+_STATUS = OutputItem(0xE020, _EVERY)
+
+
+class DeviceError(FileError):
+    """The sensor is not there, does not answer, or refuses what it is told."""
+
+
+@dataclass(frozen=True)
+class DeviceSettings:
+    """What the sensor is to send.
+
+    Attributes
+    ----------
+    content : str
+        ``"orientation"``: the sensor's own orientation and calibrated data; ``"calibrated"``: the latter
+        only; ``"raw"``: counts; ``"as set"``: whatever it is set to. An MT9-B only knows raw counts.
+    rate_hz : float, optional
+        Samples per second; by default as set, and 100 for an MTData2 sensor whose content is chosen here.
+    baud : int, optional
+        Of the line; by default the common ones are tried.
+    """
+
+    content: Content = "orientation"
+    rate_hz: float | None = None
+    baud: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.content not in CONTENTS:
+            raise InvalidInputError(f"content: expected one of {', '.join(CONTENTS)}, got {self.content!r}")
+        if self.rate_hz is not None and not 1.0 <= self.rate_hz <= 2000.0:
+            raise InvalidInputError(f"rate_hz: expected 1 to 2000, got {self.rate_hz:g}")
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What the sensor says about itself, after it has been configured.
+
+    Attributes
+    ----------
+    device_id : int
+    kind : str
+        ``"MT9-B"``, ``"legacy"`` (MTData) or ``"MTData2"``.
+    rate_hz : float
+        Samples per second; NaN if it does not say.
+    header : tuple of Message
+        What a reader of its data needs: configuration and calibration, as the sensor sent them.
+    """
+
+    device_id: int
+    kind: str
+    rate_hz: float
+    header: tuple[Message, ...]
+
+
+class Device:
+    """A conversation with the sensor on an open port.
+
+    Parameters
+    ----------
+    port : serial.Serial
+        Open; closed with the device.
+
+    Attributes
+    ----------
+    tap : callable, optional
+        Given every byte that arrives, before anything is made of it.
+    """
+
+    def __init__(self, port: Serial) -> None:
+        self._port = port
+        self._framer = Framer()
+        self.tap: Callable[[bytes], None] | None = None
+
+    def __enter__(self) -> Device:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def baud(self) -> int:
+        """Of the line."""
+        return int(self._port.baudrate)
+
+    def close(self) -> None:
+        """Close the port; the sensor goes on with what it does."""
+        self._port.close()
+
+    def receive(self) -> list[Message]:
+        """Messages that arrive now, after at most a twentieth of a second's wait.
+
+        Raises
+        ------
+        DeviceError
+            If the port is gone.
+        """
+        with self._there():
+            data = self._port.read(max(1, self._port.in_waiting))
+        if data and self.tap is not None:
+            self.tap(data)
+        return self._framer.feed(data) if data else []
+
+    def send(self, message: Message) -> None:
+        """Send without waiting for an answer."""
+        with self._there():
+            self._port.write(encode(message))
+
+    def _waiting(self) -> bool:
+        with self._there():
+            return bool(self._port.in_waiting)
+
+    @contextmanager
+    def _there(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:  # pyserial's own errors are OSErrors
+            reason = str(error).splitlines()[0]
+            raise DeviceError(f"{self._port.name}: the port is gone: {reason}") from error
+
+    def request(self, request: Message, tries: int = _TRIES) -> Message:
+        """Send and wait for the answer; data and what else arrives meanwhile are passed over.
+
+        Raises
+        ------
+        DeviceError
+            If there is no answer after `tries`, or the answer is an error.
+        """
+        while self._waiting():  # an answer that came too late to an earlier request is none to this
+            self.receive()
+        for _ in range(tries):
+            self.send(request)
+            deadline = time.monotonic() + ANSWER_S
+            while time.monotonic() < deadline:
+                for message in self.receive():
+                    if message.mid == reply_to(request.mid):
+                        return message
+                    self._refuse(message, request)
+        raise DeviceError(
+            f"{self._port.name}: expected an answer to message {request.mid:#04x}, got none in {tries} "
+            f"tries of {ANSWER_S:g} s at {self._port.baudrate} baud"
+        )
+
+    def _refuse(self, message: Message, request: Message) -> None:
+        """Errors end a request; a sensor that wakes up would measure unless told to stay."""
+        if message.mid == MessageId.ERROR:
+            raise DeviceError(
+                f"{self._port.name}: message {request.mid:#04x} was answered by {error_of(message)}"
+            )
+        if message.mid == MessageId.WAKE_UP and request.mid != MessageId.GO_TO_CONFIG:
+            self.send(Message(MessageId.WAKE_UP_ACK))
+
+    def ask(self, mid: int) -> Message | None:
+        """Answer to a request without payload; None if this sensor has none to it."""
+        try:
+            return self.request(Message(mid), tries=2)
+        except DeviceError:
+            return None
+
+    def go_to_config(self, tries: int = _TRIES) -> None:
+        """Make the sensor take settings; it stops sending data."""
+        self.request(Message(MessageId.GO_TO_CONFIG), tries)
+
+    def go_to_measurement(self) -> None:
+        """Make the sensor send data."""
+        self.request(Message(MessageId.GO_TO_MEASUREMENT))
+
+
+def connect(port_name: str, baud: int | None = None) -> Device:
+    """Open a port with a sensor on it and make the sensor take settings.
+
+    Raises
+    ------
+    DeviceError
+        If the port cannot be opened, or no sensor answers at `baud`, or at any of the common rates.
+    FileError
+        If pyserial is not installed.
+    """
+    rates = COMMON_BAUD if baud is None else (baud,)
+    for rate in rates:
+        device = Device(open_port(port_name, rate))
+        with ExitStack() as undo:
+            undo.callback(device.close)
+            with suppress(DeviceError):
+                device.go_to_config(tries=2 if baud is None else _TRIES)
+                undo.pop_all()
+                return device
+    tried = ", ".join(str(rate) for rate in rates)
+    raise DeviceError(f"{port_name}: expected a sensor, got no answer at {tried} baud")
+
+
+def open_port(port_name: str, baud: int) -> Serial:
+    """Open a serial port for this process alone: 8 data bits, no parity, 2 stop bits.
+
+    Raises
+    ------
+    DeviceError
+        If the port cannot be opened.
+    FileError
+        If pyserial is not installed.
+    """
+    try:
+        import serial
+    except ImportError as error:
+        raise FileError("a live sensor needs pyserial: pip install 'speckle3d[live]'") from error
+    try:
+        return serial.Serial(
+            port_name,
+            baud,
+            stopbits=serial.STOPBITS_TWO,
+            timeout=_POLL_S,
+            write_timeout=ANSWER_S,
+            exclusive=True,
+        )
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise DeviceError(f"{port_name}: cannot be opened as a serial port: {reason}") from error
+
+
+def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
+    """Configure a sensor that takes settings, and ask it for all that a reader of its data needs.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or refuses.
+    """
+    number = device_id(device.request(Message(MessageId.REQ_DID)))
+    current = device.ask(MessageId.OUTPUT_CONFIGURATION)
+    if current is not None:
+        return _prepare_mtdata2(device, settings, number, current)
+    before = device.ask(MessageId.REQ_CONFIGURATION)
+    units = () if before is None else Configuration.from_message(before).units
+    mt9 = not units or bool(units[0].output_mode & OutputMode.MT9)
+    _configure_legacy(device, settings, mt9)
+    return _describe(device, number, "MT9-B" if mt9 else "legacy")
+
+
+def _describe(device: Device, number: int, kind: str) -> DeviceInfo:
+    asked = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS))
+    header = tuple(message for message in asked if message is not None)
+    return DeviceInfo(number, kind, _rate_hz(header), header)
+
+
+def _rate_hz(header: tuple[Message, ...]) -> float:
+    """By the configuration, or failing that by the calibration block; NaN if neither says."""
+    for message in header:
+        if message.mid == MessageId.CONFIGURATION:
+            return Configuration.from_message(message).rate_hz
+        with suppress(InvalidInputError):  # later sensors' blocks have another layout
+            return RawCalibration.from_message(message).rate_hz
+    return float("nan")
+
+
+def _configure_legacy(device: Device, settings: DeviceSettings, mt9: bool) -> None:
+    if not mt9 and settings.content != "as set":
+        _set(device, MessageId.OUTPUT_MODE, _MODES[settings.content], 2)
+        _set(device, MessageId.OUTPUT_SETTINGS, OutputSettings.COUNTER, 4)
+        _set(device, MessageId.SKIP_FACTOR, 0, 2)
+    if settings.rate_hz is not None:
+        _set(device, MessageId.PERIOD, round(BASE_RATE_HZ / settings.rate_hz), 2)
+
+
+def _set(device: Device, mid: MessageId, value: int, size: int) -> None:
+    device.request(Message(mid, int(value).to_bytes(size, "big")))
+
+
+def _prepare_mtdata2(device: Device, settings: DeviceSettings, number: int, current: Message) -> DeviceInfo:
+    answer = current
+    if settings.content != "as set":
+        rate = round(settings.rate_hz or 100.0)
+        items = tuple(OutputItem(identifier, rate) for identifier in _ITEMS[settings.content])
+        answer = device.request(set_output_configuration((*_STAMPS, *items, _STATUS)))
+    rates = [item.rate_hz for item in output_configuration(answer) if item.rate_hz not in (0, _EVERY)]
+    info = _describe(device, number, "MTData2")
+    rate_hz = float(max(rates)) if rates else info.rate_hz
+    return DeviceInfo(number, "MTData2", rate_hz, (*info.header, answer))

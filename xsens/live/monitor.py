@@ -1,0 +1,262 @@
+"""What a live sensor is doing, from its own messages: rate, losses, orientation, and whether iron is near."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.geometry import FloatArray
+from xsens.fusion.online import OnlineFilter
+from xsens.live.device import DeviceInfo
+from xsens.logs.bytelogs import parse_stream
+from xsens.logs.logparts import Hints
+from xsens.logs.samples import ImuLog
+from xsens.messages.catalogue import Framer, MessageId, encode
+
+RATE_OVER_S = 2.0
+"""Long against an adapter's 16 ms between two handfuls of bytes, short against a person's patience."""
+
+FIELD_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
+"""Beyond which the field counts as disturbed, as in VQF (Laidig and Seel, Information Fusion 91, 2023)."""
+
+REFERENCE_S = 1.0
+"""Time at the start over which the field is taken as the place's own."""
+
+_WORD = 1 << 16
+_MOST_PENDING = 1 << 20
+_MOST_ARRIVALS = 1 << 12
+_DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
+
+
+@dataclass(frozen=True)
+class LiveState:
+    """A sensor being recorded, as it is now.
+
+    Attributes
+    ----------
+    connected : bool
+    elapsed_s : float
+        Since measuring began.
+    samples, lost : int
+        Received, and missing by the sensor's own counter while it was connected.
+    interruptions : int
+        How often it was away.
+    rate_hz : float
+        Received over the last two seconds.
+    bytes_written : int
+    world_from_sensor : Rotation, optional
+        The sensor's own orientation, or the on-line filter's.
+    field : float
+        Norm of the magnetic field over that at the start; NaN without a magnetometer.
+    dip_change_rad : float
+        Of the field's angle to the vertical; NaN without a magnetometer.
+    note : str
+        What went wrong last; empty if nothing did.
+    """
+
+    connected: bool
+    elapsed_s: float
+    samples: int
+    lost: int
+    interruptions: int
+    rate_hz: float
+    bytes_written: int
+    world_from_sensor: Rotation | None
+    field: float
+    dip_change_rad: float
+    note: str
+
+    @property
+    def disturbed(self) -> bool | None:
+        """Whether the field differs from that at the start; None if there is none."""
+        if not np.isfinite(self.field):
+            return None
+        off = abs(self.field - 1.0) > FIELD_TOLERANCE or abs(self.dip_change_rad) > DIP_TOLERANCE_RAD
+        return bool(off)
+
+    def line(self) -> str:
+        """Everything in one line."""
+        parts = [f"{self.elapsed_s:6.1f} s", f"{self.samples} samples", f"{self.lost} lost"]
+        parts.append(f"{self.rate_hz:.1f} Hz" if self.connected else "NOT CONNECTED")
+        if self.interruptions:
+            parts.append(f"{self.interruptions} interruptions")
+        if self.world_from_sensor is not None:
+            yaw, pitch, roll = self.world_from_sensor.as_euler("ZYX", degrees=True)
+            parts.append(f"roll {roll:+.1f} pitch {pitch:+.1f} yaw {yaw:+.1f}")
+        if self.disturbed is not None:
+            verdict = "DISTURBED" if self.disturbed else "clear"
+            parts.append(f"field {self.field:.2f} dip {np.rad2deg(self.dip_change_rad):+.0f} {verdict}")
+        if self.note and not self.connected:
+            parts.append(self.note)
+        return " | ".join(parts)
+
+
+class Monitor:
+    """Counts what a recording thread hears, and makes sense of it when asked for the state."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._since_s = time.monotonic()
+        self._connected = False
+        self._samples = self._lost = self._interruptions = 0
+        self._note = ""
+        self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_ARRIVALS)
+        self._framer = Framer()
+        self._header, self._hints, self._pending = b"", Hints(), bytearray()
+        self._counter: int | None = None
+        self._attitude = _Attitude()
+        self._field = _Field()
+
+    def started(self, info: DeviceInfo) -> None:
+        """The sensor begins to measure, counting from anywhere."""
+        with self._lock:
+            self._digest()
+            self._header = b"".join(encode(message) for message in info.header)
+            self._hints = Hints(rate_hz=info.rate_hz if info.rate_hz > 0 else None)
+            self._connected, self._counter = True, None
+            self._framer = Framer()
+            self._arrivals.clear()
+            self._attitude = _Attitude(info.rate_hz)
+
+    def arrived(self, received: bytes) -> None:
+        """Bytes have come, in whatever pieces."""
+        with self._lock:
+            now_s = time.monotonic()
+            data = [message for message in self._framer.feed(received) if message.mid in _DATA]
+            self._samples += len(data)
+            self._arrivals.append((now_s, len(data)))
+            self._pending += b"".join(map(encode, data))
+            if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
+                self._digest()
+
+    def interrupted(self, reason: str) -> None:
+        """The sensor is away, or still is."""
+        with self._lock:
+            self._digest()
+            self._interruptions += self._connected
+            self._connected, self._note = False, reason
+
+    def state(self, bytes_written: int) -> LiveState:
+        """How it goes now."""
+        with self._lock:
+            self._digest()
+            return LiveState(
+                connected=self._connected,
+                elapsed_s=time.monotonic() - self._since_s,
+                samples=self._samples,
+                lost=self._lost,
+                interruptions=self._interruptions,
+                rate_hz=self._rate_hz(),
+                bytes_written=bytes_written,
+                world_from_sensor=self._attitude.latest if self._connected else None,
+                field=self._field.ratio,
+                dip_change_rad=self._field.dip_change_rad,
+                note=self._note,
+            )
+
+    def _rate_hz(self) -> float:
+        """Samples after the first arrival that is still counted, over the time since."""
+        while len(self._arrivals) > 2 and self._arrivals[-1][0] - self._arrivals[0][0] > RATE_OVER_S:
+            self._arrivals.popleft()
+        if not self._connected or len(self._arrivals) < 2:
+            return 0.0
+        span_s = max(time.monotonic(), self._arrivals[-1][0]) - self._arrivals[0][0]
+        return sum(count for _, count in list(self._arrivals)[1:]) / span_s
+
+    def _digest(self) -> None:
+        data, self._pending = bytes(self._pending), bytearray()
+        if not data:
+            return
+        try:
+            log = parse_stream(self._header + data, self._hints)
+        except Speckle3DError as error:
+            self._note = str(error)
+            return
+        rotations = self._attitude.follow(log, self._count_lost(log))
+        self._field.follow(log, rotations)
+
+    def _count_lost(self, log: ImuLog) -> int:
+        """Count what is missing within the log; returned is what is missing before it."""
+        self._lost += log.lost
+        if log.counter is None:
+            return 0
+        before = 0
+        if self._counter is not None:
+            before = int(log.counter[0] - self._counter - 1) % _WORD
+            self._lost += before
+        self._counter = int(log.counter[-1]) % _WORD
+        return before
+
+
+class _Attitude:
+    """The sensor's own orientation if it sends one, else the filter's."""
+
+    def __init__(self, rate_hz: float = float("nan")) -> None:
+        self.latest: Rotation | None = None
+        self._filter = OnlineFilter()
+        self._step_s = 1.0 / rate_hz if rate_hz > 0 else float("nan")
+
+    def follow(self, log: ImuLog, lost_before: int) -> Rotation | None:
+        """Take in some samples; orientation of each, if the sensor sent them."""
+        if log.world_from_sensor is None or not log.oriented.any():
+            self._filtered(log, lost_before)
+            return None
+        self.latest = log.world_from_sensor[log.oriented][-1]
+        return log.world_from_sensor if log.oriented.all() else None
+
+    def _filtered(self, log: ImuLog, lost_before: int) -> None:
+        if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
+            self.latest = None
+            return
+        steps = np.diff(log.time_s)
+        if steps.size:
+            self._step_s = float(np.median(steps))
+        if not np.isfinite(self._step_s):
+            return
+        first = self._step_s * (1 + lost_before)
+        try:
+            self._filter.push(
+                [first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
+            )
+        except InvalidInputError:  # damage: what is recorded stays, and the display begins anew
+            self._filter = OnlineFilter()
+        state = self._filter.state
+        self.latest = None if state is None else state.world_from_sensor
+
+
+class _Field:
+    """The magnetic field beside that of the first second: its norm and its angle to the vertical."""
+
+    def __init__(self) -> None:
+        self.ratio = self.dip_change_rad = float("nan")
+        self._learnt_s = 0.0
+        self._sum = np.zeros(3)
+
+    def follow(self, log: ImuLog, rotations: Rotation | None) -> None:
+        """Take in some samples."""
+        up = log.accelerometer_m_s2 if rotations is None else rotations.inv().apply([0.0, 0.0, 1.0])
+        if log.magnetometer_au is None or up is None:
+            return
+        norm, dip = _norm_and_dip(log.magnetometer_au, up)
+        if not norm.size:
+            return
+        if self._learnt_s < REFERENCE_S:
+            self._learnt_s += norm.size / log.rate_hz if len(log) > 1 else 0.0
+            self._sum += [norm.sum(), dip.sum(), norm.size]
+        usual_norm, usual_dip = self._sum[:2] / self._sum[2]
+        self.ratio = float(norm.mean() / usual_norm)
+        self.dip_change_rad = float(dip.mean() - usual_dip)
+
+
+def _norm_and_dip(field: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Norm, and angle below the horizontal in radians, of the samples that have both vectors."""
+    norm, length = np.linalg.norm(field, axis=1), np.linalg.norm(up, axis=1)
+    there = (norm > 0) & (length > 0)  # NaN is not
+    sine = np.einsum("ij,ij->i", field[there], up[there]) / (norm * length)[there]
+    return norm[there], -np.arcsin(np.clip(sine, -1.0, 1.0))

@@ -1,0 +1,265 @@
+"""Recording a live sensor to a file that a crash cannot spoil, through unplugging and plugging in again.
+
+What arrives is appended to the file as it comes, before anything is made of it: ending the program in any way
+loses only what the sensor has not sent. The file is the sensor's own messages. Each stretch of measuring
+begins with its configuration, its calibration, and the time of the computer's clock (as a UTC message), by
+which a reader can tell how long the sensor was away.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
+from xsens.live.monitor import LiveState, Monitor
+from xsens.messages.catalogue import Message, MessageId, encode
+
+UTC_TIME = 0x61
+"""Message id of the answer to a request for the time."""
+
+SILENCE_S = 2.0
+"""A sensor that sends nothing for so long is asked whether it is still there; its slowest rate is 1 Hz."""
+
+RETRY_S = 0.1
+"""A sensor with new power waits half a second for somebody to keep it from measuring in its own way."""
+_ALL_VALID = 7
+
+
+class RawFile:
+    """Bytes appended to a file, each piece handed to the operating system at once.
+
+    Parameters
+    ----------
+    path : path
+    append : bool
+        Go on in a file that is there already, instead of refusing it.
+
+    Raises
+    ------
+    FileError
+        If the file is there and `append` is false, or it cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], append: bool = False) -> None:
+        self.path, self.written = Path(path), 0
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        try:
+            self._file = os.open(self.path, flags | (0 if append else os.O_EXCL), 0o644)
+        except FileExistsError as error:
+            raise FileError(f"{path}: there already; expected a new file, or to be told to append") from error
+        except OSError as error:
+            raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+    def append(self, data: bytes) -> None:
+        """Add bytes; all of them are the operating system's when this returns."""
+        left = memoryview(data)
+        try:
+            while left:
+                left = left[os.write(self._file, left) :]
+        except OSError as error:
+            raise FileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        self.written += len(data)
+
+    def sync(self) -> None:
+        """Have it on the disk, against a failure of the power and not only of the program."""
+        if self._file >= 0:
+            with suppress(OSError):  # pipes and some network file systems cannot
+                os.fsync(self._file)
+
+    def close(self) -> None:
+        """Have everything on the disk and close; closing twice does nothing."""
+        self.sync()
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1
+
+
+class Recorder:
+    """A sensor being recorded, in a thread of its own, so that no slow display can make it miss bytes.
+
+    Parameters
+    ----------
+    port : str
+        Name of the serial port.
+    path : path
+        New file, or one to go on in if `append`.
+    settings : DeviceSettings
+    append : bool
+
+    Attributes
+    ----------
+    info : DeviceInfo
+        What the sensor says about itself.
+
+    Raises
+    ------
+    DeviceError
+        If no sensor answers, or refuses its settings.
+    FileError
+        If the port cannot be opened or the file not be written.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        path: str | os.PathLike[str],
+        settings: DeviceSettings | None = None,
+        append: bool = False,
+    ) -> None:
+        self._port, self._settings = port, settings or DeviceSettings()
+        device = connect(port, self._settings.baud)
+        try:
+            self.info = prepare(device, self._settings)
+            self._file = RawFile(path, append)
+        except BaseException:
+            device.close()
+            raise
+        self._baud = device.baud
+        self._monitor = Monitor()
+        self._failure: Speckle3DError | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._record, args=(device,), daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the sensor, take what it has still sent, and close port and file."""
+        self._stop.set()
+        self._thread.join()
+        self._file.close()
+
+    def state(self) -> LiveState:
+        """How it goes; what has been recorded is then on the disk.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written any more.
+        """
+        if self._failure is not None:
+            raise self._failure
+        if not (self._thread.is_alive() or self._stop.is_set()):
+            raise DeviceError(f"{self._port}: the recording has ended by an error of the program")
+        self._file.sync()
+        return self._monitor.state(self._file.written)
+
+    def _record(self, device: Device | None) -> None:
+        """The thread: stretches of measuring until told to stop."""
+        try:
+            while device is not None:
+                try:
+                    self._measure(device)
+                    break
+                except DeviceError as error:
+                    self._monitor.interrupted(str(error))
+                    device = self._found_again(device)
+        except Speckle3DError as error:
+            self._failure = error
+        finally:
+            if device is not None:
+                device.close()
+
+    def _measure(self, device: Device) -> None:
+        for message in (*self.info.header, utc_message()):
+            self._file.append(encode(message))
+        self._monitor.started(self.info)
+        device.tap = self._take
+        device.go_to_measurement()
+        self._listen(device)
+        with suppress(DeviceError):  # what it sends until it stops is recorded as well
+            device.go_to_config()
+
+    def _take(self, data: bytes) -> None:
+        self._file.append(data)
+        self._monitor.arrived(data)
+
+    def _listen(self, device: Device) -> None:
+        heard = time.monotonic()
+        while not self._stop.is_set():
+            messages = device.receive()
+            if messages:
+                heard = time.monotonic()
+            if any(message.mid == MessageId.WAKE_UP for message in messages):
+                raise DeviceError(f"{self._port}: the sensor had no power for a moment")
+            if time.monotonic() - heard > SILENCE_S:
+                raise DeviceError(f"{self._port}: the sensor has been silent for {SILENCE_S:g} s")
+
+    def _found_again(self, device: Device) -> Device | None:
+        """The same sensor, ready to measure; None if told to stop before it is there."""
+        found: Device | None = device
+        while not self._stop.is_set():
+            try:
+                found = found or connect(self._port, self._baud)
+                found.go_to_config(tries=1)
+                self._require_same(prepare(found, self._settings))
+            except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
+                self._monitor.interrupted(str(error))
+                if found is not None:
+                    found.close()
+                found = None
+                self._stop.wait(RETRY_S)
+            else:
+                return found
+        return None
+
+    def _require_same(self, info: DeviceInfo) -> None:
+        if info.device_id != self.info.device_id:
+            raise DeviceError(
+                f"{self._port}: expected sensor {self.info.device_id:08X}, got {info.device_id:08X}"
+            )
+        self.info = info
+
+
+def record(
+    port: str,
+    path: str | os.PathLike[str],
+    settings: DeviceSettings | None = None,
+    append: bool = False,
+    interval_s: float = 0.25,
+    duration_s: float = float("inf"),
+) -> Iterator[LiveState]:
+    """Record a sensor and say how it goes, until the time is over or the iteration is left.
+
+    Parameters
+    ----------
+    port, path, settings, append
+        As for `Recorder`.
+    interval_s : float
+        Between two states.
+    duration_s : float
+        Of the recording.
+
+    Yields
+    ------
+    LiveState
+        The last one when all is in the file.
+    """
+    with Recorder(port, path, settings, append) as recorder:
+        end = time.monotonic() + duration_s
+        while (left := end - time.monotonic()) > 0:
+            time.sleep(min(interval_s, left))
+            yield recorder.state()
+    yield recorder.state()
+
+
+def utc_message(now: datetime | None = None) -> Message:
+    """The computer's time, in the form in which the sensors tell theirs."""
+    t = now or datetime.now(UTC)
+    fields = (t.microsecond * 1000, t.year, t.month, t.day, t.hour, t.minute, t.second, _ALL_VALID)
+    return Message(UTC_TIME, struct.pack(">IH6B", *fields))
