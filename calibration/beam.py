@@ -16,8 +16,8 @@ import numpy as np
 
 from calibration.plane import Plane, solve
 from calibration.solution import Solution
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 
 _ROUNDING = 1e-20
 """Variance of cosines that are all the same but for rounding; tilts of a tenth of a degree make 1e-13."""

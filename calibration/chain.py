@@ -16,22 +16,14 @@ from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from calibration.mirror import canonical
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import (
-    FloatArray,
-    require_finite,
-    roll_yaw_tilt,
-    rotation_from_fixed_angles,
-    skew,
-)
+from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
 
 Seen = Literal["line", "direction", "dot"]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 SCALES = ("s_x", "s_y")
 PROBE = (*SCALES, "x", "y", "z", "alpha", "beta", "gamma")

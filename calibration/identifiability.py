@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import CHAIN, BoolArray, ImagePoints, residuals_and_jacobian
+from calibration.chain import CHAIN, ImagePoints, residuals_and_jacobian
 from calibration.solution import Solution
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray, skew
+from speckle3d.core.geometry import skew
 
 MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
-from calibration.chain import ImagePoints, IntArray, as_directions
+from calibration.chain import ImagePoints, as_directions
 from calibration.clock.pairing import Offset, covered, estimate_offset
 from calibration.detection.lines import EchoLines, LineSettings, detect_lines
 from calibration.orientation import Viewed, calibrate_orientation
@@ -19,9 +19,9 @@ from calibration.report import Shot
 from calibration.results import as_calibration
 from calibration.solution import Solution
 from calibration.wires import Registration, calibrate_crossing, calibrate_wires
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
 from speckle3d.core.wires import WirePhantom

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 
 
 def wrapped(angles_rad: npt.ArrayLike) -> FloatArray:

@@ -21,12 +21,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Chain, ImagePoints, IntArray
+from calibration.chain import Chain, ImagePoints
 from calibration.detection.dots import Dots
 from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
 from calibration.wirefit import rigid_fits
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95

@@ -14,13 +14,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints, IntArray
+from calibration.chain import ImagePoints
 from calibration.identifiability import require_adequate
 from calibration.plane import ANGLES, OUTLIER_SIGMA, LineDirections, settled_angles, solve, some
 from calibration.solution import Solution
 from calibration.starts import hemisphere, in_plane_mirror
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 
 Viewed = Literal["above", "below"]
 

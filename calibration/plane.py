@@ -21,10 +21,8 @@ from calibration.chain import (
     CHAIN,
     PROBE,
     SCALES,
-    BoolArray,
     Chain,
     ImagePoints,
-    IntArray,
     Phantom,
     Seen,
     as_directions,
@@ -33,8 +31,8 @@ from calibration.chain import (
 from calibration.identifiability import judge, require_adequate
 from calibration.solution import Solution
 from calibration.starts import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.leastsquares import Fit, clustered_covariance, correlated_lags, levenberg_marquardt
 
 ANGLES = PROBE[5:]

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from calibration.chain import Chain, ImagePoints, as_directions, residuals_and_jacobian
 from calibration.plane import solve
 from calibration.solution import Solution
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 
 
 @dataclass(frozen=True)

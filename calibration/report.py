@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
 from calibration.solution import Solution
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, readable
-from speckle3d.core.geometry import FloatArray, roll_yaw_tilt
+from speckle3d.core.geometry import roll_yaw_tilt
 
 USED, DROPPED = "#0072B2", "#D55E00"
 """Of Okabe and Ito's palette, told apart with any colour vision."""

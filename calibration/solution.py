@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.chain import BoolArray, Chain, ImagePoints, Phantom
-from speckle3d.core.geometry import FloatArray
+from calibration.chain import Chain, ImagePoints, Phantom
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.leastsquares import Fit
 
 

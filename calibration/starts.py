@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import Chain, ImagePoints
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 
 _NORMALS = 30
 _ROTATIONS = 800

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.geometry import FloatArray, skew
-from speckle3d.core.wires import IntArray, WirePhantom
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.geometry import skew
+from speckle3d.core.wires import WirePhantom
 
 _RIDGE_MM2 = 1e-3
 """Holds axes that the wires leave open near zero; a dot 10 mm off the centre weighs 100 mm^2."""

@@ -20,8 +20,9 @@ from calibration.identifiability import require_adequate
 from calibration.plane import OUTLIER_SIGMA, solve, some
 from calibration.solution import Solution
 from calibration.starts import least_absolute, rotations_all_over
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray, rotation_from_axes
+from speckle3d.core.geometry import rotation_from_axes
 from speckle3d.core.wires import WirePhantom
 
 Registration = Literal["held", "turned", "free"]

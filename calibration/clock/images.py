@@ -26,8 +26,8 @@ from calibration.clock.line import SEARCH_S, Delay
 from calibration.clock.pairing import covered
 from calibration.clock.peak import SIGMAS, STEP_S, clear_peak, curves_at, doubts, half_width, mean_of, placed
 from calibration.images.stacks import TrackedImages
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import ChosenImages, GreyArray, Images

@@ -21,8 +21,8 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.clock.pairing import covered
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
 SEARCH_S = 0.5

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from calibration.solution import Solution
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray, TimedPoses, TimedRotations
+from speckle3d.core.streams import TimedPoses, TimedRotations
 
 _STEP_S = 0.02
 """Coarse steps of the offset: half a frame at 25 frames/s, in which no hand reverses."""

@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from calibration.clock.line import require_peak
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
 
 STEP_S = 0.01
 

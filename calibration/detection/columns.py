@@ -9,12 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
-
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 _GLANCES = 48
 """Frames looked at for what stands still in all of them."""

@@ -16,12 +16,11 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import ndimage
 
-from calibration.detection.columns import BoolArray, IntArray, lay_columns
+from calibration.detection.columns import lay_columns
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
-
-Float32Array = npt.NDArray[np.float32]
 
 _MAD_TO_SIGMA = 1.4826
 _FAINTEST = 0.03

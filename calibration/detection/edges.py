@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration.detection.columns import Columns
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.lines import echo_fronts, echo_levels, filter_columns, first_edges
 
-Float32Array = npt.NDArray[np.float32]
 Place = Literal["front", "slope", "peak"]
 
 _FINE = 0.25

@@ -23,9 +23,9 @@ from scipy.spatial.transform import RigidTransform
 from calibration.chain import Chain, ImagePoints
 from calibration.detection.dots import Dots
 from calibration.wirefit import linear_fits, rigid_fits
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.wires import IntArray, WirePhantom
+from speckle3d.core.wires import WirePhantom
 
 _STEEPEST = 2.0
 """How much longer than in the phantom a distance may be in the image: a plane 60 degrees from square."""

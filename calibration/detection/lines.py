@@ -14,22 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibration.detection.columns import (
-    DENSELY,
-    BoolArray,
-    Columns,
-    IntArray,
-    lay_columns,
-    without_blank_sides,
-    without_standing,
-)
+from calibration.detection.columns import DENSELY, Columns, lay_columns, without_blank_sides, without_standing
 from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import consensus_line
-
-Float32Array = npt.NDArray[np.float32]
 
 _PARTS = (0.95, 0.85, 0.75, 0.65, 0.5)
 """Brightness of an echo that counts when no threshold is given, as parts of the brightest one in the middle

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray, skew
-from speckle3d.core.streams import BoolArray
+from speckle3d.core.geometry import skew
 
 PARAMETERS = ("tilt", "yaw", "roll", "x", "y", "z")
 """Small turns about the image's x, y and z through its centre, and shifts along them."""

@@ -8,9 +8,9 @@ import numpy as np
 
 from calibration.images.curvature import Settled
 from calibration.images.fit import Refined, about_pivot
-from calibration.images.stacks import IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray, skew
+from speckle3d.core.geometry import skew
 
 BLOCK_MM = 16.0
 """Side of the blocks of tissue that err together, in units of the images' size: some patches wide, as

@@ -9,16 +9,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.similarity import Comparison, spread_patches, whole_images
-from calibration.images.stacks import (
-    BASE_PIXEL_MM,
-    WHOLE,
-    IntArray,
-    Stack,
-    TrackedImages,
-    read_stack,
-)
+from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, TrackedImages, read_stack
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.geometry import FloatArray
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, and how many of how many of its steps are done."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from calibration.images.fit import LEVERS_MM, SETTLED, Refined, about_pivot, better, weights
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 
 APART_MM = 0.3
 """How far the image's edge is moved to either side for a difference: less than the blur of speckle."""

@@ -18,8 +18,8 @@ from scipy.spatial.transform import RigidTransform
 from calibration.images.crossing import Crossing
 from calibration.images.fit import Estimate
 from calibration.images.simplex import incremented
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 
 AXES = ("tilt", "yaw", "roll", "x", "y", "z")
 """Turns about the image's x, y, z in degrees, displacements along them in mm, applied at its origin."""

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.similarity import Comparison, Likeness
-from speckle3d.core.geometry import FloatArray, skew
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.geometry import skew
 
 ROBUST = 0.5
 """1 - correlation at which a patch counts a quarter of what one that is alike does."""

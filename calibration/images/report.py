@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.images.angulation import PARAMETERS, Angulation, displacement_mm
 from calibration.images.curves import AXES, SimilarityCurves, SimilarityMap
 from calibration.images.stacks import TrackedImages
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.imaging.images import ChosenImages, GreyArray
 from speckle3d.imaging.reslice import image_plane, reslice_frames
 

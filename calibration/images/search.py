@@ -11,8 +11,8 @@ from scipy.stats import qmc
 
 from calibration.images.crossing import Crossing, Level, Progress
 from calibration.images.fit import Estimate, Refined, refine
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
 
 GLANCE = Level(4.0, images=6, side=5, overlap=0.0, least_weight=0.45)
 FOLLOWED = Level(3.0, images=8, side=5, least_weight=0.45)

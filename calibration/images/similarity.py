@@ -10,9 +10,8 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.stacks import IntArray, Stack
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
+from calibration.images.stacks import Stack
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.kernels.slicing import PARAMETERS, compare_patches
 
 LEAST_SHARE = 0.5

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.crossing import Crossing, Progress
 from calibration.images.fit import Estimate
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 
 IMAGES = 8
 """Of each sweep; published: 5 to 10."""

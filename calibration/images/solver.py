@@ -26,8 +26,8 @@ from calibration.images.search import DECIDED, search
 from calibration.images.similarity import Comparison
 from calibration.images.simplex import climb
 from calibration.images.stacks import TrackedImages
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 
 __all__ = [
     "Crossing",

@@ -16,13 +16,11 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import GreyArray, Images, PosedImages
-
-IntArray = npt.NDArray[np.int64]
 
 BASE_PIXEL_MM = 0.35
 """Images are reduced to about this: half the finest blur that comparisons use."""

@@ -18,7 +18,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from speckle3d.core.geometry import FloatArray
+    from speckle3d.core.arrays import FloatArray
     from speckle3d.core.streams import TimedRotations
     from speckle3d.core.sweep import OrientationSensor
     from xsens.fusion.orient import Orientation

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from calibration.chain import ImagePoints
     from calibration.detection.lines import LineSettings
     from calibration.job import Job, Outcome, Recording, Seen
-    from speckle3d.core.geometry import FloatArray
+    from speckle3d.core.arrays import FloatArray
 
 Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
 Out = Annotated[

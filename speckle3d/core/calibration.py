@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
 
 SENSORS = ("tracker", "orientation")

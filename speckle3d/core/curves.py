@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
 

@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-
-FloatArray = npt.NDArray[np.float64]
 
 RIGID_TOLERANCE = 1e-4
 """How far R^T R may be from the identity, and |q| from one, in data read from files (float32 safe)."""

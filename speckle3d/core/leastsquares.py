@@ -11,13 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 
-IntArray = npt.NDArray[np.int64]
 Residuals = Callable[[FloatArray], FloatArray]
 
 

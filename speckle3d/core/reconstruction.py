@@ -8,12 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid
-
-IntArray = npt.NDArray[np.int64]
 
 MODES = ("image", "image+subset", "orientation", "pose", "crossed")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""

@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray, require_increasing
-
-BoolArray = npt.NDArray[np.bool_]
+from speckle3d.core.geometry import require_increasing
 
 DEFAULT_MAX_GAP_S = 0.2
 """Longest pause between two samples that interpolation bridges: five frames at 25 frames/s, about the time

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray, require_increasing
-from speckle3d.core.streams import BoolArray, TimedPoses, TimedRotations
+from speckle3d.core.geometry import require_increasing
+from speckle3d.core.streams import TimedPoses, TimedRotations
 
 
 class Frames(Protocol):

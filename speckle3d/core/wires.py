@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, require_finite
-
-IntArray = npt.NDArray[np.int64]
+from speckle3d.core.geometry import require_finite
 
 _UNIT_TOLERANCE = 1e-6
 _PARALLEL_SINE = 0.02

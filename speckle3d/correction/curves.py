@@ -18,7 +18,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray, relative_poses, rotation_from_fixed_angles, skew
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.geometry import relative_poses, rotation_from_fixed_angles, skew
 
 Curves = Literal["time", "distance"]
 

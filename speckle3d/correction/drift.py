@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, roll_yaw_tilt, skew
+from speckle3d.core.geometry import roll_yaw_tilt, skew
 from speckle3d.core.leastsquares import Fit, levenberg_marquardt
-from speckle3d.core.streams import BoolArray
 from speckle3d.correction.curves import (
     AXES,
     COEFFICIENTS,

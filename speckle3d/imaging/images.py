@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
 
 GreyArray = npt.NDArray[np.float32]

@@ -14,9 +14,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses

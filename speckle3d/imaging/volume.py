@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_cdt
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses

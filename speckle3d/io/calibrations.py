@@ -17,14 +17,10 @@ import h5py
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source, calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import (
-    FloatArray,
-    require_finite,
-    rotations_from_quaternions,
-    transforms_from_matrices,
-)
+from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.hdf5 import (

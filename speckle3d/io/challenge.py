@@ -26,8 +26,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.geometry import FloatArray, transforms_from_matrices
+from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike, locate, one_line, open_hdf5, read_checked, reading, require_dataset

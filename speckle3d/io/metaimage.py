@@ -14,13 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import (
-    FloatArray,
-    require_increasing,
-    rotation_from_axes,
-    transforms_from_matrices,
-)
+from speckle3d.core.geometry import require_increasing, rotation_from_axes, transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike

@@ -19,8 +19,9 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.geometry import FloatArray, transforms_from_matrices
+from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
 from speckle3d.io.hdf5 import PathLike, one_line
 from speckle3d.io.headers import numbers

@@ -18,14 +18,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
 from speckle3d.io.headers import numbers
-
-IntArray = npt.NDArray[np.int64]
 
 Row = tuple[int, tuple[float, float], int]
 """Frame, column and row, wire."""

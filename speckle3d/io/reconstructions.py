@@ -12,13 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import (
-    FloatArray,
-    require_finite,
-    require_increasing,
-    transforms_from_matrices,
-)
+from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
 from speckle3d.core.reconstruction import (
     MODES,
     CalibrationFile,

@@ -14,15 +14,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import (
-    FloatArray,
     require_finite,
     require_increasing,
     rotations_from_quaternions,
     transforms_from_matrices,
 )
-from speckle3d.core.streams import BoolArray, TimedPoses, TimedRotations
+from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import (
     PathLike,

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
 from speckle3d.io.headers import numbers

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.statistics import correlation_variance
-
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 _variance = njit(correlation_variance)
 

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-Float32Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
+from speckle3d.core.arrays import Float32Array, FloatArray
 
 
 @njit(cache=True, nogil=True)

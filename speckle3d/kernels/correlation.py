@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-Float32Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})

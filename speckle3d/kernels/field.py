@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
+from speckle3d.core.arrays import ComplexArray, FloatArray
 
 
 @njit(cache=True, parallel=True, fastmath=True)

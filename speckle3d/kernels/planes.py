@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
-
-FloatArray = npt.NDArray[np.float64]
 
 _variance = njit(correlation_variance)
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-Float32Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
+from speckle3d.core.arrays import Float32Array, FloatArray
 
 EDGE_TOLERANCE = 1e-6
 """Fraction of a pixel by which a point may miss the image's border: rounding of poses, not geometry."""

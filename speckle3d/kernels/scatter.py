@@ -5,13 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-Complex64Array = npt.NDArray[np.complex64]
-IntArray = npt.NDArray[np.int64]
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 
 _BINS_PER_MM = 16.0
 _TURNS = 8192

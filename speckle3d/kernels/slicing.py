@@ -10,12 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-Float32Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
 PARAMETERS = 8
 """Turns about and displacements along the image's x, y, z, then relative changes of its two pixel sizes."""

@@ -1,1 +1,1 @@
-"""From images to pair correlations: intensity, quality, in-plane motion, which pairs, and their correlation."""
+"""Images to pair correlations: intensity, frame quality, in-plane motion, which pairs, blocks."""

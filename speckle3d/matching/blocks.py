@@ -19,10 +19,9 @@ from itertools import pairwise
 import numpy as np
 
 from speckle3d.config import Config
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
-from speckle3d.matching.intensity import Float32Array
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameInspector
 from speckle3d.matching.schedule import PairSchedule

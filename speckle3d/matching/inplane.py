@@ -13,11 +13,10 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft
 
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.correlation import patch_coherences, patch_correlations
-from speckle3d.matching.intensity import Complex64Array, Float32Array
 from speckle3d.matching.patches import PatchGrid
 
 LEAST_CORRELATION = 0.05

@@ -15,12 +15,9 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft, ndimage
 
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
-
-Float32Array = npt.NDArray[np.float32]
-Complex64Array = npt.NDArray[np.complex64]
 
 
 class IntensitySettings(BaseModel):

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from speckle3d.core.arrays import Complex64Array, Float32Array
 from speckle3d.core.curves import CurveKey
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.inplane import (
@@ -19,8 +20,6 @@ from speckle3d.matching.inplane import (
     match_patches,
 )
 from speckle3d.matching.intensity import (
-    Complex64Array,
-    Float32Array,
     IntensityExtractor,
     IntensitySettings,
     intensity_of,

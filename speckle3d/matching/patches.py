@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import ImageGrid
-
-IntArray = npt.NDArray[np.int64]
 
 
 class PatchSettings(BaseModel):

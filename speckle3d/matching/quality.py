@@ -24,12 +24,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.matching.intensity import Float32Array
-from speckle3d.matching.patches import IntArray, PatchGrid
+from speckle3d.matching.patches import PatchGrid
 
 _LEAST_RATIO = 1e-11
 """Intensity in the band over the square of the frame's peak below which there is no echo: 16 bits end above

@@ -6,10 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.matching.inplane import InPlaneMotion
-from speckle3d.matching.intensity import Float32Array
-from speckle3d.matching.patches import IntArray
 
 
 class Matched(Protocol):

@@ -24,11 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.geometry import FloatArray
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
-from speckle3d.matching.intensity import Float32Array
-from speckle3d.matching.patches import IntArray, PatchGrid
+from speckle3d.matching.patches import PatchGrid
 from speckle3d.motion.distances import EchoModel
 
 COARSE_SCALES = np.geomspace(0.4, 3.0, 16)

@@ -14,10 +14,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.optimize import least_squares
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.geometry import FloatArray
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.patches import PatchGrid
 

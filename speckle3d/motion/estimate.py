@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray, mirrored
+from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.streams import BoolArray
 from speckle3d.matching.blocks import StageTimes
-from speckle3d.matching.patches import IntArray
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence
 from speckle3d.motion.direction import sensed_orientation, settle_direction

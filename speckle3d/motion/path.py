@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from speckle3d.config import Config
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.blocks import MatchedFrame, MatchedPair, StageTimes
 from speckle3d.matching.matcher import FrameMatcher

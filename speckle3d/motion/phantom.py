@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples
-
-IntArray = npt.NDArray[np.int64]
 
 
 def known_positions(sweep: Sweep) -> tuple[RigidTransform, str]:

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels.planes import fit_correlation_plane
 from speckle3d.motion.distances import DistanceEstimator, EchoModel
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.matching.blocks import median_correlation
 from speckle3d.matching.inplane import PatchMatch
 from speckle3d.matching.matcher import ReadyFrame

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
-from speckle3d.matching.patches import IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.motion.planes import PairPlane
 
 HYPOTHESES = 8

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.motion.distances import PatchDistances
 
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import TiltResponse
-from speckle3d.core.geometry import FloatArray
 from speckle3d.kernels.statistics import correlation_variance
 
 PAIRS_PER_FACT = 20.0

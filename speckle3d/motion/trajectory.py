@@ -10,10 +10,10 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles, skew
+from speckle3d.core.geometry import rotation_from_fixed_angles, skew
 from speckle3d.matching.inplane import InPlaneMotion
-from speckle3d.matching.patches import IntArray
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.planes import PairPlane
 

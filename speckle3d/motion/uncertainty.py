@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.motion.slopes import SlopeEvidence
 
 SHARED = np.array([3.2, 3.8, 1.4, 1.4, 1.4, 4.5])

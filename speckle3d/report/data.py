@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
-from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import sha256_of

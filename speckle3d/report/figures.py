@@ -19,7 +19,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.report.data import RejectedPatches, SweepCurves

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import GreyArray
 from speckle3d.imaging.reslice import ReslicePlane, along_sweep_plane, reslice_frames

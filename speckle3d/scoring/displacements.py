@@ -41,8 +41,9 @@ import numpy.typing as npt
 from scipy.spatial.distance import directed_hausdorff
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, relative_poses
+from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import ImageGrid
 
 

@@ -19,8 +19,9 @@ import numpy.typing as npt
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, mirrored, relative_poses, require_finite, roll_yaw_tilt
+from speckle3d.core.geometry import mirrored, relative_poses, require_finite, roll_yaw_tilt
 
 JITTER_FRAMES = 9
 """Frames over which a sensor's jitter is averaged to find turning points: a third of a second."""

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.core.geometry import FloatArray
 
 FEWEST = 3
 """Below, a bootstrap only repeats the values themselves."""

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.simulation.medium import Layer, Scatterers, TiledMedium, Waves, bounds_in_medium
 
 Reflector = Literal["wall", "bar"]

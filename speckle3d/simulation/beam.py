@@ -8,12 +8,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import Complex64Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.field import line_field, two_way_field
-
-Complex64Array = npt.NDArray[np.complex64]
 
 NEPER_PER_DB = np.log(10.0) / 20.0
 

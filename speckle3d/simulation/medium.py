@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 
-Float32Array = npt.NDArray[np.float32]
 Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
 

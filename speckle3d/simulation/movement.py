@@ -9,9 +9,9 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray, rotation_from_fixed_angles
-from speckle3d.core.streams import BoolArray
+from speckle3d.core.geometry import rotation_from_fixed_angles
 
 _KNOT_RATE_HZ = 100.0
 """Knots of the trajectory: eight per period of the fastest tremor."""

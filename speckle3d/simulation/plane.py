@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.simulation.bath import water_bath
 from speckle3d.simulation.beam import Probe, tabulate_beam

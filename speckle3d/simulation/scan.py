@@ -11,14 +11,11 @@ import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.scatter import gather_near, scatter_echoes, sort_into_cells
-from speckle3d.simulation.beam import BeamTable, Complex64Array
+from speckle3d.simulation.beam import BeamTable
 from speckle3d.simulation.medium import Medium
-
-Float32Array = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 FULL_SCALE = 8191
 """14 bits, signed."""

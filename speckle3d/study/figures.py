@@ -15,8 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
 

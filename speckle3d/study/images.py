@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from speckle3d.config import config_from_toml
+from speckle3d.core.arrays import Float32Array
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.matching.intensity import Float32Array, IntensityExtractor, IntensitySettings
+from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
 
 _GLANCES = 24
 """Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""

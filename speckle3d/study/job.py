@@ -14,18 +14,16 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.reconstruction import Provenance, Trust
-from speckle3d.core.streams import BoolArray
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.matching.intensity import Float32Array
 from speckle3d.matching.quality import describe
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.motion.estimate import Tracked

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.scoring.statistics import holm, mean_interval, paired_comparison
 
 LEVEL = 0.05

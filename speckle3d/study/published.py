@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.statistics import MeanInterval, mean_interval
 from speckle3d.study.summary import plain

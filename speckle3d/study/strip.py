@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.config import Config
+from speckle3d.core.arrays import Float16Array, Float32Array
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.matching.intensity import Float32Array, IntensityExtractor
-
-Float16Array = npt.NDArray[np.float16]
+from speckle3d.matching.intensity import IntensityExtractor
 
 STRIP_MM = 2.4
 STRIP_SPACING_MM = 0.1

@@ -16,14 +16,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from speckle3d.core.streams import TimedRotations
-
-IntArray = npt.NDArray[np.int64]
 
 ANGLES = ("roll", "yaw", "tilt")
 """In this order everywhere: about the image's z, y and x."""

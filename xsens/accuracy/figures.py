@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import FloatArray
-from xsens.accuracy.angles import ANGLES, IntArray, PairErrors
+from xsens.accuracy.angles import ANGLES, PairErrors
 
 OFF_AXIS_RAD = np.deg2rad(0.5)
 """How far a frame may be turned about the two other axes: half of what the sensor claims at rest, which is

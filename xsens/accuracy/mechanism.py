@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, require_finite
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.streams import TimedRotations
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")

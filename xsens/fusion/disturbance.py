@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from xsens.fusion.settings import FusionSettings
 
 _SMOOTHING_S = 0.1

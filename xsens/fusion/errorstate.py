@@ -26,7 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from speckle3d.core.geometry import FloatArray, skew
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.geometry import skew
 from xsens.fusion.disturbance import FieldMonitor
 from xsens.fusion.increments import Increment
 from xsens.fusion.quaternions import turn_matrix

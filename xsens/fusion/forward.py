@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from xsens.fusion import quaternions
 from xsens.fusion.errorstate import ErrorStateFilter
 from xsens.fusion.increments import Increment, Samples, blocks_of

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from xsens.fusion import quaternions
 
 

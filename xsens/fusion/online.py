@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray
 from xsens.fusion.errorstate import ErrorStateFilter
 from xsens.fusion.increments import Samples, blocks_of
 from xsens.fusion.plausible import FASTEST_RAD_S, real_field, require_metres

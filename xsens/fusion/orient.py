@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray, TimedRotations
+from speckle3d.core.streams import TimedRotations
 from xsens.fusion.errorstate import ErrorStateFilter
 from xsens.fusion.forward import Pass, forward, within_steps
 from xsens.fusion.increments import Samples
@@ -26,7 +26,7 @@ from xsens.fusion.plausible import (
 )
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.fusion.smoothing import Smoothed, smooth
-from xsens.logs.samples import ImuLog, IntArray
+from xsens.logs.samples import ImuLog
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: they hold little more than the filter's start."""

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from xsens.fusion.settings import BRIDGED_S
 
 FORCE_M_S2 = (4.0, 25.0)

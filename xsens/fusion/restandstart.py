@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
+from speckle3d.core.arrays import FloatArray
 from xsens.fusion.increments import Increment
 from xsens.fusion.quaternions import turn_matrix
 from xsens.fusion.settings import FusionSettings

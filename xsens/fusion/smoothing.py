@@ -14,8 +14,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from xsens.fusion.disturbance import FieldMonitor, FieldReading
 from xsens.fusion.errorstate import ANGLE, BIAS, HEADING, SPEED
 from xsens.fusion.forward import Pass, Step, forward

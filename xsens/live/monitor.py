@@ -10,8 +10,8 @@ from threading import Lock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.geometry import FloatArray
 from xsens.fusion.online import OnlineFilter
 from xsens.live.device import DeviceInfo
 from xsens.logs.bytelogs import parse_stream

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from xsens.logs.clocks import Stamps
 from xsens.logs.legacylogs import legacy_log
@@ -17,7 +18,7 @@ from xsens.logs.logparts import Hints, Parts
 from xsens.logs.mtdata2logs import mtdata2_log
 from xsens.logs.samples import ImuLog
 from xsens.messages.catalogue import MessageId
-from xsens.messages.framing import ByteArray, Frames, IntArray, find_frames
+from xsens.messages.framing import Frames, find_frames
 
 UTC_TIME = 0x61
 """Message with the computer's clock, that a recording has before each stretch of data."""

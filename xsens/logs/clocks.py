@@ -10,13 +10,10 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from xsens.logs.samples import Gap, IntArray
-
-BoolArray = npt.NDArray[np.bool_]
+from xsens.logs.samples import Gap
 
 UNKNOWN_PAUSE_S = 1.0
 """Taken as the pause before a new start that no clock tells of; longer than interpolation bridges."""

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from speckle3d.core.geometry import FloatArray
-from xsens.messages.framing import ByteArray, IntArray
+from speckle3d.core.arrays import ByteArray, FloatArray, IntArray
 
 _LONGEST_CELL = 17
 """Of a sign, a point and 15 digits."""

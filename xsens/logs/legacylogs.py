@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from xsens.logs.clocks import Stamps
 from xsens.logs.logparts import TRANSPOSED, Hints, Parts, on_clock
 from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Orientations, from_angles, from_matrices, from_quaternions, rows_or_columns
 from xsens.messages.catalogue import Configuration, MessageId, UnitConfiguration
-from xsens.messages.framing import Frames, IntArray
+from xsens.messages.framing import Frames
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings, Values
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from xsens.logs.clocks import Stamps, Timeline, timeline
 from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Orientations

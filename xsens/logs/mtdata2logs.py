@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from xsens.logs.clocks import Stamps
 from xsens.logs.logparts import TRANSPOSED, Hints, Parts, on_clock
 from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Orientations, from_angles, from_matrices, from_quaternions, rows_or_columns
 from xsens.messages.columns import Column, columns
-from xsens.messages.framing import Frames, IntArray
+from xsens.messages.framing import Frames
 from xsens.messages.mtdata2 import kind_of, world_of
 
 _MEASURED = (

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from xsens.logs.bytelogs import parse_stream
 from xsens.logs.filekinds import other_kind
 from xsens.logs.logparts import Hints
-from xsens.logs.samples import ImuLog, IntArray
+from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.framing import find_frames
 

@@ -10,14 +10,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import FloatArray, require_increasing
-from speckle3d.core.streams import DEFAULT_MAX_GAP_S, BoolArray, TimedRotations
-
-IntArray = npt.NDArray[np.int64]
+from speckle3d.core.geometry import require_increasing
+from speckle3d.core.streams import DEFAULT_MAX_GAP_S, TimedRotations
 
 _VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 

@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import FloatArray
-from speckle3d.core.streams import BoolArray
 from xsens.logs.clocks import Stamps, timeline_of_times
 from xsens.logs.columnnames import PLAIN_VECTORS, Names, incomplete, not_understood
 from xsens.logs.logparts import TRANSPOSED, Hints, Parts, assembled, on_clock
-from xsens.logs.samples import Gap, ImuLog, IntArray
+from xsens.logs.samples import Gap, ImuLog
 from xsens.logs.texttables import TextTable, read_table
 from xsens.logs.worlds import (
     Orientations,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
 from xsens.logs.decimals import read_decimals
 
 SEPARATORS = ("\t", ";", ",", " ")

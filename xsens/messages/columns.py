@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from speckle3d.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-from xsens.messages.framing import BoolArray, ByteArray, Frames, IntArray
+from xsens.messages.framing import Frames
 from xsens.messages.mtdata2 import Kind, kind_of, number_format, parts, size_of
 from xsens.messages.numberformats import numbers_from_bytes
 

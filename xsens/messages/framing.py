@@ -15,11 +15,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import BoolArray, ByteArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-
-ByteArray = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 PREAMBLE = 0xFA
 MASTER = 0xFF

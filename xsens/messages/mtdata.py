@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import ByteArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from xsens.messages.numberformats import ByteArray, NumberFormat, bytes_from_numbers, numbers_from_bytes
+from xsens.messages.numberformats import NumberFormat, bytes_from_numbers, numbers_from_bytes
 
 Values = dict[str, npt.NDArray[np.float64]]
 """Field name to values, shape (n, count); whole numbers are exact."""

@@ -11,10 +11,8 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import FloatArray
-
-ByteArray = npt.NDArray[np.uint8]
 
 
 class NumberFormat(IntEnum):

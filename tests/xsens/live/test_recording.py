@@ -84,7 +84,7 @@ class TestRecording:
 
     def test_killed_it_loses_only_what_was_not_sent(self, sensor, path):
         code = (
-            "import sys; from xsens.live.device import DeviceSettings; from xsens.live.recording import record\n"
+            "import sys; from xsens import DeviceSettings, record\n"
             "for state in record(sys.argv[1], sys.argv[2], DeviceSettings(baud=115200)): pass"
         )
         with subprocess.Popen([sys.executable, "-c", code, str(sensor.path), str(path)]) as recording:
