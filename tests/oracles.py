@@ -219,7 +219,7 @@ def bin_by_distance(rho, offset_mm, slope, lateral_mm, edges_mm):
 
 
 def edges_of_columns(samples, inside, sigma, threshold):
-    """Twin of `calibration.detection.edges` judged by slope: each run of rows convolved alone, maxima by search.
+    """Twin of `calibration.detection.edges` by slope: each run of rows convolved alone, maxima by search.
 
     Returns the first maximum's row above the threshold, or else the largest's, (n,); NaN without one.
     """

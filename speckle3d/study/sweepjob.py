@@ -1,7 +1,7 @@
 """One sweep of a study as a job: it travels to a worker, works in a folder of its own, never raises.
 
-The blocks of a long sweep are jobs of their own, which need nothing of each other (`speckle3d.matching.blocks`).
-What they leave, the sweep's own job takes; a block that is not there it does itself.
+The blocks of a long sweep are jobs of their own (`speckle3d.matching.blocks`). What they leave, the sweep's
+own job takes; a block that is not there it does itself.
 """
 
 from __future__ import annotations
