@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.io.volumes import read_volume, write_volume
-    from speckle3d.motion.estimate import Tracked
-    from speckle3d.pipeline import calibrate_curves, correct, track
+    from speckle3d.pipeline import Tracked, calibrate_curves, correct, track
     from speckle3d.scoring.lengths import ModeError, compare_modes
     from speckle3d.simulation.presets import SimulationSettings, simulate
     from speckle3d.study.images import grey_images
@@ -43,7 +42,7 @@ _HOME = {
     "SimulationSettings": "simulation.presets",
     "Speckle3DError": "core.errors",
     "Sweep": "core.sweep",
-    "Tracked": "motion.estimate",
+    "Tracked": "pipeline",
     "calibrate_curves": "pipeline",
     "calibrated": "core.calibration",
     "compare_modes": "scoring.lengths",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import cast
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.correction.curves import Curves
@@ -21,28 +21,8 @@ from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
+from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.planes import PlaneSettings
-
-
-class SensorSettings(BaseModel):
-    """How sensor streams are used."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    consistent_subset: bool = Field(
-        True, description="In mode `orientation`, drop distances that the sensed orientation contradicts."
-    )
-    smooth_s: float = Field(
-        0.2,
-        ge=0,
-        description="Standard deviation of the Gaussian that smooths sensed orientation for the subset.",
-    )
-    direction: int = Field(
-        0,
-        ge=-1,
-        le=1,
-        description="Sign of the first elevational motion; 0: from a sensor, or positive without one.",
-    )
 
 
 class Config(BaseModel):

@@ -6,36 +6,99 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.geometry import mirrored
+from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
 from speckle3d.matching.blocks import (
     Block,
+    BlockSource,
     ImageSink,
     MatchedBlock,
-    MatchedFrame,
+    MatchedSweep,
     StageTimes,
-    blocks_of,
     match_block,
+    match_sweep,
 )
+from speckle3d.matching.chosen import match_again, match_in_order
 from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.decorrelation import fit_curves
-from speckle3d.motion.direction import orientation_at, orientation_sensor
-from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.estimate import PairSink, Solution, Tracked
-from speckle3d.motion.path import Walk
-from speckle3d.motion.phantom import phantom_samples
+from speckle3d.motion.direction import (
+    orientation_at,
+    orientation_sensor,
+    sensed_orientation,
+    settle_direction,
+)
+from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
+from speckle3d.motion.phantom import phantom_pairs, phantom_samples
+from speckle3d.motion.revisits import find_returns, tie_returns
+from speckle3d.motion.slopes import SlopeEvidence
+from speckle3d.motion.uncertainty import pose_covariance
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
-BlockSource = Callable[[Block], MatchedBlock | None]
-"""Gives a block that has been matched already, None for one that has not."""
+PairSink = Callable[[FramePairs], None]
+"""Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
+MOST_LOST = 0.3
+"""Share of frames that may not be placed; with more, lengths are mostly guesses."""
+PLANES = "distances and planes"
+"""Name of the stage in `StageTimes`."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What the image-based stages found.
+
+    Attributes
+    ----------
+    image : RigidTransform, length n
+        Poses from all patches.
+    covariance : ndarray, shape (n, 6, 6)
+        Of `image`; see `speckle3d.motion.uncertainty`.
+    subset : RigidTransform, length n, or None
+        Poses from the orientation-consistent patches.
+    rejected_share : float
+        Share of measured patches outside the consistent subset; NaN without one.
+    flags : ndarray of int, shape (n,)
+        `FrameFlag` of every frame; zero for those to be trusted.
+    pairs : int
+        Frame pairs that the trajectory was solved from.
+    direction : int
+        Sign of the elevational motion, +1 or -1.
+    direction_from : str
+        What settled the sign.
+    coherence : Coherence or None
+        How the patches' echoes depart from a phantom's; None if not adapted to.
+    slopes : SlopeEvidence
+        What the images' own yaw and tilt are worth.
+    times : StageTimes
+        Seconds spent in each stage.
+    """
+
+    image: RigidTransform
+    covariance: FloatArray
+    subset: RigidTransform | None
+    rejected_share: float
+    flags: IntArray
+    pairs: int
+    direction: int
+    direction_from: str
+    coherence: Coherence | None
+    slopes: SlopeEvidence
+    times: StageTimes
 
 
 def track(
@@ -51,8 +114,17 @@ def track(
 
     Parameters
     ----------
+    sweep : Sweep
+        n frames, read one at a time.
+    curves : DecorrelationCurves
+        Of the sweep's probe and settings.
+    config : Config, optional
+    progress : callable, optional
+        Called with frames done and frames in all.
+    sink : callable, optional
+        Called with the frame pairs, some at a time.
     images : callable, optional
-        Not called with frames of blocks that `matched` gives.
+        Called with every intensity image, but not with those of blocks that `matched` returns.
     matched : callable, optional
         Asked for each block of frames before it is matched here.
 
@@ -61,16 +133,69 @@ def track(
     MismatchError
         If the curves belong to another probe, frequency, sampling or patch size.
     InsufficientDataError
-        If frames have no speckle in common.
+        If too many frames have no speckle in common with others.
     """
-    settings = config or Config()
+    settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
-    walk = Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), settings)
-    for each in _matched(walk, images, matched):
-        walk.place(each)
-        if progress:
-            progress(each.frame + 1, len(sweep))
-    return Solution(walk, curves).solve(sink)
+    reader = PairReader(
+        curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
+    )
+
+    # RF -> intensity -> in-plane motion -> patch correlation
+    found = match_sweep(
+        sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
+    )
+    flags = _flagged(sweep, found, settings)
+
+    # -> |distance| and its sigma -> plane per frame pair, with its sign
+    pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
+    flags = _with_unjoined(flags, reader, pairs)
+
+    # -> pairs of frames from different visits of the same tissue, which the path shows
+    with times.of("revisits"):
+        returns = find_returns(path[:, 0], settings.trajectory.revisit_mm)
+        wanted = [pair for each in returns for pair in each.pairs()]
+        table = found.table.followed_by(match_again(sweep, matcher, wanted))
+        ties = tie_returns(
+            returns, table, path[:, 0], reader.fitter, coherence, settings.trajectory.least_correlation
+        )
+        pairs = _in_order([*pairs, *(t for t in ties if not flags[t.first] and not flags[t.second])])
+
+    # -> graph of relative poses -> trajectory
+    with times.of("trajectory"):
+        slopes = reader.slopes(pairs, coherence)
+        edges = reader.edges(table, pairs, [slopes.applied(pair.plane) for pair in pairs])
+        trajectory = reader.solve(edges, with_covariance=True)
+        covariance = pose_covariance(
+            trajectory.poses,
+            trajectory.covariance,
+            matcher.centre_mm,
+            scale_sigma(coherence),
+            slopes,
+            0.0 if coherence is None else float(coherence.share.mean()),
+        )
+        direction, source = settle_direction(sweep, trajectory.poses, settings.sensors)
+
+    # -> orientation-consistent subset -> its own trajectory
+    with times.of(PLANES):
+        subset, used = _consistent(sweep, table, pairs, direction, reader, settings)
+
+    if sink:
+        for rows in reader.rows(table, pairs, edges, used, direction, scale_sigma(coherence)):
+            sink(rows)
+    return Tracked(
+        image=_seen_from(direction, trajectory.poses),
+        covariance=covariance if direction > 0 else MIRROR @ covariance @ MIRROR,
+        subset=None if subset is None else _seen_from(direction, subset),
+        rejected_share=float("nan") if subset is None else _rejected_share(pairs, used),
+        flags=_with_unjoined(flags, reader, pairs),
+        pairs=len(pairs),
+        direction=direction,
+        direction_from=source,
+        coherence=coherence,
+        slopes=slopes,
+        times=times,
+    )
 
 
 def match_ahead(
@@ -89,7 +214,7 @@ def match_ahead(
     """
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
-    frames = list(match_block(sweep, matcher, settings, block, images, times))
+    frames = list(match_block(sweep, matcher, settings.trajectory, settings.quality, block, images, times))
     return MatchedBlock(frames, times.seconds)
 
 
@@ -101,15 +226,76 @@ def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> F
     return matcher
 
 
-def _matched(walk: Walk, images: ImageSink | None, given: BlockSource | None) -> Iterator[MatchedFrame]:
-    """All frames of a sweep in order, from blocks that are there and those that are matched now."""
-    for block in blocks_of(len(walk.sweep), walk.config.trajectory.block_frames):
-        held = None if given is None else given(block)
-        if held is not None:
-            walk.times.include(held.seconds)
-            yield from held.frames
-        else:
-            yield from match_block(walk.sweep, walk.matcher, walk.config, block, images, walk.times)
+def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
+    """Flags of all frames, if few enough have one."""
+    flags = flag_frames(found.features, config.quality)
+    flags[found.table.unmatched(len(sweep), config.trajectory.least_correlation)] |= FrameFlag.UNMATCHED
+    lost = int((flags != 0).sum())
+    if lost > MOST_LOST * len(sweep):
+        raise InsufficientDataError(
+            f"{sweep.name}: expected frames with speckle in common, got {lost} of {len(sweep)} that cannot "
+            f"be placed: {'; '.join(describe(flags))}"
+        )
+    return flags
+
+
+def _measured(
+    table: CorrelationTable, flags: IntArray, reader: PairReader, config: Config, times: StageTimes
+) -> tuple[list[SignedPair], Coherence | None, FloatArray]:
+    """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
+
+    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
+    """
+    bad = (flags & ~FrameFlag.UNMATCHED) != 0
+    sound: BoolArray = ~bad[table.first] & ~bad[table.second]
+    with times.of(PLANES):
+        path = reader.rough_path(table)
+    if not config.coherence.adapt:
+        with times.of(PLANES):
+            pairs = reader.measure(table, path, sound, None)
+        return pairs, None, reader.path(table, pairs, None)
+    for known_scale in (False, True):
+        with times.of("coherence"):
+            coherence, path = reader.coherence(table, path, sound, config.coherence, known_scale)
+        with times.of(PLANES):
+            pairs = reader.measure(table, path, sound, coherence)
+            path = reader.path(table, pairs, coherence)
+    return pairs, coherence, path
+
+
+def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:
+    return sorted(pairs, key=lambda pair: (pair.second, pair.first))
+
+
+def _with_unjoined(flags: IntArray, reader: PairReader, pairs: Sequence[SignedPair]) -> IntArray:
+    """Flags in which sound frames that no pair joins to earlier ones are unmatched, too."""
+    lone = reader.unjoined(np.array([pair.second for pair in pairs]))
+    return np.where(lone & (flags == 0), int(FrameFlag.UNMATCHED), flags)
+
+
+def _consistent(
+    sweep: Sweep,
+    table: CorrelationTable,
+    pairs: Sequence[SignedPair],
+    direction: int,
+    reader: PairReader,
+    config: Config,
+) -> tuple[RigidTransform | None, list[BoolArray]]:
+    """Poses from the orientation-consistent patches (None without a sensor), and the patches used by pair."""
+    sensed = sensed_orientation(sweep, config.sensors)
+    if sensed is None:
+        return None, [pair.plane.used for pair in pairs]
+    planes = reader.consistent(table, pairs, sensed, direction)
+    return reader.solve(reader.edges(table, pairs, planes)).poses, [plane.used for plane in planes]
+
+
+def _rejected_share(pairs: Sequence[SignedPair], used: Sequence[BoolArray]) -> float:
+    rejected = sum(int((pair.plane.used & ~u).sum()) for pair, u in zip(pairs, used, strict=True))
+    return rejected / sum(int(pair.plane.used.sum()) for pair in pairs)
+
+
+def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:
+    return poses if direction > 0 else mirrored(poses)
 
 
 def calibrate_curves(
@@ -135,7 +321,9 @@ def calibrate_curves(
         )
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
-        samples.append(phantom_samples(sweep, matcher, settings.curves, _shifted(progress, before, total)))
+        wanted = phantom_pairs(sweep, settings.curves)
+        matches = match_in_order(sweep, matcher, wanted, _shifted(progress, before, total))
+        samples.append(phantom_samples(sweep, matcher.patches, matches))
         before += len(sweep)
     return fit_curves(keys[0], samples, settings.curves)
 

@@ -16,7 +16,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.motion.direction import settle_direction, smooth_rotations
+from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_rotations
 from speckle3d.pipeline import correct, track
 from speckle3d.scoring.lengths import compare_modes
 
@@ -138,19 +138,19 @@ def test_the_first_image_pose_is_the_identity(tracked):
 def test_a_tracker_settles_the_direction(sweep, tracked):
     assert tracked.direction_from == "tracker"
     assert not tracked.flags.any()
-    assert settle_direction(sweep, tracked.image, Config()) == (1, "tracker")
-    assert settle_direction(sweep, mirrored(tracked.image), Config()) == (-1, "tracker")
+    assert settle_direction(sweep, tracked.image, SensorSettings()) == (1, "tracker")
+    assert settle_direction(sweep, mirrored(tracked.image), SensorSettings()) == (-1, "tracker")
 
 
 def test_the_user_settles_the_direction_before_any_sensor(sweep, tracked):
     for sign in (1, -1):
-        config = Config.model_validate({"sensors": {"direction": sign}})
-        assert settle_direction(sweep, tracked.image, config) == (sign, "setting")
+        settings = SensorSettings(direction=sign)
+        assert settle_direction(sweep, tracked.image, settings) == (sign, "setting")
 
 
 def test_without_sensors_the_direction_is_assumed(sweep, tracked):
     bare = replace(sweep, tracker=None, orientation=None, truth=None)
-    assert settle_direction(bare, mirrored(tracked.image), Config()) == (1, "assumed")
+    assert settle_direction(bare, mirrored(tracked.image), SensorSettings()) == (1, "assumed")
 
 
 def test_turns_seen_by_the_orientation_sensor_settle_the_direction(sweep):
@@ -160,8 +160,8 @@ def test_turns_seen_by_the_orientation_sensor_settle_the_direction(sweep):
     image = RigidTransform.from_rotation(turned)
     sensor = OrientationSensor(TimedRotations(time_s, turned), Rotation.identity())
     oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
-    assert settle_direction(oriented, image, Config()) == (1, "orientation sensor")
-    assert settle_direction(oriented, mirrored(image), Config()) == (-1, "orientation sensor")
+    assert settle_direction(oriented, image, SensorSettings()) == (1, "orientation sensor")
+    assert settle_direction(oriented, mirrored(image), SensorSettings()) == (-1, "orientation sensor")
 
 
 def test_a_sensor_that_does_not_turn_with_the_image_settles_nothing(sweep):
@@ -169,7 +169,7 @@ def test_a_sensor_that_does_not_turn_with_the_image_settles_nothing(sweep):
     image, sensed = (Rotation.from_rotvec(rng.normal(0, np.deg2rad(0.1), (n, 3))) for _ in range(2))
     sensor = OrientationSensor(TimedRotations(sweep.frame_time_s, sensed), Rotation.identity())
     oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
-    assert settle_direction(oriented, RigidTransform.from_rotation(image), Config()) == (1, "assumed")
+    assert settle_direction(oriented, RigidTransform.from_rotation(image), SensorSettings()) == (1, "assumed")
 
 
 def test_a_mirror_image_turns_and_travels_the_other_way():
@@ -200,8 +200,8 @@ def test_modes_that_cannot_be_are_refused(sweep, tracked):
 
 def test_a_simulation_without_sensors_takes_its_sign_from_the_truth_and_says_so(sweep, tracked):
     alone = replace(sweep, tracker=None, orientation=None)
-    assert settle_direction(alone, tracked.image, Config()) == (1, "truth")
-    assert settle_direction(alone, mirrored(tracked.image), Config()) == (-1, "truth")
+    assert settle_direction(alone, tracked.image, SensorSettings()) == (1, "truth")
+    assert settle_direction(alone, mirrored(tracked.image), SensorSettings()) == (-1, "truth")
 
 
 class NoiseFrames:

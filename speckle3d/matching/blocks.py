@@ -1,9 +1,8 @@
-"""Frames of a sweep matched with earlier ones, in blocks that need nothing of each other.
+"""Frames of a sweep matched with earlier ones, in blocks that can be matched independently of each other.
 
-What two frames have in common does not depend on where other frames lie. A long sweep is therefore matched
-in blocks of frames, each a function of the sweep, the configuration and the block alone: here one after
-another, or anywhere else in any order, with the same result to the last bit. What is left, planes, signs and
-trajectory, is sequential and needs no images.
+What two frames have in common does not depend on where other frames lie, so that a long sweep is matched in
+blocks: each is a function of the sweep, the settings and the block's frame numbers alone. Blocks may run one
+after another or in any order, in any process, with the same result to the last bit.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-import numpy as np
-
-from speckle3d.config import Config
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import Float32Array
 from speckle3d.core.sweep import Sweep
-from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
+from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
-from speckle3d.matching.quality import FrameFeatures, FrameInspector
-from speckle3d.matching.schedule import PairSchedule
+from speckle3d.matching.quality import FrameFeatures, FrameInspector, QualitySettings
+from speckle3d.matching.schedule import PairSchedule, TrajectorySettings
+from speckle3d.matching.table import CorrelationTable, MatchedPair
 
 SEARCHED = 3
 """References against which the in-plane motion of a frame is searched, if it resembles none before."""
 AHEAD = 3
 """Frames made ready before they are asked for."""
+MATCHING = "in-plane motion and correlation"
+"""Name of the stage in `StageTimes`."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
 
@@ -53,11 +52,14 @@ class StageTimes:
 
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def add(self, stage: str, since: float) -> float:
-        """Book the time since `since` on `stage`; returns now."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - since
-        return now
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        """Add the time spent inside to a stage's."""
+        then = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.include({stage: time.perf_counter() - then})
 
     def include(self, seconds: Mapping[str, float]) -> None:
         """Add what was spent elsewhere."""
@@ -67,32 +69,10 @@ class StageTimes:
 
 @dataclass(frozen=True)
 class Block:
-    """Frames from `first` up to, without, `stop`."""
+    """Frames `first` to `stop`, `stop` excluded."""
 
     first: int
     stop: int
-
-
-@dataclass(frozen=True)
-class MatchedPair:
-    """What a frame has in common with an earlier one.
-
-    Attributes
-    ----------
-    correlation : ndarray, shape (p,)
-        Of each patch; see `PatchMatch`.
-    median : float
-        Over the patches that have any; zero if none has.
-    """
-
-    correlation: FloatArray
-    median: float
-    motion: InPlaneMotion
-
-    @classmethod
-    def of(cls, match: PatchMatch) -> MatchedPair:
-        """Keep what later stages need."""
-        return cls(match.correlation, median_correlation(match.correlation), match.motion)
 
 
 @dataclass(frozen=True)
@@ -112,39 +92,97 @@ class MatchedBlock:
     seconds: Mapping[str, float]
 
 
+BlockSource = Callable[[Block], MatchedBlock | None]
+"""Returns a block that has been matched already, None for one that has not."""
+
+
+@dataclass(frozen=True)
+class MatchedSweep:
+    """All pairs of a sweep, sorted by second frame, then by first, and the features of every frame."""
+
+    table: CorrelationTable
+    features: Sequence[FrameFeatures]
+
+
 def blocks_of(frames: int, block_frames: int) -> list[Block]:
-    """Blocks of a sweep: as few as have at most `block_frames` each, and nearly equal."""
+    """Split a sweep into the fewest near-equal blocks of at most `block_frames`."""
     count = -(-frames // block_frames)
     bounds = [frames * k // count for k in range(count + 1)]
     return [Block(first, stop) for first, stop in pairwise(bounds)]
 
 
+def match_sweep(
+    sweep: Sweep,
+    matcher: FrameMatcher,
+    trajectory: TrajectorySettings,
+    quality: QualitySettings,
+    times: StageTimes,
+    progress: Callable[[int, int], None] | None = None,
+    images: ImageSink | None = None,
+    given: BlockSource | None = None,
+) -> MatchedSweep:
+    """Match every frame of a sweep with the earlier ones that the schedule wants.
+
+    Parameters
+    ----------
+    times : StageTimes
+        To which the time spent is added.
+    progress : callable, optional
+        Called with frames done and frames in all.
+    images : callable, optional
+        Called with every intensity image, but not with those of blocks that `given` returns.
+    given : callable, optional
+        Asked for each block before it is matched here.
+    """
+    features: list[FrameFeatures] = []
+
+    def pairs() -> Iterator[tuple[int, int, MatchedPair]]:
+        for block in blocks_of(len(sweep), trajectory.block_frames):
+            held = given(block) if given else None
+            if held:
+                times.include(held.seconds)
+            matched = (
+                held.frames
+                if held
+                else match_block(sweep, matcher, trajectory, quality, block, images, times)
+            )
+            for each in matched:
+                features.append(each.features)
+                yield from ((first, each.frame, each.pairs[first]) for first in sorted(each.pairs))
+                if progress:
+                    progress(each.frame + 1, len(sweep))
+
+    return MatchedSweep(CorrelationTable.of(pairs(), len(matcher.patches)), features)
+
+
 def match_block(
     sweep: Sweep,
     matcher: FrameMatcher,
-    config: Config,
+    trajectory: TrajectorySettings,
+    quality: QualitySettings,
     block: Block,
     images: ImageSink | None = None,
     times: StageTimes | None = None,
 ) -> Iterator[MatchedFrame]:
     """Match each frame of a block with the earlier ones that the schedule wants, those before it included."""
-    return _BlockMatcher(sweep, matcher, config, times or StageTimes()).run(block, images)
-
-
-def median_correlation(correlation: FloatArray) -> float:
-    """Median over the patches that have any; zero if none has."""
-    known = correlation[np.isfinite(correlation)]
-    return float(np.median(known)) if known.size else 0.0
+    return _BlockMatcher(sweep, matcher, trajectory, quality, times or StageTimes()).run(block, images)
 
 
 class _BlockMatcher:
-    """Frames in, pairs out; keeps the few frames that are still to be matched with."""
+    """Matches the frames of a block; keeps those that later ones are still to be matched with."""
 
-    def __init__(self, sweep: Sweep, matcher: FrameMatcher, config: Config, times: StageTimes) -> None:
+    def __init__(
+        self,
+        sweep: Sweep,
+        matcher: FrameMatcher,
+        trajectory: TrajectorySettings,
+        quality: QualitySettings,
+        times: StageTimes,
+    ) -> None:
         self._sweep, self._matcher, self._times = sweep, matcher, times
-        self._settings = config.trajectory
-        self._inspector = FrameInspector(sweep.signal, matcher.patches, config.quality)
-        self._schedule = PairSchedule(config.trajectory)
+        self._settings = trajectory
+        self._inspector = FrameInspector(sweep.signal, matcher.patches, quality)
+        self._schedule = PairSchedule(trajectory)
         self._ready: dict[int, ReadyFrame] = {}
         self._motion: dict[int, InPlaneMotion] = {}
 
@@ -158,15 +196,14 @@ class _BlockMatcher:
             yield MatchedFrame(frame, features, self._advance(frame, ready))
 
     def _advance(self, frame: int, ready: ReadyFrame) -> dict[int, MatchedPair]:
-        """Match a frame with its references, and let go of what is no longer needed."""
-        then = time.perf_counter()
-        self._ready[frame] = ready
-        pairs = self._pairs(frame)
-        self._schedule.settle(frame, {first: pair.median for first, pair in pairs.items()})
-        keep = self._schedule.needed(frame)
-        self._ready = {k: v for k, v in self._ready.items() if k in keep}
-        self._motion = {k: v for k, v in self._motion.items() if k in keep}
-        self._times.add("in-plane motion and correlation", then)
+        """Match a frame with its references, and drop frames that are no longer needed."""
+        with self._times.of(MATCHING):
+            self._ready[frame] = ready
+            pairs = self._pairs(frame)
+            self._schedule.settle(frame, {first: pair.median for first, pair in pairs.items()})
+            keep = self._schedule.needed(frame)
+            self._ready = {k: v for k, v in self._ready.items() if k in keep}
+            self._motion = {k: v for k, v in self._motion.items() if k in keep}
         return pairs
 
     def _pairs(self, frame: int) -> dict[int, MatchedPair]:
@@ -195,8 +232,8 @@ class _BlockMatcher:
     def _lead_in(self, first: int) -> None:
         """Find the key frames before a block, going back from it no farther than a block is long.
 
-        By travel and not by a number of frames: after a pause at the border, only frames from before the
-        pause tell on which side the next ones are.
+        Key frames are so far apart in travel, not in time: after a pause at the border, only frames from
+        before the pause tell on which side the next ones are.
         """
         s = self._settings
         most = s.key_frames + s.far_key_frames
@@ -205,16 +242,15 @@ class _BlockMatcher:
         back = range(first - 1, max(-1, first - 1 - max(s.block_frames, s.recent)), -1)
         with closing(self._prefetch(back, first - 1)) as earlier:
             for frame, ready, _ in earlier:
-                then = time.perf_counter()
-                self._ready[frame] = ready
-                if frame < first - 1:
-                    median = self._lead(keys[-1], frame)
-                    if sound is None and median >= s.least_correlation:
-                        sound = keys[-1]
-                    if median < s.key_correlation:
-                        keys.append(frame)
-                self._ready = {k: v for k, v in self._ready.items() if k in keys or k in recent}
-                self._times.add("in-plane motion and correlation", then)
+                with self._times.of(MATCHING):
+                    self._ready[frame] = ready
+                    if frame < first - 1:
+                        median = self._lead(keys[-1], frame)
+                        if sound is None and median >= s.least_correlation:
+                            sound = keys[-1]
+                        if median < s.key_correlation:
+                            keys.append(frame)
+                    self._ready = {k: v for k, v in self._ready.items() if k in keys or k in recent}
                 if len(keys) >= most and frame <= recent.start:
                     break
         self._schedule.begin(sorted(keys[:most]), first - 1 if sound is None else sound)
@@ -223,7 +259,7 @@ class _BlockMatcher:
         """Match a frame with a key frame after it; its motion is the key frame's if they are not alike."""
         fixed, moving = self._ready[key], self._ready[frame]
         found = self._matcher.match(fixed, moving, self._matcher.search(fixed, moving))
-        median = median_correlation(found.correlation)
+        median = MatchedPair.of(found).median
         alike = median >= self._settings.least_correlation
         self._motion[frame] = compose(self._motion[key], found.motion) if alike else self._motion[key]
         return median
@@ -231,23 +267,21 @@ class _BlockMatcher:
     def _prefetch(
         self, numbers: range, inspected_from: int, images: ImageSink | None = None
     ) -> Generator[tuple[int, ReadyFrame, FrameFeatures | None]]:
-        """Frames made ready, a few ahead of use, on a thread of their own; features from some frame on.
+        """Yield frames made ready, a few ahead of use, on a second thread; features from some frame on.
 
-        The frame just before a block is inspected, too: whether the first is the same is among its features.
+        The frame before a block is inspected, too: a frame's features say whether it repeats the one before.
         """
 
         def make(index: int) -> tuple[int, ReadyFrame, FrameFeatures | None]:
-            then = time.perf_counter()
-            frame = self._sweep.frames[index]
-            then = self._times.add("reading", then)
-            echo, features = self._matcher.echo(frame), None
-            if index >= inspected_from:
-                features = self._inspector.inspect(frame, echo.intensity)
-            if images:
-                images(index, echo.intensity)
-            ready = self._matcher.prepare(echo)
-            self._times.add("intensity", then)
-            return index, ready, features
+            with self._times.of("reading"):
+                frame = self._sweep.frames[index]
+            with self._times.of("intensity"):
+                echo, features = self._matcher.echo(frame), None
+                if index >= inspected_from:
+                    features = self._inspector.inspect(frame, echo.intensity)
+                if images:
+                    images(index, echo.intensity)
+                return index, self._matcher.prepare(echo), features
 
         if not _READS_AHEAD.get():
             yield from map(make, numbers)

@@ -1,61 +1,96 @@
-"""The correlations of all matched frame pairs of a sweep: all that later stages need of the images."""
+"""Pair correlations: what two frames have in common, and all of a sweep's pairs as one table."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
 
 
-class Matched(Protocol):
-    """What two frames have in common: the correlation of each patch, shape (p,), and in-plane motion."""
+@dataclass(frozen=True)
+class MatchedPair:
+    """What a frame has in common with an earlier one.
 
-    @property
-    def correlation(self) -> FloatArray: ...  # noqa: D102
+    Attributes
+    ----------
+    correlation : ndarray, shape (p,)
+        Of each patch; see `PatchMatch`.
+    median : float
+        Over the patches that have a correlation; zero if none has.
+    """
 
-    @property
-    def motion(self) -> InPlaneMotion: ...  # noqa: D102
+    correlation: FloatArray
+    median: float
+    motion: InPlaneMotion
+
+    @classmethod
+    def of(cls, match: PatchMatch) -> MatchedPair:
+        """Keep what later stages need."""
+        known = match.correlation[np.isfinite(match.correlation)]
+        return cls(match.correlation, float(np.median(known)) if known.size else 0.0, match.motion)
 
 
+@dataclass(frozen=True)
 class CorrelationTable:
-    """Pairs in the order of their second frames; about one kilobyte each, a frame being a megabyte."""
+    """The correlations of a sweep's frame pairs: all that later stages need of the images.
 
-    def __init__(self, patches: int) -> None:
-        self._patches = patches
-        self._frames: list[tuple[int, int]] = []
-        self._correlation: list[Float32Array] = []
-        self._motion: list[InPlaneMotion] = []
+    A pair takes about a kilobyte, a frame a megabyte.
+
+    Attributes
+    ----------
+    first, second : ndarray, shape (e,)
+        Frames of each pair.
+    correlation : ndarray, shape (e, p)
+        Of each patch.
+    median : ndarray, shape (e,)
+        Median correlation of each pair.
+    motion : tuple of InPlaneMotion, length e
+    """
+
+    first: IntArray
+    second: IntArray
+    correlation: Float32Array
+    median: FloatArray
+    motion: tuple[InPlaneMotion, ...]
+
+    @classmethod
+    def of(cls, pairs: Iterable[tuple[int, int, MatchedPair]], patches: int) -> CorrelationTable:
+        """Gather pairs, each given as first frame, second frame and what they have in common."""
+        # Rounded at once to what is kept, so that memory holds no more than the table.
+        rows = [(i, j, p.correlation.astype(np.float32), p.median, p.motion) for i, j, p in pairs]
+        frames = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
+        return cls(
+            frames[:, 0],
+            frames[:, 1],
+            np.array([row[2] for row in rows], dtype=np.float32).reshape(-1, patches),
+            np.array([row[3] for row in rows], dtype=float),
+            tuple(row[4] for row in rows),
+        )
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return int(self.first.size)
 
-    def append(self, first: int, second: int, match: Matched) -> None:
-        """Add one pair."""
-        self._frames.append((first, second))
-        self._correlation.append(match.correlation.astype(np.float32))
-        self._motion.append(match.motion)
+    def followed_by(self, other: CorrelationTable) -> CorrelationTable:
+        """Return a table of these pairs and, in the rows after them, another's."""
+        return CorrelationTable(
+            np.concatenate([self.first, other.first]),
+            np.concatenate([self.second, other.second]),
+            np.concatenate([self.correlation, other.correlation]),
+            np.concatenate([self.median, other.median]),
+            self.motion + other.motion,
+        )
 
-    @property
-    def first(self) -> IntArray:
-        """First frame of each pair, shape (e,)."""
-        return self._column(0)
+    def moved_mm(self, row: int) -> FloatArray:
+        """In-plane displacement of one pair's second frame, lateral and axial, shape (2,)."""
+        return np.array([self.motion[row].x_mm, self.motion[row].y_mm])
 
-    @property
-    def second(self) -> IntArray:
-        """Second frame of each pair, shape (e,)."""
-        return self._column(1)
-
-    @property
-    def correlation(self) -> Float32Array:
-        """Correlation of each patch, shape (e, p)."""
-        return np.array(self._correlation, dtype=np.float32).reshape(len(self), self._patches)
-
-    def motion(self, row: int) -> InPlaneMotion:
-        """In-plane motion of one pair."""
-        return self._motion[row]
-
-    def _column(self, k: int) -> IntArray:
-        return np.array(self._frames, dtype=np.int64).reshape(-1, 2)[:, k]
+    def unmatched(self, frames: int, least_correlation: float) -> BoolArray:
+        """Frames after the first that resemble none of those they were matched with, shape (frames,)."""
+        best = np.full(frames, -np.inf)
+        np.maximum.at(best, self.second, self.median)
+        best[0] = np.inf
+        return best < least_correlation

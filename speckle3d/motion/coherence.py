@@ -100,6 +100,11 @@ class Coherence:
         return [EchoModel(*one) for one in zip(staying, 1 - share, gain, stretch, strict=True)]
 
 
+def scale_sigma(coherence: Coherence | None) -> float:
+    """Relative standard deviation of the scale of all distances; the curves' own without adaptation."""
+    return CURVES_SIGMA if coherence is None else coherence.scale_sigma
+
+
 def estimate_coherence(
     first: IntArray,
     second: IntArray,

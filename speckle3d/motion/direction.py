@@ -1,18 +1,39 @@
-"""What sensors say before drift is corrected: sensed orientation, and the sign of the motion."""
+"""Sensed orientation for the consistent subset, and the sign of the elevational motion."""
 
 from __future__ import annotations
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 
 
+class SensorSettings(BaseModel):
+    """How sensor streams are used."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    consistent_subset: bool = Field(
+        True, description="In mode `orientation`, drop distances that the sensed orientation contradicts."
+    )
+    smooth_s: float = Field(
+        0.2,
+        ge=0,
+        description="Standard deviation of the Gaussian that smooths sensed orientation for the subset.",
+    )
+    direction: int = Field(
+        0,
+        ge=-1,
+        le=1,
+        description="Sign of the first elevational motion; 0: from a sensor, or positive without one.",
+    )
+
+
 def orientation_sensor(sweep: Sweep) -> OrientationSensor | Tracker | None:
-    """Return what knows the sweep's orientation: its orientation sensor, or else its tracker."""
+    """Return the sweep's orientation sensor, or its tracker if it has none."""
     return sweep.orientation or sweep.tracker
 
 
@@ -22,16 +43,14 @@ def orientation_at(sensor: OrientationSensor | Tracker, time_s: FloatArray) -> R
     return measured.rotation if isinstance(measured, RigidTransform) else measured
 
 
-def sensed_orientation(sweep: Sweep, config: Config) -> Rotation | None:
-    """Smoothed orientation of every frame for the consistent subset; None if off or not known throughout."""
+def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | None:
+    """Smoothed orientation of every frame; None if the subset is off or a frame has no reading."""
     sensor = orientation_sensor(sweep)
-    if not config.sensors.consistent_subset or sensor is None or sensor.sensor_from_image is None:
+    if not settings.consistent_subset or sensor is None or sensor.sensor_from_image is None:
         return None
     if not sensor.covers(sweep.frame_time_s).all():
         return None
-    return smooth_rotations(
-        orientation_at(sensor, sweep.frame_time_s), sweep.frame_time_s, config.sensors.smooth_s
-    )
+    return smooth_rotations(orientation_at(sensor, sweep.frame_time_s), sweep.frame_time_s, settings.smooth_s)
 
 
 def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) -> Rotation:
@@ -44,10 +63,10 @@ def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) ->
     return mean * Rotation.from_rotvec(gaussian_filter1d(vectors, sigma, axis=0, mode="nearest"))
 
 
-def settle_direction(sweep: Sweep, image: RigidTransform, config: Config) -> tuple[int, str]:
-    """Sign of the elevational motion, which images alone cannot tell, and what told it."""
-    if config.sensors.direction:
-        return config.sensors.direction, "setting"
+def settle_direction(sweep: Sweep, image: RigidTransform, settings: SensorSettings) -> tuple[int, str]:
+    """Sign of the elevational motion, which images alone cannot tell, and its source."""
+    if settings.direction:
+        return settings.direction, "setting"
     centre = sweep.grid.centre_mm
     if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
         covered = np.flatnonzero(sweep.tracker.covers(sweep.frame_time_s))

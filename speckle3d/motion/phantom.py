@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
@@ -11,16 +11,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
-from speckle3d.matching.inplane import InPlaneMotion
-from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
+from speckle3d.matching.patches import PatchGrid
 from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples
 
 
 def known_positions(sweep: Sweep) -> tuple[RigidTransform, str]:
-    """Poses of a phantom sweep's frames: the truth if stored, else the tracker's, smoothed over time.
+    """Poses of a phantom sweep's frames and their source: the stored truth, or the tracker's, smoothed.
 
-    A tracker's jitter is a good part of the distances wanted here, and the probe's motion is smoother than
-    it: a smoothing spline whose stiffness comes from generalised cross-validation separates them.
+    A tracker's jitter is a good part of the distances wanted here. The probe moves more smoothly: a smoothing
+    spline, its stiffness from generalised cross-validation, takes the jitter out.
 
     Raises
     ------
@@ -46,45 +46,40 @@ def known_positions(sweep: Sweep) -> tuple[RigidTransform, str]:
     return first * moved, "tracker"
 
 
-def phantom_samples(
-    sweep: Sweep,
-    matcher: FrameMatcher,
-    settings: CurveSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> PhantomSamples:
-    """Correlate frame pairs of one phantom sweep that are closer than the curves' reach.
+def phantom_pairs(sweep: Sweep, settings: CurveSettings | None = None) -> IntArray:
+    """Choose frame pairs of a phantom sweep that are within the curves' reach, shape (m, 2).
 
-    Frames are read once, in order, and kept only while later ones are within reach.
+    Raises
+    ------
+    InsufficientDataError
+        If positions are not known, or no frames are near enough to each other.
     """
     s = settings or CurveSettings()
-    poses, _ = known_positions(sweep)
-    wanted = _choose_pairs(_separations(poses, sweep.grid.centre_mm), s)
-    kept: dict[int, ReadyFrame] = {}
-    motion = {0: InPlaneMotion()}
-    rows: list[FloatArray] = []
-    for frame in range(len(sweep)):
-        kept[frame] = matcher.prepare(matcher.echo(sweep.frames[frame]))
-        if frame:
-            start = matcher.search(kept[frame - 1], kept[frame])
-            step = matcher.match(kept[frame - 1], kept[frame], start).motion
-            motion[frame] = compose(motion[frame - 1], step)
-        for first in wanted[wanted[:, 1] == frame, 0]:
-            start = compose(inverse(motion[first]), motion[frame])
-            match = matcher.match(kept[first], kept[frame], start)
-            offset, tilt = _patch_offsets(poses[first].inv() * poses[frame], matcher, match.motion)
-            depth = matcher.patches.centre_mm[:, 1]
-            rows.append(np.column_stack([depth, offset, np.full(depth.size, tilt), match.correlation]))
-        needed = wanted[wanted[:, 1] > frame, 0]
-        kept = {k: v for k, v in kept.items() if k == frame or k in needed}
-        if progress:
-            progress(frame + 1, len(sweep))
-    if not rows:
+    pairs = _choose_pairs(_separations(known_positions(sweep)[0], sweep.grid.centre_mm), s)
+    if not len(pairs):
         raise InsufficientDataError(
             f"{sweep.name}: expected phantom frames closer than {s.largest_mm:g} mm, got none"
         )
+    return pairs
+
+
+def phantom_samples(
+    sweep: Sweep, patches: PatchGrid, matches: Iterable[tuple[int, int, PatchMatch]]
+) -> PhantomSamples:
+    """Set the correlations of matched phantom frames beside their known distances.
+
+    Parameters
+    ----------
+    matches : iterable of (first frame, second frame, match)
+    """
+    poses, _ = known_positions(sweep)
+    depth = patches.centre_mm[:, 1]
+    rows = []
+    for first, second, match in matches:
+        offset, tilt = _patch_offsets(poses[first].inv() * poses[second], patches, match.motion)
+        rows.append(np.column_stack([depth, offset, np.full(depth.size, tilt), match.correlation]))
     table = np.concatenate(rows)
-    depth, offset, tilt, correlation = table.T
-    return PhantomSamples(depth, offset, tilt, correlation, len(rows))
+    return PhantomSamples(table[:, 0], table[:, 1], table[:, 2], table[:, 3], len(rows))
 
 
 def _separations(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
@@ -107,10 +102,10 @@ def _choose_pairs(separation: FloatArray, settings: CurveSettings) -> IntArray:
 
 
 def _patch_offsets(
-    first_from_second: RigidTransform, matcher: FrameMatcher, motion: InPlaneMotion
+    first_from_second: RigidTransform, patches: PatchGrid, motion: InPlaneMotion
 ) -> tuple[FloatArray, float]:
     """Signed distance of each patch of the second frame from the first frame's plane, mm, and its tilt."""
-    lateral = matcher.patches.centre_mm - [motion.x_mm, motion.y_mm]
+    lateral = patches.centre_mm - [motion.x_mm, motion.y_mm]
     points = np.column_stack([lateral, np.zeros(len(lateral))])
     return np.asarray(first_from_second.apply(points)[:, 2]), float(
         first_from_second.rotation.as_matrix()[2, 1]

@@ -1,25 +1,21 @@
-"""Frames of a sweep that comes back, matched with those of its way there.
+"""Ties between visits of the same tissue, for a sweep that comes back.
 
-A sweep that returns over the same tissue sees speckle that it has seen before, and the two ways can be tied
-together. Frames are read a second time for it, a few at a time.
+Speckle that was seen before is seen again, so that frames of a later visit have a distance from those of an
+earlier one however far the probe travelled between them.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.matching.blocks import median_correlation
-from speckle3d.matching.inplane import PatchMatch
-from speckle3d.matching.matcher import ReadyFrame
+from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.distances import EchoModel
-from speckle3d.motion.path import Walk
-from speckle3d.motion.planes import PairPlane
+from speckle3d.motion.estimate import SignedPair
+from speckle3d.motion.planes import PairPlane, PlaneFitter
 
 AWAY_MM = 3.0
 """Travel between two visits: less is within reach of the pairs measured anyway."""
@@ -27,7 +23,6 @@ REACH_MM, REACH_PER_MM = 0.4, 0.02
 """How far off a return may be found: speckle's range, and drift with travel."""
 SPACING_MM = 0.15
 MOST_CANDIDATES = 16
-KEPT_FRAMES = 24
 LEAST_PAIRS = 4
 CAP, MARGIN = 9.0, 6.0
 """Squared deviations at which a pair counts as wrong, and by which a place must beat any other."""
@@ -37,41 +32,78 @@ RELATIVE_ERROR, FIXED_ERROR_MM = 0.1, 0.02
 
 
 @dataclass(frozen=True)
-class Revisit:
-    """A pair of frames from two visits: how its echoes are read, its plane and the plane's sign."""
+class Return:
+    """A frame that may have come back to where earlier ones, nearest first, were."""
 
-    first: int
-    second: int
-    match: PatchMatch
-    model: EchoModel | None
-    plane: PairPlane
-    sign: float
+    frame: int
+    earlier: Sequence[int]
+
+    def pairs(self) -> Iterator[tuple[int, int]]:
+        """Pairs to be matched, as first and second frame."""
+        return ((first, self.frame) for first in self.earlier)
 
 
-def find_revisits(walk: Walk, position_mm: FloatArray, coherence: Coherence | None) -> list[Revisit]:
-    """Match frames of later visits, `revisit_mm` of travel apart, with those of earlier ones.
+def find_returns(position_mm: FloatArray, every_mm: float) -> list[Return]:
+    """Find frames, `every_mm` of travel apart, that are back where earlier ones were.
 
     Parameters
     ----------
     position_mm : ndarray, shape (n,)
         Elevational position of each frame's centre, right to a few hundredths of the travel.
+    every_mm : float
+        Zero: none are looked for.
     """
-    every = walk.config.trajectory.revisit_mm
-    if every == 0:
+    if every_mm == 0:
         return []
-    travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(position_mm)))])
-    reader = _Reader(walk)
-    found: list[Revisit] = []
-    last = -np.inf
-    for second in range(1, position_mm.size):
-        if travel[second] - last < every:
+    travel = _travel(position_mm)
+    found: list[Return] = []
+    for frame in range(1, position_mm.size):
+        if found and travel[frame] - travel[found[-1].frame] < every_mm:
             continue
-        earlier = _candidates(second, position_mm, travel)
-        if len(earlier) < LEAST_PAIRS:
-            continue
-        last = travel[second]
-        found += _tie(walk, reader, second, earlier, position_mm, travel, coherence)
+        earlier = _candidates(frame, position_mm, travel)
+        if len(earlier) >= LEAST_PAIRS:
+            found.append(Return(frame, earlier))
     return found
+
+
+def tie_returns(
+    returns: Sequence[Return],
+    table: CorrelationTable,
+    position_mm: FloatArray,
+    fitter: PlaneFitter,
+    coherence: Coherence | None,
+    least_correlation: float,
+) -> list[SignedPair]:
+    """Pairs of returns with the frames they came back to, where these agree on one place for the return.
+
+    Parameters
+    ----------
+    table : CorrelationTable
+        Holds the pairs of the returns, among others; a pair below `least_correlation` shows that its frames
+        are far apart.
+    position_mm : ndarray, shape (n,)
+        As for `find_returns`.
+    """
+    rows = {
+        pair: row for row, pair in enumerate(zip(table.first.tolist(), table.second.tolist(), strict=True))
+    }
+    travel = _travel(position_mm)
+    ties: list[SignedPair] = []
+    for each in returns:
+        read: dict[int, SignedPair] = {}
+        for pair in each.pairs():
+            row = rows[pair]
+            if table.median[row] >= least_correlation:
+                one = _read(row, table, position_mm, fitter, coherence)
+                if one is not None:
+                    read[pair[0]] = one
+        if len(read) >= LEAST_PAIRS:
+            ties += _agreeing(each, read, position_mm, travel)
+    return ties
+
+
+def _travel(position_mm: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(position_mm)))])
 
 
 def _candidates(second: int, position_mm: FloatArray, travel: FloatArray) -> list[int]:
@@ -87,37 +119,35 @@ def _candidates(second: int, position_mm: FloatArray, travel: FloatArray) -> lis
     return [int(i) for i in thinned[np.argsort(off[thinned])][:MOST_CANDIDATES]]
 
 
-def _tie(
-    walk: Walk,
-    reader: _Reader,
-    second: int,
-    earlier: Sequence[int],
+def _read(
+    row: int,
+    table: CorrelationTable,
     position_mm: FloatArray,
-    travel: FloatArray,
+    fitter: PlaneFitter,
     coherence: Coherence | None,
-) -> list[Revisit]:
-    """Pairs of one frame with those it came back to, if they agree on one place for it."""
-    read = {}
-    for first in earlier:
-        match = reader.match(first, second)
-        if median_correlation(match.correlation) >= walk.config.trajectory.least_correlation:
-            model = None
-            if coherence is not None:
-                apart = np.array([position_mm[second] - position_mm[first]])
-                model = coherence.models(np.array([float(first)]), apart)[0]
-            moved = np.array([match.motion.x_mm, match.motion.y_mm])
-            plane = walk.fitter.fit(match.correlation, moved, model)
-            if plane is not None:
-                read[first] = Revisit(first, second, match, model, plane, 1.0)
-    if len(read) < LEAST_PAIRS:
-        return []
-    reach = REACH_MM + REACH_PER_MM * float(np.ptp(travel[[*earlier, second]]))
+) -> SignedPair | None:
+    first, second = int(table.first[row]), int(table.second[row])
+    model = None
+    if coherence is not None:
+        # Structure is what the earlier visit saw of it.
+        apart = np.array([position_mm[second] - position_mm[first]])
+        model = coherence.models(np.array([float(first)]), apart)[0]
+    plane = fitter.fit(table.correlation[row].astype(float), table.moved_mm(row), model)
+    return None if plane is None else SignedPair(row, first, second, model, plane)
+
+
+def _agreeing(
+    each: Return, read: Mapping[int, SignedPair], position_mm: FloatArray, travel: FloatArray
+) -> list[SignedPair]:
+    """Pairs of one return with their signs, if they agree on one place for it."""
+    earlier = list(each.earlier)
+    reach = REACH_MM + REACH_PER_MM * float(np.ptp(travel[[*earlier, each.frame]]))
     planes = [read[i].plane if i in read else None for i in earlier]
-    shift = _place(position_mm[second] - position_mm[list(earlier)], planes, reach)
+    shift = _place(position_mm[each.frame] - position_mm[earlier], planes, reach)
     if shift is None:
         return []
-    at = position_mm[second] + shift
-    return [replace(r, sign=1.0 if at >= position_mm[i] else -1.0) for i, r in read.items()]
+    at = position_mm[each.frame] + shift
+    return [replace(pair, sign=1.0 if at >= position_mm[i] else -1.0) for i, pair in read.items()]
 
 
 def _place(apart_mm: FloatArray, planes: Sequence[PairPlane | None], reach_mm: float) -> float | None:
@@ -147,28 +177,3 @@ def _place(apart_mm: FloatArray, planes: Sequence[PairPlane | None], reach_mm: f
     if others.any() and cost[others].min() - cost[best] < MARGIN:
         return None
     return float(shifts[best])
-
-
-class _Reader:
-    """Matches any two frames, keeping the latest read ones ready."""
-
-    def __init__(self, walk: Walk) -> None:
-        self._walk = walk
-        self._ready: OrderedDict[int, ReadyFrame] = OrderedDict()
-
-    def match(self, first: int, second: int) -> PatchMatch:
-        """In-plane motion and correlation, searched for over the whole range."""
-        fixed, moving = self._frame(first), self._frame(second)
-        matcher = self._walk.matcher
-        return matcher.match(fixed, moving, matcher.search(fixed, moving))
-
-    def _frame(self, index: int) -> ReadyFrame:
-        if index in self._ready:
-            self._ready.move_to_end(index)
-            return self._ready[index]
-        matcher = self._walk.matcher
-        ready = matcher.prepare(matcher.echo(self._walk.sweep.frames[index]))
-        self._ready[index] = ready
-        if len(self._ready) > KEPT_FRAMES:
-            self._ready.popitem(last=False)
-        return ready

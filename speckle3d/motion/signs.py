@@ -15,6 +15,9 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.motion.planes import PairPlane
 
 HYPOTHESES = 8
+PLAIN_ERROR, ADAPTED_ERROR = 0.25, 0.1
+"""Relative error of distances by a phantom's curves and with coherence adapted to. Coherent tissue makes long
+distances too short, so that a misfit of a quarter is no sign of turning back."""
 TREND_MM = 0.3
 """Travel over which a direction is remembered: a few frames of a hand-held sweep."""
 TURNING_COST = 2.0
@@ -37,15 +40,14 @@ class SignResolver:
     frames : int
         Of the sweep.
     relative_error : float
-        Of offsets and slopes, besides their covariance. Coherent tissue makes long distances too short, so
-        that a misfit of a quarter is no sign of turning back; less where coherence has been adapted to.
+        Of offsets and slopes, besides their covariance: `PLAIN_ERROR` or `ADAPTED_ERROR`.
 
     Notes
     -----
     The sweep's first motion counts as positive.
     """
 
-    def __init__(self, frames: int, relative_error: float = 0.25) -> None:
+    def __init__(self, frames: int, relative_error: float = PLAIN_ERROR) -> None:
         self._relative_error = relative_error
         self._paths = np.zeros((1, frames, 2))
         self._cost = np.zeros(1)

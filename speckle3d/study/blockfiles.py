@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.matching.blocks import Block, MatchedBlock, MatchedFrame, MatchedPair
+from speckle3d.matching.blocks import Block, MatchedBlock, MatchedFrame
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.quality import FrameFeatures
+from speckle3d.matching.table import MatchedPair
 from speckle3d.study.strip import Strip
 
 _BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile)

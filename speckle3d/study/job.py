@@ -26,8 +26,7 @@ from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.matching.quality import describe
 from speckle3d.motion.direction import sensed_orientation
-from speckle3d.motion.estimate import Tracked
-from speckle3d.pipeline import Progress, correct, require_modes, track
+from speckle3d.pipeline import Progress, Tracked, correct, require_modes, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, accumulated, compare_modes
 from speckle3d.study.blockfiles import BlockFiles
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
@@ -129,7 +128,7 @@ def require_possible(
 
 def available_modes(sweep: Sweep, config: Config) -> list[str]:
     """Modes beside `image` for which the sweep has sensors, calibrated to the image."""
-    found = [SUBSET] if sensed_orientation(sweep, config) is not None else []
+    found = [SUBSET] if sensed_orientation(sweep, config.sensors) is not None else []
     for mode in ("orientation", "pose"):
         try:
             require_modes(sweep, [mode])
@@ -140,7 +139,7 @@ def available_modes(sweep: Sweep, config: Config) -> list[str]:
 
 
 def _require_subset(sweep: Sweep, config: Config) -> None:
-    if sensed_orientation(sweep, config) is None:
+    if sensed_orientation(sweep, config.sensors) is None:
         raise InsufficientDataError(
             f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
             "sensors.consistent_subset, got none"

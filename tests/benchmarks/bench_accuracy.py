@@ -177,11 +177,11 @@ def _settings(options: Mapping[str, object]) -> SimulationSettings:
 def _direction_without_tracker(sweep: Sweep, image: RigidTransform, config: Config) -> str:
     """Whether a sweep without a tracker would have got its sign right; `image` has the true one."""
     alone = replace(sweep, tracker=None, truth=None)
-    sign, source = settle_direction(alone, image, config)
+    sign, source = settle_direction(alone, image, config.sensors)
     if source == "assumed":
         return "undecided"
     # The verdict must not depend on which of the two mirror images is asked about.
-    assert settle_direction(alone, mirrored(image), config)[0] == -sign
+    assert settle_direction(alone, mirrored(image), config.sensors)[0] == -sign
     return "right" if sign > 0 else "wrong"
 
 

@@ -42,9 +42,9 @@ def reordered(sweep, order, noise=0.0):
     )
 
 
-def matcher_of(sweep):
-    s = CONFIG
-    return FrameMatcher(sweep, s.intensity, s.patches, s.inplane, s.matching)
+def matched(sweep, s, block, **more):
+    matcher = FrameMatcher(sweep, s.intensity, s.patches, s.inplane, s.matching)
+    return match_block(sweep, matcher, s.trajectory, s.quality, block, **more)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_blocks_matched_elsewhere_in_any_order_give_the_same_bits(sweep, curves,
     given = {}
     for block in reversed(blocks_of(len(sweep), 24)):
         times = StageTimes()
-        frames = list(match_block(sweep, matcher_of(sweep), CONFIG, block, times=times))
+        frames = list(matched(sweep, CONFIG, block, times=times))
         assert [each.frame for each in frames] == list(range(block.first, block.stop))
         given[block] = MatchedBlock(frames, times.seconds)
     del given[Block(24, 48)]
@@ -115,7 +115,7 @@ def test_blocks_matched_elsewhere_in_any_order_give_the_same_bits(sweep, curves,
 
 def test_a_block_reads_few_frames_before_it(sweep):
     part = reordered(sweep, np.arange(96))
-    frames = list(match_block(part, matcher_of(part), CONFIG, Block(72, 96)))
+    frames = list(matched(part, CONFIG, Block(72, 96)))
     s = CONFIG.trajectory
     references = {first for each in frames for first in each.pairs if first < 72}
     # Steps of 0.13 mm: a key frame every other frame, eight of them at most, and three read ahead.
@@ -130,7 +130,7 @@ def test_a_border_within_a_pause_still_sees_the_frames_before_it(sweep, curves):
     order = np.concatenate([np.arange(20), np.full(20, 20), np.arange(21, 41)])
     paused = reordered(sweep, order, noise=0.02)
     config = Config.model_validate({"trajectory": {"block_frames": 30}})
-    frames = list(match_block(paused, matcher_of(paused), config, Block(30, 60)))
+    frames = list(matched(paused, config, Block(30, 60)))
     assert min(frames[0].pairs) < 18
     found = track(paused, curves, config)
     true = (paused.truth[0].inv() * paused.truth).apply(sweep.grid.centre_mm)[:, 2]

@@ -10,12 +10,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.matching.chosen import match_in_order
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
 from speckle3d.motion.decorrelation import CurveSettings, fit_curves
-from speckle3d.motion.phantom import known_positions, phantom_samples
+from speckle3d.motion.phantom import known_positions, phantom_pairs, phantom_samples
 
 SIGMA_MM, FRAMES = 0.3, 44
 GRID = ImageGrid(48, 260, 0.3, 0.06)
@@ -44,9 +45,15 @@ def matcher_of(sweep):
     return FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
 
 
+def samples_of(sweep, settings, progress=None):
+    matcher = matcher_of(sweep)
+    matches = match_in_order(sweep, matcher, phantom_pairs(sweep, settings), progress)
+    return phantom_samples(sweep, matcher.patches, matches)
+
+
 def test_the_curve_comes_back(phantom):
     done = []
-    samples = phantom_samples(phantom, matcher_of(phantom), SETTINGS, lambda n, of: done.append((n, of)))
+    samples = samples_of(phantom, SETTINGS, lambda n, of: done.append((n, of)))
     curves = fit_curves(speckle.KEY, [samples], SETTINGS)
     assert done == [(n + 1, FRAMES) for n in range(FRAMES)]
     d = curves.distance_mm
@@ -57,10 +64,10 @@ def test_the_curve_comes_back(phantom):
 
 
 def test_pairs_are_within_reach_and_about_as_many_as_asked(phantom):
-    samples = phantom_samples(phantom, matcher_of(phantom), CurveSettings(largest_mm=0.5, pairs=60))
+    samples = samples_of(phantom, CurveSettings(largest_mm=0.5, pairs=60))
     assert samples.pairs == 60
     assert np.abs(samples.offset_mm).max() <= 0.5 + 1e-9
-    every = phantom_samples(phantom, matcher_of(phantom), CurveSettings(largest_mm=0.5, pairs=3000))
+    every = samples_of(phantom, CurveSettings(largest_mm=0.5, pairs=3000))
     # Thinned, they are spread over separation as all of them are, to half a step.
     quantiles = [0.1, 0.3, 0.5, 0.7, 0.9]
     spread = [np.quantile(np.abs(one.offset_mm), quantiles) for one in (samples, every)]
@@ -83,24 +90,24 @@ def stepped_and_tipped(phantom, step_mm, tilt):
 @pytest.mark.parametrize("tilt", [0.01, -0.01])
 def test_offsets_and_tilt_are_signed_and_those_of_the_patches(phantom, step_mm, tilt):
     two = stepped_and_tipped(phantom, step_mm, tilt)
-    samples = phantom_samples(two, matcher_of(two), SETTINGS)
+    samples = samples_of(two, SETTINGS)
     expected = step_mm + np.sin(tilt) * (samples.depth_mm - GRID.centre_mm[1])
     np.testing.assert_allclose(samples.offset_mm, expected, atol=1e-3)
     np.testing.assert_allclose(samples.tilt_rad, np.sin(tilt), atol=1e-9)
 
 
 def test_frames_that_do_not_turn_have_no_tilt(phantom):
-    samples = phantom_samples(phantom, matcher_of(phantom), SETTINGS)
+    samples = samples_of(phantom, SETTINGS)
     assert np.abs(samples.tilt_rad).max() < 1e-9
 
 
 def test_frames_too_far_apart_or_without_positions_are_refused(phantom):
     z = 5.0 * np.arange(FRAMES)
     far = replace(phantom, truth=RigidTransform.from_translation(np.column_stack([0 * z, 0 * z, z])))
-    with pytest.raises(InsufficientDataError, match=r"phantom: expected phantom frames closer than 1\.2 mm"):
-        phantom_samples(far, matcher_of(far), SETTINGS)
-    with pytest.raises(InsufficientDataError, match=r"known positions \(/truth or /tracker\), got neither"):
-        phantom_samples(replace(phantom, truth=None), matcher_of(phantom), SETTINGS)
+    with pytest.raises(InsufficientDataError, match=r"^phantom: .*1\.2 mm"):
+        samples_of(far, SETTINGS)
+    with pytest.raises(InsufficientDataError, match="/truth or /tracker"):
+        phantom_pairs(replace(phantom, truth=None), SETTINGS)
 
 
 def test_a_trackers_jitter_is_smoothed_away(phantom):

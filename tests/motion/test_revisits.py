@@ -8,11 +8,19 @@ import pytest
 from speckle3d.config import Config
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
+from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.path import Walk
-from speckle3d.motion.planes import PairPlane
-from speckle3d.motion.revisits import AWAY_MM, MOST_CANDIDATES, REACH_MM, _candidates, _place, find_revisits
+from speckle3d.motion.planes import PairPlane, PlaneFitter
+from speckle3d.motion.revisits import (
+    AWAY_MM,
+    MOST_CANDIDATES,
+    REACH_MM,
+    _candidates,
+    _place,
+    find_returns,
+    tie_returns,
+)
 from speckle3d.pipeline import track
 
 TURN = 21
@@ -59,11 +67,18 @@ def curves(shipped):
 
 
 @pytest.fixture(scope="module")
-def walk(shipped, curves):
-    """A walk that has not begun: frames are read only to be matched anew."""
-    sweep, s = there_and_back(shipped), Config()
+def returning(shipped):
+    return there_and_back(shipped)
+
+
+def ties_of(sweep, curves, position):
+    """Ties found on a path, and the table that holds their pairs."""
+    s = Config()
     matcher = FrameMatcher(sweep, s.intensity, s.patches, s.inplane, s.matching)
-    return Walk(sweep, matcher, DistanceEstimator(curves, matcher.patches), s)
+    fitter = PlaneFitter(DistanceEstimator(curves, matcher.patches), matcher.at_mm, s.planes)
+    returns = find_returns(position, s.trajectory.revisit_mm)
+    table = match_again(sweep, matcher, [pair for each in returns for pair in each.pairs()])
+    return tie_returns(returns, table, position, fitter, None, s.trajectory.least_correlation), table
 
 
 # ---- whole sweeps ------------------------------------------------------------------------------------------
@@ -115,32 +130,32 @@ def test_one_way_no_frame_is_read_again(shipped, curves, monkeypatch):
 
 
 @pytest.mark.parametrize("drift_mm", [0.0, 0.1, 0.25, -0.25])
-def test_pairs_of_two_visits_are_on_their_true_sides_though_the_path_drifted(walk, drift_mm):
+def test_pairs_of_two_visits_are_on_their_true_sides_though_the_path_drifted(returning, curves, drift_mm):
     """The way back is believed to end so far from where it does."""
-    z = positions(walk.sweep)
+    z = positions(returning)
     believed = z.copy()
     believed[TURN:] += drift_mm * np.linspace(0, 1, TURN)
-    found = find_revisits(walk, believed, None)
+    found, table = ties_of(returning, curves, believed)
     assert found
-    for r in found:
-        assert r.first < TURN <= r.second
-        assert r.sign == np.sign(z[r.second] - z[r.first])
-        assert np.median(r.match.correlation) > walk.config.trajectory.least_correlation
+    for pair in found:
+        assert pair.first < TURN <= pair.second
+        assert (table.first[pair.row], table.second[pair.row]) == (pair.first, pair.second)
+        assert pair.sign == np.sign(z[pair.second] - z[pair.first])
+        assert table.median[pair.row] > Config().trajectory.least_correlation
     # A millimetre of travel lies between frames that are tied.
     travel = np.concatenate([[0], np.cumsum(np.abs(np.diff(believed)))])
-    assert (np.diff(travel[sorted({r.second for r in found})]) >= 1.0).all()
+    assert (np.diff(travel[sorted({pair.second for pair in found})]) >= 1.0).all()
 
 
-def test_nothing_is_tied_where_the_path_is_beyond_reach(walk):
-    believed = positions(walk.sweep).copy()
+def test_nothing_is_tied_where_the_path_is_beyond_reach(returning, curves):
+    believed = positions(returning).copy()
     believed[TURN:] += 2.0
-    assert find_revisits(walk, believed, None) == []
+    assert ties_of(returning, curves, believed)[0] == []
 
 
-def test_nothing_is_looked_for_where_it_is_not_wanted(walk):
-    off = Config.model_validate({"trajectory": {"revisit_mm": 0.0}})
-    quiet = Walk(walk.sweep, walk.matcher, walk.estimator, off)
-    assert find_revisits(quiet, positions(walk.sweep), None) == []
+def test_nothing_is_looked_for_where_it_is_not_wanted(returning):
+    assert find_returns(positions(returning), 1.0)
+    assert find_returns(positions(returning), 0.0) == []
 
 
 def test_candidates_are_of_an_earlier_visit_few_and_nearest_first():
