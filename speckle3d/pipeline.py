@@ -45,8 +45,7 @@ from speckle3d.motion.direction import (
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
 from speckle3d.motion.revisits import find_returns, tie_returns
-from speckle3d.motion.slopes import SlopeEvidence
-from speckle3d.motion.uncertainty import pose_covariance
+from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""

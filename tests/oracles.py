@@ -155,7 +155,7 @@ def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius)
 
 
 def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
-    """Twin of `speckle3d.motion.subset.consistent_subset`: every plane, every patch, one after the other.
+    """Twin of `speckle3d.motion.planes.consistent_subset`: every plane, every patch, one after the other.
 
     Returns all best subsets: placements may tie but for rounding.
     """

@@ -15,19 +15,17 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.optimize import least_squares
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
-from speckle3d.motion.tilt import effective_distance, fit_tilt_response
 
 TILT_ROUNDS = 4
 LITTLE_TILT, LITTLE_TILT_MM = 0.1, 0.01
 """Curves are fitted to frames whose turning changes distances by no more than this."""
 LEAST_RHO = 0.1
-"""Curves end where the phantom's correlation falls to this: below it a patch of some hundred cells cannot
-tell one distance from another."""
+"""Correlation at which curves end: below it a patch of some hundred cells cannot tell distances apart."""
 
 
 class CurveSettings(BaseModel):
@@ -85,7 +83,7 @@ def fit_curves(
     distance, response = np.abs(offset), None
     of_echo = key.correlation_of == "echo"
     fair = np.ones(depth.size, dtype=bool)
-    # Frames that turn distort the curves a little, and the curves say what turning does.
+    # Turning distorts the curves a little and is itself read from them: estimate both in turn.
     for turn in range(TILT_ROUNDS):
         fitted = [
             _fit_row(row, grid, s.terms, of_echo, *_select(fair, depth, row, distance, rho)) for row in rows
@@ -126,7 +124,7 @@ def _fit_row(
     centre, mean = _bin_means(distance, rho)
     floor = _floor(centre, mean)
     excess = (mean - floor) / (1 - floor)
-    # A curve that levels out is past its use: fit what lies before the first bin under the least rho.
+    # Where a curve has levelled out it tells no distance: fit what lies before the first bin below the least.
     below = np.flatnonzero(excess < LEAST_RHO)
     keep = slice(0, int(below[0]) if below.size else mean.size)
     centre, excess = centre[keep], excess[keep]
@@ -152,10 +150,10 @@ def _cells(left: FloatArray, expected: FloatArray, of_echo: bool) -> float:
 
 
 def _floor(centre: FloatArray, mean: FloatArray) -> float:
-    """Correlation that stays however far apart the frames are.
+    """Correlation of frames however far apart.
 
-    Fitting the in-plane motion of frames that share nothing finds a little correlation all the same; the
-    curves hold it, so that it is not taken for coherent scattering in a sweep.
+    The fit of in-plane motion finds a little correlation in frames that share no speckle. Curves include it,
+    so that it is not taken for coherent scattering in a sweep.
     """
     below = np.flatnonzero(mean < LEAST_RHO)
     far = mean[centre > 1.5 * centre[below[0]]] if below.size else mean[:0]
@@ -169,7 +167,7 @@ def _fitted_fall(grid: FloatArray, centre: FloatArray, rho: FloatArray, terms: i
     weight = 1 / (1 - rho**2 + 0.01)
     log_weight = rho * weight
     start = np.linalg.lstsq(design * log_weight[:, None], -np.log(rho) * log_weight, rcond=None)[0]
-    # The logarithm of a mean is not the mean of logarithms: the last word has the correlation itself.
+    # The mean of logarithms is not the logarithm of the mean, so the last fit is of the correlation itself.
     coefficients = least_squares(_misfit, start, args=(design, rho, weight)).x
     coefficients[0] = max(coefficients[0], 1e-6)
     inside = grid <= reach
@@ -189,3 +187,82 @@ def _bin_means(distance: FloatArray, rho: FloatArray) -> tuple[FloatArray, Float
     _, label = np.unique(np.round(distance / width), return_inverse=True)
     count = np.bincount(label)
     return np.bincount(label, distance) / count, np.bincount(label, rho) / count
+
+
+PAIRS_PER_FACT = 20.0
+"""Frame pairs per independent piece of information: pairs share frames."""
+SURE_MM = 4.0
+"""Standard deviation below which a pivot counts as learnt, a fraction of the probe's focal length."""
+TURNED_RAD = 1e-5
+
+
+def effective_distance(
+    offset_mm: FloatArray, tilt_rad: FloatArray, pivot_mm: FloatArray | float, spread_mm: FloatArray | float
+) -> FloatArray:
+    """Distance without tilt at which speckle would have decorrelated as much."""
+    return np.asarray(np.hypot(offset_mm - pivot_mm * tilt_rad, spread_mm * tilt_rad))
+
+
+def fit_tilt_response(
+    depths_mm: FloatArray,
+    curves: FloatArray,
+    cells: FloatArray,
+    distance_mm: FloatArray,
+    wavenumber_per_mm: float,
+    of_echo: bool,
+    samples: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+) -> TiltResponse | None:
+    """Fit the pivot at each depth to phantom frames that turned; None if they hardly did.
+
+    Spread and pivot cannot be separated while frames turn about the probe's face; the spread is therefore
+    that of a Gaussian beam of the curves' own width: two-way wavenumber times width squared.
+
+    Parameters
+    ----------
+    depths_mm, cells : ndarray, shape (r,)
+    curves : ndarray, shape (r, k)
+        On `distance_mm`, shape (k,).
+    wavenumber_per_mm : float
+        Two-way, 4 pi over the wavelength; 0 if it is not known.
+    samples : tuple of ndarray, each of shape (n,)
+        Depth, signed offset, tilt, correlation.
+    """
+    depth, offset, tilt, rho = samples
+    turned = np.isfinite(rho) & (np.abs(tilt) > TURNED_RAD) & (np.abs(offset) < distance_mm[-1])
+    width = np.array([np.interp(0.5, -np.log(curve), distance_mm) for curve in curves])
+    spread = wavenumber_per_mm * width**2
+    fits = []
+    for number, row in enumerate(depths_mm):
+        here = turned & (np.abs(depth - row) < 1e-5)
+        if here.sum() < 4 * PAIRS_PER_FACT:
+            return None
+        seen = offset[here], tilt[here], rho[here]
+        fits.append(_fit_pivot(*seen, distance_mm, curves[number], cells[number], spread[number], of_echo))
+    pivot, deviation = np.array(fits).T
+    if np.median(deviation) > SURE_MM:
+        return None
+    # Wavefronts change slowly with depth.
+    smooth = np.polynomial.Polynomial.fit(depths_mm, pivot, min(2, depths_mm.size - 1), w=1 / deviation)
+    return TiltResponse(smooth(depths_mm), spread)
+
+
+def _fit_pivot(
+    offset: FloatArray,
+    tilt: FloatArray,
+    rho: FloatArray,
+    distance_mm: FloatArray,
+    curve: FloatArray,
+    cells: float,
+    spread: float,
+    of_echo: bool,
+) -> tuple[float, float]:
+    """Pivot of one depth and its standard deviation."""
+
+    def standard(pivot: FloatArray) -> FloatArray:
+        expected = np.interp(effective_distance(offset, tilt, pivot[0], spread), distance_mm, curve)
+        variance = correlation_variance(np.minimum(expected, 0.98), cells / PAIRS_PER_FACT, of_echo)
+        return np.asarray((rho - expected) / np.sqrt(variance))
+
+    starts = [least_squares(standard, [start], loss="soft_l1") for start in (-8.0, 0.0, 8.0)]
+    fit = min(starts, key=lambda f: float(f.cost))
+    return float(fit.x[0]), float(1 / np.sqrt(np.square(np.asarray(fit.jac)).sum() + 1e-9))

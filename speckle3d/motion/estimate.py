@@ -16,10 +16,8 @@ from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, CoherenceSettings, estimate_coherence, scale_sigma
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
-from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings
+from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings, consistent_subset
 from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, SignResolver, pair_signs
-from speckle3d.motion.slopes import SlopeEvidence, weigh_slopes
-from speckle3d.motion.subset import consistent_subset
 from speckle3d.motion.trajectory import (
     RelativePoses,
     Trajectory,
@@ -28,6 +26,7 @@ from speckle3d.motion.trajectory import (
     relative_poses_of,
     solve_trajectory,
 )
+from speckle3d.motion.uncertainty import SlopeEvidence, weigh_slopes
 
 ROWS_AT_ONCE = 1024
 ENOUGH_PAIRS = 3
@@ -286,9 +285,7 @@ class PairReader:
             self._distances(table, pair), raised, self._planes.support_sigma, open_side
         )
         rho = table.correlation[pair.row].astype(float)
-        plane = self.fitter.fit(
-            rho, moved, pair.model, agreed.support, slopes, pair.plane.offset_mm, open_side
-        )
+        plane = self.fitter.fit(rho, moved, pair.model, agreed, slopes, pair.plane.offset_mm, open_side)
         return plane or pair.plane
 
     def _distances(self, table: CorrelationTable, pair: SignedPair) -> PatchDistances:

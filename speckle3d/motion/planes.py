@@ -6,9 +6,8 @@ are nearly Gaussian, and not to distances, which are skewed where speckle has al
 where it has. Correlations know no sign; the plane returned has a >= 0, and the trajectory settles its sign.
 
 Tilt is nearly invisible to decorrelation: a focused beam's wavefront is curved about the focus, so that
-turning moves speckle at every depth as it moves it there, and patches see a + c (y - yc - pivot) with a pivot
-that grows with depth just as y does. The fit keeps what little is seen, and `speckle3d.motion.slopes` says
-what it is worth.
+turning moves the speckle of all depths alike, and patches see a + c (y - yc - pivot) with a pivot that grows
+with depth as y does. The fit keeps what is seen; `speckle3d.motion.uncertainty` weighs it.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels.planes import fit_correlation_plane
-from speckle3d.motion.distances import DistanceEstimator, EchoModel
+from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
 
 CROSSING_EVIDENCE = 6.0
 """Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
 OUTLYING = 9.0
-"""Squared deviations beyond which a patch speaks no more against a plane. On the line where frames cross,
-correlation is known to a few thousandths; one patch there that lost it would outvote all others."""
+"""Squared deviations at which a patch's misfit is capped. On the line where frames cross, correlation is known
+to a few thousandths; one patch that lost it there would outvote all others."""
 LOOSE_SLOPE = 0.05
 """Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
 SENSED_SLOPE = 5e-4
@@ -36,8 +35,8 @@ WELL_FITTED = 0.9
 ROUNDS = 12
 LEAST_PATCHES = 6
 NEAR_MM = 0.15
-"""Where fits start at the least: correlation is flat at zero, and frames that are farther apart than supposed
-look tilted from there."""
+"""Least distance at which fits start: correlation is flat at zero, and from there frames that are farther apart
+look tilted."""
 
 
 class PlaneSettings(BaseModel):
@@ -227,3 +226,41 @@ class PlaneFitter:
                 slope = middle / np.abs(lateral - centre).mean()
                 starts.append(np.array([-slope * centre, slope, 0.0]))
         return [(start, np.zeros(3), loose) for start in starts]
+
+
+def consistent_subset(
+    distances: PatchDistances, raised_mm: FloatArray, support_sigma: float = 1.0, either_side: bool = True
+) -> BoolArray:
+    """Patches whose distances agree on one plane of the orientation that the sensor measured.
+
+    Every patch in turn places the plane, through +d and through -d; the placement that most others agree
+    with, in magnitude and within `support_sigma` of their own deviations, keeps its supporters.
+
+    Parameters
+    ----------
+    raised_mm : ndarray, shape (p,)
+        How much farther each patch is than the image's centre, by the sensor's relative rotation.
+    either_side : bool
+        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, "Sensorless drift correction using
+       orientation measurements", figure 4.
+    """
+    d, sigma = distances.distance_mm, distances.sigma_mm
+    known = np.flatnonzero(np.isfinite(d))
+    support = np.zeros(len(d), dtype=bool)
+    if known.size == 0:
+        return support
+    raised = raised_mm[known]
+    sides = (1.0, -1.0) if either_side else (1.0,)
+    offsets = np.concatenate([side * d[known] - raised for side in sides])
+    distance = np.abs(offsets[:, None] + raised)
+    error = np.abs(distance - d[known]) / sigma[known]
+    agree = error <= support_sigma
+    # Among placements of equal support, the one whose supporters lie closest.
+    score = agree.sum(axis=1) - np.where(agree, error, 0.0).sum(axis=1) / (agree.shape[1] * support_sigma + 1)
+    best = int(np.argmax(score))
+    support[known] = agree[best]
+    return support

@@ -184,7 +184,7 @@ def test_patches_that_left_the_image_are_nan_and_the_others_are_not():
 
 def test_frames_of_different_shape_are_refused():
     fixed, moving = pair(0)
-    with pytest.raises(InvalidInputError, match=r"one shape, got \(96, 420\) and \(96, 419\)"):
+    with pytest.raises(InvalidInputError, match=r"\(96, 420\).*\(96, 419\)"):
         match((fixed, moving[:, :-1]))
 
 

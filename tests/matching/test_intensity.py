@@ -160,7 +160,7 @@ def test_full_white_is_one_and_black_is_the_bottom_of_the_range():
 
 @pytest.mark.parametrize("shape", [(6, 1799), (5, 1800), (1800, 6), (1800,), (1, 6, 1800)])
 def test_frames_of_another_shape_are_refused(shape):
-    with pytest.raises(InvalidInputError, match=r"expected a frame of shape \(6, 1800\), got"):
+    with pytest.raises(InvalidInputError, match=r"\(6, 1800\)"):
         extractor().intensity(np.zeros(shape, np.float32))
     bmode = IntensityExtractor(BModeSettings(60.0), ImageGrid(6, 1800, 0.1, 0.1))
     with pytest.raises(InvalidInputError, match=r"\(6, 1800\)"):

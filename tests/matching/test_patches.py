@@ -47,9 +47,9 @@ def test_a_wider_image_has_more_patches_of_the_same_size():
 
 
 def test_an_image_too_small_is_refused_with_both_sizes_named():
-    with pytest.raises(InvalidInputError, match=r"1 x 2 patches of 3\.6 x 3 mm below 2 mm, got 3\.0 mm wide"):
+    with pytest.raises(InvalidInputError, match=r"3\.6 x 3 mm.* 3\.0 mm"):
         lay_patches(ImageGrid(11, 700, 0.3, 0.05))
-    with pytest.raises(InvalidInputError, match=r"and 6\.0 mm deep"):
+    with pytest.raises(InvalidInputError, match=r"6\.0 mm"):
         lay_patches(ImageGrid(64, 121, 0.3, 0.05))
 
 

@@ -133,7 +133,7 @@ def test_too_few_distances_or_too_little_of_the_curve_are_refused(distances, mes
 def test_the_depth_that_lacks_samples_is_named():
     whole = samples(speckle.gaussian_correlation, STEPPED)
     rho = np.where(whole.depth_mm == 16.0, np.nan, whole.correlation)
-    with pytest.raises(InsufficientDataError, match=r"curves at 16\.0 mm depth: .* got 0"):
+    with pytest.raises(InsufficientDataError, match=r"16\.0 mm"):
         fit_curves(speckle.KEY, [replace(whole, correlation=rho)])
 
 

@@ -12,7 +12,7 @@ from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import DistanceEstimator
 from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings
-from speckle3d.motion.slopes import BEYOND_DOUBT, NEAR_MM, UNEVENNESS, SlopeEvidence, weigh_slopes
+from speckle3d.motion.uncertainty import BEYOND_DOUBT, NEAR_MM, UNEVENNESS, SlopeEvidence, weigh_slopes
 
 GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
 PATCHES = lay_patches(GRID)

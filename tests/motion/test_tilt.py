@@ -10,10 +10,9 @@ from speckle3d.core.sweep import BModeSettings, ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import lay_patches
-from speckle3d.motion.decorrelation import PhantomSamples, fit_curves
+from speckle3d.motion.decorrelation import PhantomSamples, effective_distance, fit_curves, fit_tilt_response
 from speckle3d.motion.distances import DistanceEstimator
 from speckle3d.motion.planes import PlaneFitter
-from speckle3d.motion.tilt import effective_distance, fit_tilt_response
 
 DEPTHS_MM = np.arange(5.0, 36.0, 5.0)
 CELLS = 60

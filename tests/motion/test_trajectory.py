@@ -337,7 +337,7 @@ def test_one_false_pair_among_many_is_overruled():
 def test_a_frame_out_of_reach_is_named():
     pairs, truth = random_graph(0)
     cut = kept(pairs, pairs.second != 3)
-    with pytest.raises(InsufficientDataError, match=r"frame 3: .* \(1 of 6 frames so\)"):
+    with pytest.raises(InsufficientDataError, match="frame 3: "):
         solved(cut, len(truth))
     with pytest.raises(InsufficientDataError, match="frame 6: "):
         solved(pairs, 8)

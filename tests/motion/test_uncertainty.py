@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.motion.slopes import SlopeEvidence
-from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, SHARED, pose_covariance
+from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, SHARED, SlopeEvidence, pose_covariance
 
 CENTRE_MM = np.array([7.0, 22.0, 0.0])
 Z_MM = np.concatenate([np.linspace(0, 10, 51), np.linspace(10, 0, 51)[1:]])
