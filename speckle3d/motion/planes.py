@@ -24,8 +24,8 @@ from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistan
 CROSSING_EVIDENCE = 6.0
 """Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
 OUTLYING = 9.0
-"""Squared deviations at which a patch's misfit is capped. On the line where frames cross, correlation is known
-to a few thousandths; one patch that lost it there would outvote all others."""
+"""Squared deviations at which a patch's misfit is capped. Where frames cross, correlation is known to a few
+thousandths; one patch that lost it there would outvote all others."""
 LOOSE_SLOPE = 0.05
 """Standard deviation of the slopes' prior, 3 degrees between frames that share speckle: keeps fits finite."""
 SENSED_SLOPE = 5e-4
@@ -35,8 +35,8 @@ WELL_FITTED = 0.9
 ROUNDS = 12
 LEAST_PATCHES = 6
 NEAR_MM = 0.15
-"""Least distance at which fits start: correlation is flat at zero, and from there frames that are farther apart
-look tilted."""
+"""Least distance at which fits start: correlation is flat at zero, and seen from there, frames that are farther
+apart look tilted."""
 
 
 class PlaneSettings(BaseModel):
