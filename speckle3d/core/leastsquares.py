@@ -18,7 +18,7 @@ from speckle3d.core.errors import InvalidInputError
 
 Residuals = Callable[[FloatArray], FloatArray]
 
-_MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
 
@@ -128,7 +128,7 @@ def levenberg_marquardt(
 
 def robust_sigma(residuals: FloatArray, smallest: float = 0.0) -> float:
     """Standard deviation of normal residuals with the same median size, at least `smallest`."""
-    return max(_MAD_TO_SIGMA * float(np.median(np.abs(residuals))), smallest)
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), smallest)
 
 
 def huber_weights(residuals: FloatArray, limit: float = 1.345) -> FloatArray:

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.curves import CurveKey, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
@@ -145,7 +146,7 @@ def _cells(left: FloatArray, expected: FloatArray, of_echo: bool) -> float:
     cells = 60.0
     for _ in range(4):
         variance = correlation_variance(expected, cells, of_echo) + 1e-6
-        cells /= (1.4826 * float(np.median(np.abs(left) / np.sqrt(variance)))) ** 2
+        cells /= robust_sigma(left / np.sqrt(variance)) ** 2
     return cells
 
 
