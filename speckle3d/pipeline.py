@@ -109,7 +109,10 @@ def track(
     images: ImageSink | None = None,
     matched: BlockSource | None = None,
 ) -> Tracked:
-    """Estimate the pose of every frame from the images, and from the orientation-consistent patches if asked.
+    """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
+
+    The second set of poses (`Tracked.subset`) needs an orientation sensor that is calibrated to the image and has
+    readings for all frames.
 
     Parameters
     ----------
@@ -127,12 +130,24 @@ def track(
     matched : callable, optional
         Asked for each block of frames before it is matched here.
 
+    Returns
+    -------
+    Tracked
+
     Raises
     ------
     MismatchError
         If the curves belong to another probe, frequency, sampling or patch size.
     InsufficientDataError
         If too many frames have no speckle in common with others.
+
+    Examples
+    --------
+    >>> import speckle3d as s3
+    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
+    >>> len(tracked.image), tracked.direction_from, bool(tracked.flags.any())
+    (96, 'tracker', False)
     """
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
@@ -302,6 +317,14 @@ def calibrate_curves(
 ) -> DecorrelationCurves:
     """Measure decorrelation curves on phantom sweeps whose positions are known.
 
+    Parameters
+    ----------
+    sweeps : sequence of Sweep
+        Fully developed speckle in steps or by hand; with some that turn, the curves learn what tilt does.
+    config : Config, optional
+    progress : callable, optional
+        Called with frames done and frames in all.
+
     Raises
     ------
     InsufficientDataError
@@ -369,15 +392,44 @@ def correct(
 ) -> dict[str, DriftCorrection]:
     """Correct the drift of the image-based poses in each of `modes`.
 
+    Parameters
+    ----------
+    tracked : Tracked
+    sweep : Sweep
+        From which `tracked` was made.
+    modes : sequence of str
+        Among ``"orientation"`` (three curves) and ``"pose"`` (six).
+    config : Config, optional
+
+    Returns
+    -------
+    dict of str to DriftCorrection
+        By mode; ``poses`` are ``world_from_image`` in the sensor's world.
+
     Raises
     ------
+    InvalidInputError
+        If a mode is unknown.
     InsufficientDataError
         If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, equations 1 to 5.
+
+    Examples
+    --------
+    >>> import speckle3d as s3
+    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
+    >>> corrected = s3.correct(tracked, sweep, ["orientation", "pose"])
+    >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
+    [96, 96]
     """
     settings = config or Config()
     require_modes(sweep, modes)
     done: dict[str, DriftCorrection] = {}
-    # Wander that the sensed orientation shows need not be made up for by cubics.
+    # What wander the sensed orientation shows, cubics need not make up for.
     start = tracked.subset if tracked.subset is not None else tracked.image
     for mode in modes:
         if mode == "pose":
