@@ -111,7 +111,7 @@ def track(
 ) -> Tracked:
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
 
-    The second set of poses (`Tracked.subset`) needs an orientation sensor that is calibrated to the image and has
+    The second set of poses, `Tracked.subset`, needs an orientation sensor calibrated to the image that has
     readings for all frames.
 
     Parameters
