@@ -15,11 +15,12 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.correction.drift import DriftCorrection
+from speckle3d.correction.modes import correct_mode, require_modes
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -36,12 +37,7 @@ from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.decorrelation import fit_curves
-from speckle3d.motion.direction import (
-    orientation_at,
-    orientation_sensor,
-    sensed_orientation,
-    settle_direction,
-)
+from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
 from speckle3d.motion.revisits import find_returns, tie_returns
@@ -354,39 +350,6 @@ def _shifted(progress: Progress | None, before: int, total: int) -> Progress | N
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
-def require_modes(sweep: Sweep, modes: Sequence[str]) -> None:
-    """Check that the sweep has what every drift mode needs, before any work is done.
-
-    Raises
-    ------
-    InvalidInputError
-        If a mode is unknown.
-    InsufficientDataError
-        If its sensor is missing, not calibrated to the image, or covers no frame.
-    """
-    sensors = {
-        "pose": (sweep.tracker, "a tracker in /tracker", "sensor_from_image"),
-        "orientation": (
-            orientation_sensor(sweep),
-            "an orientation sensor in /orientation",
-            "sensor_from_image_wxyz" if sweep.orientation else "sensor_from_image",
-        ),
-    }
-    for mode in modes:
-        if mode not in sensors:
-            raise InvalidInputError(f"expected a drift mode among orientation, pose; got {mode!r}")
-        sensor, wanted, attribute = sensors[mode]
-        where = f"{sweep.name}: drift mode {mode}"
-        if sensor is None:
-            raise InsufficientDataError(f"{where}: expected {wanted}, got none")
-        if sensor.sensor_from_image is None:
-            raise InsufficientDataError(
-                f"{where}: the sensor is not calibrated to the image: it lacks the attribute {attribute}"
-            )
-        if not sensor.covers(sweep.frame_time_s).any():
-            raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
-
-
 def correct(
     tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
 ) -> dict[str, DriftCorrection]:
@@ -428,29 +391,6 @@ def correct(
     """
     settings = config or Config()
     require_modes(sweep, modes)
-    done: dict[str, DriftCorrection] = {}
     # What wander the sensed orientation shows, cubics need not make up for.
     start = tracked.subset if tracked.subset is not None else tracked.image
-    for mode in modes:
-        if mode == "pose":
-            done[mode] = _correct_by_tracker(start, sweep, settings)
-        else:
-            done[mode] = _correct_by_orientation(start, sweep, settings)
-    return done
-
-
-def _correct_by_tracker(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
-    assert sweep.tracker is not None
-    covered = sweep.tracker.covers(sweep.frame_time_s)
-    measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
-    with naming(sweep.name):
-        return correct_pose(poses, measured, covered, sweep.grid.corners_mm, config.drift)
-
-
-def _correct_by_orientation(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
-    sensor = orientation_sensor(sweep)
-    assert sensor is not None
-    covered = sensor.covers(sweep.frame_time_s)
-    rotation = orientation_at(sensor, sweep.frame_time_s[covered])
-    with naming(sweep.name):
-        return correct_orientation(poses, rotation, covered, sweep.grid.centre_mm, config.drift)
+    return {mode: correct_mode(mode, start, sweep, settings.drift) for mode in modes}
