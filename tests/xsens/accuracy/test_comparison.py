@@ -58,8 +58,3 @@ def test_what_orient_gives_is_taken_and_a_log_is_not():
     for wrong in (log, "log.csv"):
         with pytest.raises(InvalidInputError, match="expected TimedRotations or an Orientation"):
             compare_orientations(found, wrong)
-
-
-def test_the_type_of_a_stream_is_a_public_name(python):
-    code = "import sys, xsens; assert 'numpy' not in sys.modules; print(xsens.TimedRotations.__module__)"
-    assert python(code).strip() == TimedRotations.__module__

@@ -374,21 +374,3 @@ def test_the_sensors_own_orientation_is_a_stream():
     assert log.duration_s == pytest.approx(0.3)
     with pytest.raises(InsufficientDataError, match="the sensor's own orientation, got none"):
         ImuLog(np.arange(4.0)).rotations()
-
-
-def test_public_names_are_there_documented_and_loaded_late(python):
-    code = """
-import sys, xsens
-late = not {"numpy", "scipy"} & set(sys.modules)
-documented = all(getattr(xsens, name).__doc__ and name in dir(xsens) for name in xsens.__all__)
-same = set(xsens._HOME) == set(xsens.__all__) and xsens.__all__ == sorted(xsens.__all__)
-print(late, documented, same, {"numba", "h5py"} & set(sys.modules))
-try:
-    xsens.read_lg
-except AttributeError as error:
-    print(error)
-"""
-    assert python(code).splitlines() == [
-        "True True True set()",
-        "module 'xsens' has no attribute 'read_lg'",
-    ]
