@@ -10,8 +10,8 @@ from imu_logs import samples
 
 import speckle3d
 import xsens
-from xsens.logs.read import write_csv
 from xsens.logs.samples import ImuLog
+from xsens.logs.textlogs import write_csv
 
 HEAVY = ("numba", "llvmlite", "h5py", "numpy", "scipy", "SimpleITK", "matplotlib", "pydantic")
 

@@ -19,13 +19,13 @@ from .live.device import DeviceSettings as DeviceSettings
 from .live.monitor import LiveState as LiveState
 from .live.recording import Recorder as Recorder
 from .live.recording import record as record
-from .logs.logparts import Hints as Hints
+from .logs.parts import Hints as Hints
 from .logs.read import parse_stream as parse_stream
 from .logs.read import read_log as read_log
-from .logs.read import write_csv as write_csv
 from .logs.samples import Gap as Gap
 from .logs.samples import ImuLog as ImuLog
 from .logs.samples import TimedRotations as TimedRotations
+from .logs.textlogs import write_csv as write_csv
 from .messages.framing import Framer as Framer
 from .messages.framing import Message as Message
 from .messages.framing import decode as decode

@@ -4,7 +4,8 @@ import pytest
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from xsens.live.device import DeviceError, DeviceSettings, connect, open_port, prepare
-from xsens.messages.catalogue import Configuration, Message, MessageId
+from xsens.messages.control import Configuration, MessageId
+from xsens.messages.framing import Message
 
 pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):

@@ -10,9 +10,10 @@ import pytest
 
 from speckle3d.core.errors import FileError
 from xsens.live.device import DeviceError, DeviceSettings
-from xsens.live.recording import UTC_TIME, RawFile, Recorder, record, utc_message
+from xsens.live.recording import RawFile, Recorder, record
 from xsens.logs.read import read_log
-from xsens.messages.catalogue import Message, MessageId, decode
+from xsens.messages.control import MessageId
+from xsens.messages.framing import decode
 
 pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
@@ -71,8 +72,8 @@ class TestRecording:
         more = {"mt9": [MessageId.EMTS], "mtdata2": [MessageId.OUTPUT_CONFIGURATION_ACK]}.get(sensor.kind, [])
         ack = MessageId.GO_TO_MEASUREMENT_ACK
         data = MessageId.MT_DATA2 if sensor.kind == "mtdata2" else MessageId.MT_DATA
-        assert found == [MessageId.CONFIGURATION, *more, UTC_TIME, ack, data][: len(found)]
-        (told,) = [message.payload for message in messages if message.mid == UTC_TIME]
+        assert found == [MessageId.CONFIGURATION, *more, MessageId.UTC_TIME, ack, data][: len(found)]
+        (told,) = [message.payload for message in messages if message.mid == MessageId.UTC_TIME]
         assert abs(read_utc(told) - before) < timedelta(seconds=5)
 
     def test_each_byte_is_the_operating_systems_as_it_comes(self, sensor, path):
@@ -115,7 +116,9 @@ class TestRecording:
             wait_until(lambda: len(sensor.run) > 20)
             assert recorder.state().interruptions == 1
         assert counters(path) == sent + sensor.run
-        stamps = [read_utc(each.payload) for each in decode(path.read_bytes()) if each.mid == UTC_TIME]
+        stamps = [
+            read_utc(each.payload) for each in decode(path.read_bytes()) if each.mid == MessageId.UTC_TIME
+        ]
         assert 0.3 < (stamps[1] - stamps[0]).total_seconds() < 8.0
 
     def test_a_sensor_that_lost_its_power_is_set_again(self, sensor, path):
@@ -259,8 +262,3 @@ class TestRawFile:
 def read_utc(payload: bytes) -> datetime:
     nanoseconds, year = int.from_bytes(payload[:4], "big"), int.from_bytes(payload[4:6], "big")
     return datetime(year, *payload[6:11], nanoseconds // 1000, tzinfo=UTC)
-
-
-def test_the_time_is_told_as_the_sensors_tell_it():
-    message = utc_message(datetime(2024, 2, 29, 23, 59, 58, 123_456, tzinfo=UTC))
-    assert message == Message(0x61, bytes.fromhex("075bca00 07e8 02 1d 17 3b 3a 07"))

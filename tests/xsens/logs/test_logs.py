@@ -17,17 +17,19 @@ from imu_logs import (
     raw_values,
     samples,
 )
+from imu_messages import calibration_message, configuration_message, items_payload, mtdata_payloads
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedRotations
-from xsens.live.recording import utc_message
-from xsens.logs.read import Hints, parse_stream, read_log, write_csv
+from xsens.logs.parts import Hints
+from xsens.logs.read import parse_stream, read_log
 from xsens.logs.samples import Gap, ImuLog
-from xsens.messages.catalogue import Configuration, MessageId, UnitConfiguration
+from xsens.logs.textlogs import write_csv
+from xsens.messages.control import Configuration, MessageId, UnitConfiguration, utc_message
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
-from xsens.messages.mtdata2 import Item, encode_items
+from xsens.messages.mtdata2 import Item
 
 UNIT = calibration()
 COUNTED = OutputSettings.COUNTER
@@ -68,7 +70,7 @@ def test_a_file_of_the_mt9_software(s, tmp_path):
 def test_lost_records_are_gaps_and_wrapped_counters_are_none(s):
     records = mt9_records(s, UNIT, first=65500)
     del records[120:123], records[50]
-    log = parse_stream(encode(UNIT.message()) + b"".join(records))
+    log = parse_stream(encode(calibration_message(UNIT)) + b"".join(records))
     assert log.gaps == (
         Gap(49, 1, pytest.approx(2 / 256)),
         Gap(118, 3, pytest.approx(4 / 256)),
@@ -81,7 +83,9 @@ def test_lost_records_are_gaps_and_wrapped_counters_are_none(s):
 
 def test_raw_counts_with_their_counter_last_are_told_apart(s):
     layout = DataLayout(OutputMode.RAW, COUNTED)
-    data = encode(UNIT.message()) + b"".join(framed(layout.encode(raw_values(s, UNIT, 300))))
+    data = encode(calibration_message(UNIT)) + b"".join(
+        framed(mtdata_payloads(layout, raw_values(s, UNIT, 300)))
+    )
     assert parse_stream(data).counter[0] == 300
 
 
@@ -124,7 +128,7 @@ def test_matrices_are_turned_if_gravity_says_so(s):
     layout = DataLayout(EVERYTHING, COUNTED | OutputSettings.MATRIX)
     values = legacy_values(s, layout)
     values["matrix"] = np.swapaxes(values["matrix"].reshape(-1, 3, 3), 1, 2).reshape(-1, 9)
-    log = parse_stream(configured(layout) + b"".join(framed(layout.encode(values))))
+    log = parse_stream(configured(layout) + b"".join(framed(mtdata_payloads(layout, values))))
     assert_same_samples(log, s, atol=2e-6)
     assert any("taken by columns" in note for note in log.notes)
 
@@ -164,10 +168,10 @@ def test_one_of_several_units_behind_a_master(s):
     alone = DataLayout(OutputMode.CALIBRATED, OutputSettings.NO_MAGNETOMETER)
     values = legacy_values(s, alone, first=7)
     far = {name: 2.0 * np.asarray(v) for name, v in values.items()}
-    counter = DataLayout(OutputMode.RAW, COUNTED).encode(raw_values(s, UNIT, 7))[:, -2:]
-    payloads = np.concatenate((counter, alone.encode(values), alone.encode(far)), axis=1)
+    counter = mtdata_payloads(DataLayout(OutputMode.RAW, COUNTED), raw_values(s, UNIT, 7))[:, -2:]
+    payloads = np.concatenate((counter, mtdata_payloads(alone, values), mtdata_payloads(alone, far)), axis=1)
     units = tuple(UnitConfiguration(0x100 + i, alone.size, alone.mode, alone.settings) for i in range(2))
-    data = encode(Configuration(0x1, 1152, 0, units).message()) + b"".join(framed(payloads))
+    data = encode(configuration_message(Configuration(0x1, 1152, 0, units))) + b"".join(framed(payloads))
     with pytest.raises(InvalidInputError, match=r"a choice among 2 units .*: 00000100, 00000101\)"):
         parse_stream(data)
     for unit, factor in ((0, 1.0), (1, 2.0)):
@@ -197,10 +201,10 @@ def test_a_clock_that_wraps_round_goes_on(s):
 
 
 def test_messages_without_a_measurement_are_no_samples_and_no_loss(s):
-    payloads = [encode_items(items_of(s, i, first=i >= 100)) for i in range(200)]
+    payloads = [items_payload(items_of(s, i, first=i >= 100)) for i in range(200)]
     # Its time is earlier than that of the sample before, as a satellite receiver's is.
     payloads.insert(
-        100, encode_items([Item(0x1060, (9_500,)), Item(0x1020, (100,)), Item(0x7010, bytes(94))])
+        100, items_payload([Item(0x1060, (9_500,)), Item(0x1020, (100,)), Item(0x7010, bytes(94))])
     )
     log = parse_stream(b"".join(framed(payloads, MessageId.MT_DATA2)))
     assert (len(log), log.gaps) == (200, ())
@@ -209,7 +213,7 @@ def test_messages_without_a_measurement_are_no_samples_and_no_loss(s):
 
 def test_items_at_lower_rates_are_missing_in_between(s):
     payloads = [
-        encode_items(
+        items_payload(
             [item for item in items_of(s, i) if i % 4 == 0 or item.identifier not in (0xC020, 0x2010)]
         )
         for i in range(200)
@@ -234,7 +238,7 @@ def test_increments_stand_in_for_rates(s):
     period_s = 0.01
     turns = Rotation.from_rotvec(s["gyroscope_rad_s"] * period_s).as_quat(scalar_first=True)
     payloads = [
-        encode_items(
+        items_payload(
             [
                 Item(0x1020, (i,)),
                 Item(0x1060, (100 * i,)),
@@ -255,7 +259,7 @@ def test_a_quaternion_that_is_none_is_missing(s):
     payloads[3][-1] = Item(0x2010, (0.0, 0.0, 0.0, 0.0))
     payloads[4][-1] = Item(0x2010, (float("nan"), 0.0, 0.0, 1.0))
     payloads[5][2] = Item(0x4020, (float("inf"), 0.0, 0.0))
-    log = parse_stream(b"".join(framed(map(encode_items, payloads), MessageId.MT_DATA2)))
+    log = parse_stream(b"".join(framed(map(items_payload, payloads), MessageId.MT_DATA2)))
     assert np.flatnonzero(~log.oriented).tolist() == [3, 4]
     assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [5]
 
@@ -288,7 +292,7 @@ def test_a_sensor_plugged_in_again_is_away_as_long_as_the_computer_says(s):
 
 def test_messages_of_another_kind_or_unit_are_left_out_and_told(s):
     data = b"".join(mtdata2_messages(s)) + encode(Message(MessageId.MT_DATA, bytes(22)))
-    data += encode(Message(MessageId.MT_DATA2, encode_items(items_of(s, 3)), bid=2))
+    data += encode(Message(MessageId.MT_DATA2, items_payload(items_of(s, 3)), bid=2))
     log = parse_stream(data)
     assert len(log) == 200
     assert log.notes == ("2 data messages of another kind or unit were left out",)
@@ -300,7 +304,7 @@ def test_a_stream_without_data_says_what_it_has():
     ):
         parse_stream(encode(Message(MessageId.WAKE_UP)))
     with pytest.raises(InvalidInputError, match=r"^stream: expected measurements with a time in 1 MTData2"):
-        parse_stream(encode(Message(MessageId.MT_DATA2, encode_items([Item(0x1020, (1,))]))))
+        parse_stream(encode(Message(MessageId.MT_DATA2, items_payload([Item(0x1020, (1,))]))))
 
 
 # What holds for every kind

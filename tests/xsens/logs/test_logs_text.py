@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from imu_logs import WORLDS, samples
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.decimals import read_decimals
-from xsens.logs.read import Hints, parse_text, read_log
+from xsens.logs.parts import Hints
+from xsens.logs.read import read_log
+from xsens.logs.textlogs import parse_text
 from xsens.logs.texttables import read_table
 
 VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
@@ -232,52 +233,16 @@ def test_tables_are_read_quickly_as_they_are_read_cell_by_cell(rows, separator, 
     assert (table.names, table.left_out) == (("ab", "cd", "ef"), 0)
 
 
-@st.composite
-def decimals(draw):
-    """Columns of numbers with a few decimals, some blank, as text."""
-    places = draw(st.lists(st.integers(0, 9), min_size=2, max_size=4))
-    rows = draw(st.integers(1, 20))
-    blank = st.booleans() if draw(st.booleans()) else st.just(False)
-    return [
-        ["" if draw(blank) else f"{draw(st.floats(-9999, 9999)):.{n}f}" for n in places] for _ in range(rows)
-    ]
+@pytest.mark.parametrize("cell", ["-", ".", "1-", "--1", "1.2.3", "1 2", "é", "# 2", "-nan(ind)", " "])
+def test_words_are_missing_and_leave_the_other_cells_as_they_are(cell):
+    table = read_table(f"ab;cd;ef\n1.5;2.5;\n{cell};3.5;-1e-3\n+0.5;nan;inf\n", frozenset({"ab", "cd"}))
+    expected = [[1.5, 2.5, np.nan], [np.nan, 3.5, -0.001], [0.5, np.nan, np.inf]]
+    np.testing.assert_array_equal(table.values, expected)
 
 
-@settings(deadline=None, max_examples=100)
-@given(decimals())
-def test_plain_decimals_are_to_the_bit_what_they_are_one_by_one(rows):
-    body = "\n".join(";".join(row) for row in rows).encode()
-    found = read_decimals(body, ";", len(rows[0]))
-    if found is not None:
-        np.testing.assert_array_equal(found, [[float(cell or "nan") for cell in row] for row in rows])
-    if all(cell for row in rows for cell in row):
-        assert found is not None
-
-
-@pytest.mark.parametrize(
-    "cell",
-    [
-        "-",
-        ".",
-        "-.",
-        "1e3",
-        "nan",
-        "1-",
-        "--1",
-        "1.2.3",
-        "+1",
-        "0x1",
-        "1 2",
-        "é",
-        "12345678901234567.8",
-        "12.34",
-    ],
-)
-def test_cells_that_are_no_plain_decimals_are_left_to_others(cell):
-    """12.34 because its point lies elsewhere than its column's others."""
-    assert read_decimals(f"1.5,2.5\n{cell},3.5\n0.5,1.5".encode(), ",", 2) is None
-    assert read_decimals(b"12345678901234567,2", ",", 2) is None
-    assert read_decimals(b"1.5,2.5\n1.5\n1.5,2.5,1.0", ",", 2) is None
+def test_columns_may_be_aligned_with_blanks():
+    table = read_table("ab  cd   ef\n 1   2.5   3\n10  -2   30\n1 2\n", frozenset({"ab", "cd", "ef"}))
+    assert (table.values.tolist(), table.left_out) == ([[1.0, 2.5, 3.0], [10.0, -2.0, 30.0]], 1)
 
 
 # Columns that are not understood, and readings that are none

@@ -14,17 +14,20 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
+from imu_messages import items_payload
 
 from speckle3d.core.errors import FileError, Speckle3DError
-from xsens.logs.read import MOST_BYTES, parse_stream, parse_text, read_log, write_csv
+from xsens.logs.read import MOST_BYTES, parse_stream, read_log
 from xsens.logs.samples import ImuLog
-from xsens.messages.catalogue import Configuration, MessageId
+from xsens.logs.textlogs import parse_text, write_csv
+from xsens.messages.control import Configuration, MessageId
 from xsens.messages.framing import Framer, Message, encode, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
-from xsens.messages.mtdata2 import Item, decode_items, encode_items
+from xsens.messages.mtdata2 import Item, decode_items
 from xsens.messages.rawcounts import RawCalibration
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
+assert CORPUS, "the corpus lies beside this file"
 SECONDS = float(os.environ.get("FUZZ_SECONDS", "2"))
 """For each kind of input, at most; with ``FUZZ_SECONDS=600`` in the environment, ten minutes each."""
 
@@ -156,7 +159,7 @@ def resealed(draw):
         st.binary(max_size=200),
         st.binary(min_size=22, max_size=22),
         st.binary(min_size=168, max_size=168),
-        st.lists(items, max_size=6).map(encode_items),
+        st.lists(items, max_size=6).map(items_payload),
     )
     messages = draw(st.lists(st.builds(Message, mids, payload, st.just(0xFF)), max_size=12))
     return b"".join(map(encode, messages))
@@ -271,7 +274,7 @@ def many_arrangements():
     pieces = []
     for _ in range(SIZE // 50):
         drawn = zip(rng.choice(identifiers, 3), rng.choice(sizes, 3), strict=True)
-        pieces.append(encode(Message(0x36, encode_items(Item(int(i), bytes(int(n))) for i, n in drawn))))
+        pieces.append(encode(Message(0x36, items_payload(Item(int(i), bytes(int(n))) for i, n in drawn))))
     return b"".join(pieces)
 
 

@@ -1,67 +1,28 @@
-"""What the messages are called, when they may be sent, and what the short ones say.
+"""Message ids, and the content of control messages: errors, device ids, configurations.
 
-Of request and reply, the reply's id is one more. Measured data are in `xsens.messages.mtdata` (legacy) and
-`xsens.messages.mtdata2`; framing is in `xsens.messages.framing`.
+Measured data are in `xsens.messages.mtdata` (legacy) and `xsens.messages.mtdata2`; framing is in
+`xsens.messages.framing`.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
-from enum import Enum, IntEnum
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import IntEnum
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.framing import MASTER, Framer, Frames, Message, decode, encode, find_frames
-
-__all__ = [
-    "BAUD_CODES",
-    "MASTER",
-    "NOT_OUTPUT_BUT_ASKED_FOR",
-    "Configuration",
-    "Framer",
-    "Frames",
-    "Message",
-    "MessageId",
-    "OutputItem",
-    "State",
-    "UnitConfiguration",
-    "decode",
-    "device_id",
-    "encode",
-    "error_of",
-    "find_frames",
-    "output_configuration",
-    "reply_to",
-    "request_of",
-    "set_output_configuration",
-    "state_after",
-    "valid_in",
-]
+from xsens.messages.framing import Message
 
 BASE_RATE_HZ = 115200
 """Ticks per second of the sampling period."""
 
 NOT_OUTPUT_BUT_ASKED_FOR = 0xFFFF
-"""Skip factor with which the sensor sends data only on `MessageId.REQ_DATA`."""
-
-BAUD_CODES = {
-    460800: 0x00,
-    230400: 0x01,
-    115200: 0x02,
-    76800: 0x03,
-    57600: 0x04,
-    38400: 0x05,
-    28800: 0x06,
-    19200: 0x07,
-    14400: 0x08,
-    9600: 0x09,
-    921600: 0x80,
-}
-"""What the sensors call their baud rates."""
+"""Skip factor with which the sensor sends data only in answer to `MessageId.REQ_DATA`."""
 
 
 class MessageId(IntEnum):
-    """Message ids, of requests and data; a reply's is one more than its request's."""
+    """Message ids of requests, replies and data; a reply's is its request's plus one."""
 
     REQ_DID = 0x00
     DEVICE_ID = 0x01
@@ -89,6 +50,7 @@ class MessageId(IntEnum):
     RESET = 0x40
     RESET_ACK = 0x41
     ERROR = 0x42
+    UTC_TIME = 0x61
     FILTER_PROFILE = 0x64
     REQ_EMTS = 0x90
     EMTS = 0x91
@@ -103,45 +65,9 @@ class MessageId(IntEnum):
     SKIP_FACTOR_ACK = 0xD5
 
 
-class State(Enum):
-    """What the sensor is doing: it takes settings in the one state and sends data in the other."""
-
-    CONFIGURATION = "configuration"
-    MEASUREMENT = "measurement"
-
-
-_IN_BOTH = {MessageId.GO_TO_CONFIG, MessageId.RESET, MessageId.RESET_ORIENTATION, MessageId.REQ_DID}
-_WHILE_MEASURING = {MessageId.REQ_DATA}
-_STATE_AFTER: dict[int, State] = {
-    MessageId.GO_TO_MEASUREMENT_ACK: State.MEASUREMENT,
-    MessageId.MT_DATA: State.MEASUREMENT,
-    MessageId.MT_DATA2: State.MEASUREMENT,
-    MessageId.WAKE_UP_ACK: State.CONFIGURATION,
-    MessageId.GO_TO_CONFIG_ACK: State.CONFIGURATION,
-}
-
-
-def valid_in(request: int, state: State) -> bool:
-    """Whether the sensor heeds `request`, a message id, in `state`."""
-    if request in _IN_BOTH:
-        return True
-    return (request in _WHILE_MEASURING) == (state is State.MEASUREMENT)
-
-
-def state_after(message: Message, state: State) -> State:
-    """The sensor's state once it has sent `message`, `state` being the one before."""
-    return _STATE_AFTER.get(message.mid, state)
-
-
 def reply_to(request: int) -> int:
     """Message id of the answer to `request`."""
     return request + 1
-
-
-def request_of(message: Message) -> int | None:
-    """Which request `message` answers; None if it is data, an error or unasked for."""
-    unasked = {MessageId.MT_DATA, MessageId.MT_DATA2, MessageId.ERROR, MessageId.WAKE_UP}
-    return None if message.mid in unasked or message.mid % 2 == 0 else message.mid - 1
 
 
 _ERRORS = {
@@ -156,29 +82,29 @@ _ERRORS = {
 
 
 def error_of(message: Message) -> str:
-    """What an error message of the sensor says."""
+    """Text of an error message of the sensor."""
     code = _exactly(message, 1)[0]
     return f"error {code}: {_ERRORS.get(code, 'not documented')}"
 
 
 def device_id(message: Message) -> int:
-    """The unit's number, from any message that begins with it (DeviceID, InitMTResults, configuration)."""
+    """Serial number of the unit, from a message that begins with it (DeviceID, configuration)."""
     return int.from_bytes(_at_least(message, 4)[:4], "big")
 
 
 @dataclass(frozen=True)
 class UnitConfiguration:
-    """What one unit sends.
+    """Output of one unit.
 
     Attributes
     ----------
     device_id : int
     data_length : int
-        Bytes of its part of an MTData message.
+        Bytes of the unit's part of an MTData message.
     output_mode, output_settings : int
         See `xsens.messages.mtdata`.
     reserved : bytes
-        Eight bytes whose meaning is not documented, kept.
+        Eight bytes whose meaning is not documented.
     """
 
     device_id: int
@@ -199,9 +125,9 @@ class Configuration:
     Attributes
     ----------
     device_id : int
-        Of the unit, or of the master where there are several.
+        Of the unit, or of the master if there are several units.
     period : int
-        Of sampling, in 1/115200 s.
+        Sampling period, in 1/115200 s.
     skip_factor : int
         Samples left out between two that are sent.
     units : tuple of UnitConfiguration
@@ -225,7 +151,7 @@ class Configuration:
 
     @property
     def rate_hz(self) -> float:
-        """Messages per second; NaN if sent only when asked for."""
+        """Messages per second; NaN if they are sent only on request."""
         if self.period == 0 or self.skip_factor == NOT_OUTPUT_BUT_ASKED_FOR:
             return float("nan")
         return BASE_RATE_HZ / (self.period * (self.skip_factor + 1))
@@ -239,24 +165,6 @@ class Configuration:
         units = tuple(UnitConfiguration(*fields) for fields in _UNIT.iter_unpack(payload[_HEAD.size :]))
         number, period, skip, mode, sync_skip, offset, date, time, first, second, _ = head
         return cls(number, period, skip, units, mode, sync_skip, offset, date, time, (first, second))
-
-    def message(self) -> Message:
-        """Encode."""
-        head = (self.device_id, self.period, self.skip_factor, self.sync_mode, self.sync_skip)
-        texts = (self.sync_offset, self.date, self.time, *self.reserved, len(self.units))
-        units = (
-            _UNIT.pack(u.device_id, u.data_length, u.output_mode, u.output_settings, u.reserved)
-            for u in self.units
-        )
-        return Message(MessageId.CONFIGURATION, _HEAD.pack(*head, *texts) + b"".join(units))
-
-    def with_output(self, mode: int, settings: int, data_length: int) -> Configuration:
-        """The same with every unit set to send `mode` in the manner of `settings`."""
-        units = (
-            replace(u, output_mode=mode, output_settings=settings, data_length=data_length)
-            for u in self.units
-        )
-        return replace(self, units=tuple(units))
 
 
 @dataclass(frozen=True)
@@ -276,7 +184,7 @@ class OutputItem:
 
 
 def output_configuration(message: Message) -> tuple[OutputItem, ...]:
-    """What an MTData2 sensor says, or is told, to send."""
+    """Items that an MTData2 sensor is configured to send, from its answer or a request."""
     if len(message.payload) % 4:
         raise InvalidInputError(
             f"output configuration: expected whole items of 4 bytes, got {len(message.payload)} bytes"
@@ -285,9 +193,32 @@ def output_configuration(message: Message) -> tuple[OutputItem, ...]:
 
 
 def set_output_configuration(items: tuple[OutputItem, ...]) -> Message:
-    """Tell an MTData2 sensor what to send; without items, ask it."""
+    """Request that sets the items an MTData2 sensor sends; without items, one that asks for them."""
     payload = b"".join(struct.pack(">HH", item.identifier, item.rate_hz) for item in items)
     return Message(MessageId.OUTPUT_CONFIGURATION, payload)
+
+
+_UTC = struct.Struct(">IH6B")
+_UTC_ALL_VALID = 7
+
+
+def utc_message(now: datetime | None = None) -> Message:
+    """The computer's time in the form in which the sensors send theirs; now by default."""
+    t = now or datetime.now(UTC)
+    fields = (t.microsecond * 1000, t.year, t.month, t.day, t.hour, t.minute, t.second, _UTC_ALL_VALID)
+    return Message(MessageId.UTC_TIME, _UTC.pack(*fields))
+
+
+def utc_time_s(message: Message) -> float:
+    """Seconds since 1970 of a UTC message; NaN if it is another one or holds no valid date."""
+    if message.mid != MessageId.UTC_TIME or len(message.payload) != _UTC.size:
+        return float("nan")
+    nanosecond, year, month, day, hour, minute, second, _ = _UTC.unpack(message.payload)
+    try:
+        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+        return float(whole.timestamp() + nanosecond * 1e-9)
+    except (ValueError, OverflowError):
+        return float("nan")
 
 
 def _at_least(message: Message, size: int) -> bytes:
