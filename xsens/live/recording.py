@@ -1,9 +1,9 @@
 """Record a live sensor to a file that survives a crash, unplugging and plugging in again.
 
 Bytes are appended to the file as they arrive, before they are decoded: ending the program in any way loses
-only what the sensor has not yet sent. The file holds the sensor's own messages. Each stretch of measuring begins
-with its configuration, its calibration, and the time of the computer's clock (as a UTC message), by which a
-reader can tell how long the sensor was disconnected.
+only what the sensor has not yet sent. The file holds the sensor's own messages. Each stretch of measuring
+begins with its configuration, its calibration, and the time of the computer's clock (as a UTC message), by
+which a reader can tell how long the sensor was disconnected.
 """
 
 from __future__ import annotations

@@ -145,8 +145,8 @@ def _table(
 def _numbers(lines: list[str], separator: str, count: int) -> FloatArray:
     """Numbers of lines of `count` cells each, shape (lines, count), NaN where a cell is no number.
 
-    `numpy.loadtxt` refuses blank cells, which are then filled in, and words; if there are words, all cells are
-    read one by one, which takes ten times as long.
+    `numpy.loadtxt` refuses blank cells, which are then filled in, and words; if there are words, all cells
+    are read one by one, which takes seven times as long.
     """
     delimiter = None if separator == " " else separator
     with suppress(ValueError):
