@@ -1,4 +1,4 @@
-"""Settings of a mechanism that holds the probe at known orientations, as comma-separated text.
+"""Read the settings of a mechanism that holds the probe at known orientations from comma-separated text.
 
 ::
 
@@ -7,9 +7,9 @@
     -16.4,-5.5,0,12.0,14.5
     -14.5,-5.5,0,17.0,19.5
 
-Degrees. The columns may be in any order and separated by commas, semicolons, tabs or blanks; ``roll`` may be
-missing and is then 0; ``time_s`` is the sensor's clock, when the mechanism had come to rest, and ``until_s``
-when it left. Without a header the columns are tilt, yaw and, if there is a third, roll.
+Angles are in degrees. The columns may be in any order and separated by commas, semicolons, tabs or blanks;
+``roll`` may be missing and is then 0; on the sensor's clock, ``time_s`` is when the mechanism came to rest
+and ``until_s`` when it left. Without a header the columns are tilt, yaw and, if there is a third, roll.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from speckle3d.core.streams import TimedRotations
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
 
 _LARGEST_BYTES = 16 * 2**20
-"""A mechanism set by hand or motor to a quarter of a million orientations: no file of settings is larger."""
+"""Enough for a quarter of a million orientations, more than a mechanism is set to by hand or motor."""
 
 _AXIS = {"roll": "Z", "yaw": "Y", "tilt": "X"}
 
@@ -44,9 +44,9 @@ class MechanismSettings:
     Attributes
     ----------
     base_from_image : Rotation, length n
-        The probe as set, seen from the mechanism's base.
+        The probe's orientation as set, relative to the mechanism's base.
     time_s, until_s : ndarray, shape (n,), optional
-        On the sensor's clock, from when to when the mechanism stood still; without `until_s` a moment.
+        Start and end of the mechanism's standstill, on the sensor's clock; without `until_s` a moment.
     """
 
     base_from_image: Rotation
@@ -90,7 +90,7 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     FileError
         If the file cannot be read.
     InvalidInputError
-        Naming the file and the line that is not what it must be.
+        With file and line, if the text is not as described.
     """
     sequence = _sequence(turns)
     text = _read(Path(path))
@@ -105,12 +105,13 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
 
 
 def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
-    """The sensor's reading for each setting, averaged over the time the mechanism stood still.
+    """Reading of the sensor for each setting, averaged over the time the mechanism stood still.
 
     Raises
     ------
     InsufficientDataError
-        If the settings have no times and are not as many as the readings, or the sensor has no reading there.
+        If the sensor has no reading at the time of a setting, or the settings have no times and their number
+        is not that of the readings.
     """
     if settings.time_s is None:
         if len(sensor) != len(settings):
@@ -168,7 +169,7 @@ def _table(text: str, where: str) -> dict[str, FloatArray]:
 
 
 def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and cells of the lines that say something."""
+    """Line numbers and cells of the lines that are not empty or comments."""
     for at, line in enumerate(text.splitlines(), 1):
         content = line.partition("#")[0].strip()
         if not content:

