@@ -56,11 +56,9 @@ def _packed(item):
 
 def configuration_message(c):
     """The answer to a request for the configuration."""
-    head = (c.device_id, c.period, c.skip_factor, c.sync_mode, c.sync_skip, c.sync_offset, c.date, c.time)
-    payload = struct.pack(">IHHHHI8s8s32s32sH", *head, *c.reserved, len(c.units))
+    payload = struct.pack(">IHH88xH", c.device_id, c.period, c.skip_factor, len(c.units))
     for u in c.units:
-        unit = (u.device_id, u.data_length, u.output_mode, u.output_settings, u.reserved)
-        payload += struct.pack(">IHHI8s", *unit)
+        payload += struct.pack(">IHHI8x", u.device_id, u.data_length, u.output_mode, u.output_settings)
     return Message(MessageId.CONFIGURATION, payload)
 
 

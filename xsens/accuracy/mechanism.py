@@ -19,15 +19,15 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.streams import TimedRotations
+from xsens.logs.read import read_bounded
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
 
@@ -88,20 +88,18 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     Raises
     ------
     FileError
-        If the file cannot be read.
+        If the file cannot be read, is no file, or is larger than 16 MB.
     InvalidInputError
         With file and line, if the text is not as described.
     """
     sequence = _sequence(turns)
-    text = _read(Path(path))
+    text = read_bounded(path, _LARGEST_BYTES).decode("utf-8-sig", errors="replace")
     table = _table(text, str(path))
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
     order = "".join(_AXIS[name] for name in sequence)
     rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
-    try:
+    with naming(str(path)):
         return MechanismSettings(rotation, table.get("time_s"), table.get("until_s"))
-    except InvalidInputError as error:
-        raise type(error)(f"{path}: {error}") from error
 
 
 def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
@@ -138,17 +136,6 @@ def _sequence(turns: str) -> list[str]:
     if sorted(names) != sorted(_AXIS):
         raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
     return names
-
-
-def _read(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_BYTES + 1)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(data) > _LARGEST_BYTES:
-        raise InvalidInputError(f"{path}: expected at most {_LARGEST_BYTES} bytes of settings, got more")
-    return data.decode("utf-8-sig", errors="replace")
 
 
 def _table(text: str, where: str) -> dict[str, FloatArray]:

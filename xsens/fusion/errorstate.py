@@ -21,7 +21,6 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -49,27 +48,6 @@ _REST_BIAS_RAD = math.radians(0.03)
 _REST_NOISE = 0.1
 """Random walk of a resting sensor's attitude, as a fraction of the gyroscope's. The gyroscope is not
 integrated at rest; this allows for turning too slow to notice."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The filter at the end of an increment.
-
-    Attributes
-    ----------
-    matrix : ndarray, shape (3, 3)
-        World from sensor.
-    bias_rad_s : ndarray, shape (3,)
-    sd_rad : ndarray, shape (3,)
-        Standard deviation of the attitude about the world's axes.
-    resting, disturbed : bool
-    """
-
-    matrix: FloatArray
-    bias_rad_s: FloatArray
-    sd_rad: FloatArray
-    resting: bool
-    disturbed: bool
 
 
 class ErrorStateFilter:
@@ -128,10 +106,10 @@ class ErrorStateFilter:
         """Gyroscope bias, shape (3,), by all observations."""
         return self._heading_bias if self._magnetic else self.bias
 
-    def snapshot(self) -> Snapshot:
-        """Copy of the present estimate."""
-        sd = np.sqrt(np.diag(self.kalman.P)[ANGLE])
-        return Snapshot(self.matrix, self.heading_bias.copy(), sd, self.resting, self.disturbed)
+    @property
+    def sd_rad(self) -> FloatArray:
+        """Standard deviation of the attitude about the world's axes, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.kalman.P)[ANGLE]))
 
     def advance(self, increment: Increment) -> None:
         """Predict over one increment and correct by its observations."""

@@ -112,17 +112,16 @@ class OnlineFilter:
         kalman = self._kalman
         if kalman is None:
             return None
-        snapshot = kalman.snapshot()
-        matrix = snapshot.matrix
-        if not snapshot.resting:
+        matrix, bias = kalman.matrix, kalman.heading_bias
+        if not kalman.resting:
             for each in self._pending:
-                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - snapshot.bias_rad_s) * each.step_s[0])
+                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - bias) * each.step_s[0])
         return OnlineState(
             Rotation.from_matrix(matrix),
-            snapshot.sd_rad,
-            snapshot.bias_rad_s,
-            snapshot.disturbed,
-            snapshot.resting,
+            kalman.sd_rad,
+            bias.copy(),
+            kalman.disturbed,
+            kalman.resting,
             kalman.started,
         )
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
@@ -114,7 +112,9 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, smooth)
-    joined = _Result(*(np.concatenate(parts) for parts in zip(*map(_fields, results), strict=True)))
+    joined = _Result(
+        *(np.concatenate(parts) for parts in zip(*(vars(each).values() for each in results), strict=True))
+    )
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
@@ -218,7 +218,3 @@ def _per_sample(
     counts = [len(times) for times in done.time_s]
     each = np.repeat(np.arange(len(counts)), counts)
     return _Result(np.concatenate(wxyz), sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
-
-
-def _fields(result: _Result) -> tuple[npt.NDArray[Any], ...]:
-    return result.wxyz, result.sd_rad, result.bias_rad_s, result.disturbed, result.resting

@@ -63,10 +63,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     """
     source = log.source or "log"
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
-        lacking = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
-        none = " and ".join(f"no {name}" for name, values in lacking.items() if values is None)
-        why = "".join(f"; {note}" for note in log.notes if note.startswith("columns not understood"))
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {none}{why}")
+        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {_lacking(log)}")
     used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
     force = log.accelerometer_m_s2[used]
     there = np.isfinite(force).all(axis=1)
@@ -94,6 +91,13 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         notes.append(against)
     step_s = np.concatenate([[np.median(steps)], steps])
     return used, Samples(step_s, log.gyroscope_rad_s[used], force, field), notes
+
+
+def _lacking(log: ImuLog) -> str:
+    """Names of the missing sensors, and the note on columns that may have been meant for them."""
+    vectors = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
+    none = " and ".join(f"no {name}" for name, values in vectors.items() if values is None)
+    return none + "".join(f"; {note}" for note in log.notes if note.startswith("columns not understood"))
 
 
 def _require_seconds(steps_s: FloatArray, source: str) -> None:

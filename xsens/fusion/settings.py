@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+from scipy.constants import g
+
 from speckle3d.core.errors import InvalidInputError
 
 _DEG = math.pi / 180.0
@@ -44,7 +46,8 @@ class FusionSettings:
     field_off_s : float
         How long a disturbance of norm and dip persists.
     norm_tolerance, dip_tolerance_rad : float
-        A field that differs by more from the reference's norm (a fraction) or dip is disturbed.
+        A field that differs by more from the reference's norm (a fraction) or dip is disturbed; 0.1 and
+        10 deg are VQF's defaults (Laidig and Seel, Information Fusion 91, 2023).
     field_memory_s : float
         Time over which the reference follows an undisturbed field, and a changed field must persist.
     rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
@@ -63,7 +66,7 @@ class FusionSettings:
     """
 
     block_s: float = 1.0 / 32.0
-    gravity_m_s2: float = 9.80665
+    gravity_m_s2: float = g
     gyro_noise_rad_sqrt_s: float = 0.05 * _DEG
     gyro_scale_noise_sqrt_s: float = 0.002
     bias_walk_rad_s_sqrt_s: float = 0.002 * _DEG

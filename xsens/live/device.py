@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from xsens.messages.control import (
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Content = Literal["as set", "raw", "calibrated", "orientation"]
 
-CONTENTS: tuple[Content, ...] = ("as set", "raw", "calibrated", "orientation")
+CONTENTS: tuple[Content, ...] = get_args(Content)
 
 COMMON_BAUD = (115200, 921600, 460800, 230400, 57600)
 """Order in which rates are tried: the factory setting, then faster ones, which are set more often."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.constants import g
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -18,8 +19,6 @@ from xsens.logs.clocks import Stamps, Timeline, timeline
 from xsens.logs.samples import ImuLog
 from xsens.messages.mtdata import DataLayout
 from xsens.messages.rawcounts import RawCalibration
-
-GRAVITY_M_S2 = 9.80665
 
 WORLDS = {
     "NWU": Rotation.identity(),
@@ -253,12 +252,10 @@ def _rows_or_columns(matrices: FloatArray, accelerometer_m_s2: FloatArray | None
     """
     if accelerometer_m_s2 is None:
         return matrices, False
-    rest = np.abs(_length(accelerometer_m_s2) - GRAVITY_M_S2) < _AT_REST_M_S2
+    rest = np.abs(_length(accelerometer_m_s2) - g) < _AT_REST_M_S2
     rest &= are_rotations(matrices)
     as_is, turned = (
-        np.linalg.norm(
-            np.einsum(how, matrices[rest], accelerometer_m_s2[rest]) - [0, 0, GRAVITY_M_S2], axis=1
-        )
+        np.linalg.norm(np.einsum(how, matrices[rest], accelerometer_m_s2[rest]) - [0, 0, g], axis=1)
         for how in ("mij,mj->mi", "mji,mj->mi")
     )
     if rest.any() and np.median(turned) < _CLEARLY_BETTER * np.median(as_is):

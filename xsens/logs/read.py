@@ -69,7 +69,7 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     InvalidInputError
         If it holds no samples of the sensor, or lacks what is needed to understand them.
     """
-    data = _content(path)
+    data = read_bounded(path, MOST_BYTES)
     if not data:
         raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
     if (other := _other_kind(data)) is not None:
@@ -79,15 +79,21 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     return parse_stream(data, hints, str(path))
 
 
-def _content(path: PathLike) -> bytes:
-    """Read a file of bounded size whole; never wait on a pipe, never read from a device."""
+def read_bounded(path: PathLike, most_bytes: int) -> bytes:
+    """Read a file of bounded size whole; never wait on a pipe, never read from a device.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, is no file, or is larger than `most_bytes`.
+    """
     try:
         with open(path, "rb", opener=_without_waiting) as file:
             found = os.fstat(file.fileno())
             if not stat.S_ISREG(found.st_mode):
                 raise FileError(f"{path}: expected a file, got something else")
-            if found.st_size > MOST_BYTES:
-                raise FileError(f"{path}: expected at most {MOST_BYTES} bytes, got {found.st_size}")
+            if found.st_size > most_bytes:
+                raise FileError(f"{path}: expected at most {most_bytes} bytes, got {found.st_size}")
             return file.read(found.st_size)
     except FileError:
         raise

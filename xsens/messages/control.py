@@ -103,19 +103,18 @@ class UnitConfiguration:
         Bytes of the unit's part of an MTData message.
     output_mode, output_settings : int
         See `xsens.messages.mtdata`.
-    reserved : bytes
-        Eight bytes whose meaning is not documented.
     """
 
     device_id: int
     data_length: int
     output_mode: int
     output_settings: int
-    reserved: bytes = bytes(8)
 
 
-_HEAD = struct.Struct(">IHHHHI8s8s32s32sH")
-_UNIT = struct.Struct(">IHHI8s")
+_HEAD = struct.Struct(">IHH88xH")
+"""Device, period, skip factor; synchronisation, date and time, which are not read; number of units."""
+
+_UNIT = struct.Struct(">IHHI8x")
 
 
 @dataclass(frozen=True)
@@ -131,23 +130,12 @@ class Configuration:
     skip_factor : int
         Samples left out between two that are sent.
     units : tuple of UnitConfiguration
-    sync_mode, sync_skip, sync_offset : int
-    date, time : bytes
-        Of the recording, as text; zero bytes if not set.
-    reserved : tuple of bytes
-        Two runs of 32 bytes.
     """
 
     device_id: int
     period: int
     skip_factor: int
     units: tuple[UnitConfiguration, ...]
-    sync_mode: int = 0
-    sync_skip: int = 0
-    sync_offset: int = 0
-    date: bytes = bytes(8)
-    time: bytes = bytes(8)
-    reserved: tuple[bytes, bytes] = (bytes(32), bytes(32))
 
     @property
     def rate_hz(self) -> float:
@@ -159,12 +147,10 @@ class Configuration:
     @classmethod
     def from_message(cls, message: Message) -> Configuration:
         """Decode; raises `InvalidInputError` if the length does not suit the number of units."""
-        head = _HEAD.unpack(_at_least(message, _HEAD.size)[: _HEAD.size])
-        count = head[-1]
+        number, period, skip, count = _HEAD.unpack_from(_at_least(message, _HEAD.size))
         payload = _exactly(message, _HEAD.size + count * _UNIT.size)
         units = tuple(UnitConfiguration(*fields) for fields in _UNIT.iter_unpack(payload[_HEAD.size :]))
-        number, period, skip, mode, sync_skip, offset, date, time, first, second, _ = head
-        return cls(number, period, skip, units, mode, sync_skip, offset, date, time, (first, second))
+        return cls(number, period, skip, units)
 
 
 @dataclass(frozen=True)

@@ -281,7 +281,7 @@ class TestMechanism:
         path = tmp_path / "huge.csv"
         with path.open("wb") as file:
             file.truncate(10 * 2**30)
-        with pytest.raises(InvalidInputError, match=r"huge.csv.*16777216"):
+        with pytest.raises(FileError, match=r"huge.csv.*16777216"):
             read_mechanism_csv(path)
 
     def test_readings_are_averaged_while_the_mechanism_stands_still(self):
