@@ -15,6 +15,7 @@ BRIDGED_S = 0.1
 """The longest pause that is integrated over: a hand's rate changes little in it (tremor: below 12 Hz)."""
 
 
+# A frozen dataclass like DeviceSettings and Hints, not a pydantic model: xsens stands without pydantic.
 @dataclass(frozen=True)
 class FusionSettings:
     """Parameters of the orientation filter, all of them measurable properties.

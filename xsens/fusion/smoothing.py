@@ -120,14 +120,9 @@ def forward(
     return done, kalman
 
 
-def samples_per_block(step_s: float, settings: FusionSettings) -> int:
-    """Number of samples in an increment."""
-    return max(1, round(settings.block_s / step_s))
-
-
 def _parts(samples: Samples, settings: FusionSettings) -> Iterator[tuple[Samples, int]]:
     """Runs of whole blocks, then the remaining samples as one block, with the samples per block."""
-    per_block = samples_per_block(float(np.median(samples.step_s)), settings)
+    per_block = max(1, round(settings.block_s / float(np.median(samples.step_s))))
     whole = len(samples) // per_block * per_block
     for first in range(0, whole, _CHUNK * per_block):
         yield samples[first : min(first + _CHUNK * per_block, whole)], per_block
@@ -140,20 +135,20 @@ def _step(kalman: ErrorStateFilter, increment: Increment) -> Step:
     kalman.advance(increment)
     predicted, velocity = kalman.predicted
     return Step(
-        increment,
-        start,
-        bias,
-        predicted,
-        velocity,
-        kalman.matrix,
-        kalman.velocity,
-        kalman.heading_bias,
-        kalman.kalman.P,
-        kalman.transition,
-        kalman.noise,
-        kalman.resting,
-        kalman.disturbed,
-        kalman.started,
+        increment=increment,
+        start=start,
+        start_bias_rad_s=bias,
+        predicted=predicted,
+        predicted_velocity_m_s=velocity,
+        matrix=kalman.matrix,
+        velocity_m_s=kalman.velocity,
+        bias_rad_s=kalman.heading_bias,
+        covariance=kalman.kalman.P,
+        transition=kalman.transition,
+        noise=kalman.noise,
+        resting=kalman.resting,
+        disturbed=kalman.disturbed,
+        started=kalman.started,
     )
 
 

@@ -118,7 +118,7 @@ class DeviceInfo:
 
 
 class Device:
-    """A conversation with the sensor on an open port.
+    """A sensor on an open port, which answers requests and sends data.
 
     Parameters
     ----------

@@ -28,8 +28,8 @@ from xsens.messages.rawcounts import RawCalibration
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
 assert CORPUS, "the corpus lies beside this file"
-SECONDS = float(os.environ.get("FUZZ_SECONDS", "2"))
-"""For each kind of input, at most; with ``FUZZ_SECONDS=600`` in the environment, ten minutes each."""
+SECONDS = float(os.environ.get("FUZZ_SECONDS", "4"))
+"""For each kind of input, at most, in the slow tests; ``FUZZ_SECONDS=600`` makes it ten minutes each."""
 
 PER_SECOND = 75
 """Inputs tried in a second, about."""
@@ -173,6 +173,7 @@ TEXTS = [
 ]
 
 
+@pytest.mark.parametrize("seconds", [0.5, pytest.param(SECONDS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "inputs",
     [
@@ -184,8 +185,8 @@ TEXTS = [
     ],
     ids=["bytes", "damaged logs", "damaged text", "resealed messages", "numbers"],
 )
-def test_fuzzed(inputs, tmp_path):
-    in_time, limits = fuzzed(SECONDS)
+def test_fuzzed(inputs, seconds, tmp_path):
+    in_time, limits = fuzzed(seconds)
 
     @limits
     @given(inputs)
