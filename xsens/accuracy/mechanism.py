@@ -28,6 +28,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.streams import TimedRotations
 from xsens.logs.read import read_bounded
+from xsens.logs.texttables import number
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
 
@@ -143,7 +144,7 @@ def _table(text: str, where: str) -> dict[str, FloatArray]:
     lines = list(_lines(text))
     if not lines:
         raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got an empty file")
-    named = any(_number(cell) is None for cell in lines[0][1])
+    named = any(math.isnan(number(cell)) for cell in lines[0][1])
     names = _names(lines[0][1], f"{where}:{lines[0][0]}") if named else list(_COLUMNS[: len(lines[0][1])])
     if not named and len(names) not in (2, 3):
         raise InvalidInputError(
@@ -186,15 +187,8 @@ def _name(cell: str) -> str:
 def _row(cells: list[str], names: list[str], where: str) -> list[float]:
     if len(cells) != len(names):
         raise InvalidInputError(f"{where}: expected {len(names)} columns, got {len(cells)}")
-    values = [_number(cell) for cell in cells]
+    values = [number(cell) for cell in cells]
     for cell, value in zip(cells, values, strict=True):
-        if value is None or not math.isfinite(value):
+        if not math.isfinite(value):
             raise InvalidInputError(f"{where}: expected a finite number, got {cell[:40]!r}")
-    return [value for value in values if value is not None]
-
-
-def _number(cell: str) -> float | None:
-    try:
-        return float(cell)
-    except ValueError:
-        return None
+    return values

@@ -22,7 +22,6 @@ from xsens.messages.control import (
     device_id,
     error_of,
     output_configuration,
-    reply_to,
     set_output_configuration,
 )
 from xsens.messages.framing import Framer, Message, encode
@@ -199,7 +198,7 @@ class Device:
             deadline = time.monotonic() + ANSWER_S
             while time.monotonic() < deadline:
                 for message in self.receive():
-                    if message.mid == reply_to(request.mid):
+                    if message.mid == request.mid + 1:
                         return message
                     self._refuse(message, request)
         raise DeviceError(

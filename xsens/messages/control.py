@@ -65,11 +65,6 @@ class MessageId(IntEnum):
     SKIP_FACTOR_ACK = 0xD5
 
 
-def reply_to(request: int) -> int:
-    """Message id of the answer to `request`."""
-    return request + 1
-
-
 _ERRORS = {
     3: "the period is not within the valid range",
     4: "the message is not valid, or not in this state",
