@@ -49,7 +49,7 @@ _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIM
 
 
 def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
-    """Read a log: MT9 software ``.bin``, ``.mtb``, raw bytes of a port, or text of any known kind.
+    r"""Read a log: MT9 software ``.bin``, ``.mtb``, raw bytes of a port, or text of any known kind.
 
     Parameters
     ----------
@@ -68,6 +68,17 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
         If the file cannot be read, is no file, or is larger than `MOST_BYTES`.
     InvalidInputError
         If it holds no samples of the sensor, or lacks what is needed to understand them.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, xsens
+    >>> rows = [f"{time_s},0,0,9.8\n" for time_s in (0.0, 0.01, 0.02, 0.05)]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder, "log.csv")
+    ...     _ = path.write_text("time_s,acc_x,acc_y,acc_z\n" + "".join(rows))
+    ...     log = xsens.read_log(path)
+    >>> len(log), log.lost
+    (4, 2)
     """
     data = read_bounded(path, MOST_BYTES)
     if not data:
