@@ -11,22 +11,9 @@ pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
-from simulated_device import DEVICE_ID, KINDS, SimulatedDevice, wait_until
+from simulated_device import DEVICE_ID, KINDS, of_kind, wait_until
 
 BAUD = 115200
-
-
-@pytest.fixture
-def sensor(tmp_path, request):
-    """A simulated sensor of the kind that the test is parametrised with, an MT9-B by default."""
-    with SimulatedDevice(tmp_path / "port", **getattr(request, "param", {})) as simulated:
-        yield simulated
-
-
-def of_kind(*kinds, **more):
-    return pytest.mark.parametrize(
-        "sensor", [{"kind": kind, **more} for kind in kinds], indirect=True, ids=kinds
-    )
 
 
 class TestDevice:

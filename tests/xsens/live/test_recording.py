@@ -19,27 +19,14 @@ pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
-from simulated_device import KINDS, SimulatedDevice, values, wait_until
+from simulated_device import KINDS, of_kind, values, wait_until
 
 FAST = DeviceSettings(baud=115200)
 
 
 @pytest.fixture
-def sensor(tmp_path, request):
-    """A simulated sensor of the kind that the test is parametrised with, an MT9-B by default."""
-    with SimulatedDevice(tmp_path / "port", **getattr(request, "param", {})) as simulated:
-        yield simulated
-
-
-@pytest.fixture
 def path(tmp_path):
     return tmp_path / "recording.mtb"
-
-
-def of_kind(*kinds, **more):
-    return pytest.mark.parametrize(
-        "sensor", [{"kind": kind, **more} for kind in kinds], indirect=True, ids=kinds
-    )
 
 
 def counters(path) -> list[int]:
