@@ -4,8 +4,8 @@ import numpy as np
 import scipy.io
 from scipy.spatial.transform import Rotation
 
+from xsens.logs.parts import nwu_from
 from xsens.logs.samples import ImuLog
-from xsens.logs.worlds import nwu_from
 
 TRIALS = (
     "06_undisturbed_fast_rotation_A",

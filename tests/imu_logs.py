@@ -1,12 +1,19 @@
 """Logs of the orientation sensor made of known samples, byte by byte as the sensor would send them."""
 
 import numpy as np
+from imu_messages import (
+    calibration_message,
+    configuration_message,
+    counts_of,
+    items_payload,
+    mtdata_payloads,
+)
 from scipy.spatial.transform import Rotation
 
-from xsens.messages.catalogue import Configuration, MessageId, UnitConfiguration
+from xsens.messages.control import Configuration, MessageId, UnitConfiguration
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.mtdata2 import Item, encode_items
+from xsens.messages.mtdata2 import Item
 from xsens.messages.rawcounts import RawCalibration
 
 G = 9.80665
@@ -44,7 +51,7 @@ def calibration(seed=0):
 def raw_values(s, unit, first=0):
     """Raw counts by field name; the counter begins at `first` and wraps round."""
     vectors = [s[name] for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")]
-    counts = unit.to_counts(np.stack(vectors))
+    counts = counts_of(unit, np.stack(vectors))
     m = len(counts)
     return {
         "counter": (first + np.arange(m)[:, None]) % 65536,
@@ -62,20 +69,20 @@ def framed(payloads, mid=MessageId.MT_DATA):
 
 def mt9_records(s, unit, first=0):
     """Records of an MT9-B."""
-    return framed(DataLayout(OutputMode.MT9).encode(raw_values(s, unit, first)))
+    return framed(mtdata_payloads(DataLayout(OutputMode.MT9), raw_values(s, unit, first)))
 
 
 def mt9_bin(s, unit, first=0, stray=15):
     """A file of the MT9 software: the block, the end of a record, records."""
     records = mt9_records(s, unit, first)
-    return encode(unit.message()) + records[0][-stray:] + b"".join(records)
+    return encode(calibration_message(unit)) + records[0][-stray:] + b"".join(records)
 
 
 def configured(layout, period=1152, skip=0, size=None):
     """The answer to a request for the configuration."""
     size = layout.size if size is None else size
     unit = UnitConfiguration(0x1234, size, layout.mode, layout.settings)
-    return encode(Configuration(0x1234, period, skip, (unit,)).message())
+    return encode(configuration_message(Configuration(0x1234, period, skip, (unit,))))
 
 
 def legacy_values(s, layout, first=0):
@@ -105,7 +112,7 @@ def legacy_values(s, layout, first=0):
 
 def legacy_messages(s, layout, first=0):
     """Messages of an MTi in legacy mode."""
-    return framed(layout.encode(legacy_values(s, layout, first)))
+    return framed(mtdata_payloads(layout, legacy_values(s, layout, first)))
 
 
 WORLDS = {
@@ -137,5 +144,5 @@ def items_of(s, i, form=0, world="ENU", orientation="quaternion", ticks=100, fir
 
 def mtdata2_messages(s, **how):
     """Messages of an MTi with MTData2."""
-    payloads = [encode_items(items_of(s, i, **how)) for i in range(len(s["time_s"]))]
+    payloads = [items_payload(items_of(s, i, **how)) for i in range(len(s["time_s"]))]
     return framed(payloads, MessageId.MT_DATA2)

@@ -14,6 +14,8 @@ import threading
 import time
 import tty
 
+import pytest
+
 OFF, ASLEEP, CONFIGURATION, MEASUREMENT = "off", "asleep", "configuration", "measurement"
 
 KINDS = ("mt9", "legacy", "mtdata2")
@@ -53,6 +55,13 @@ def values(index, rate_hz, iron=0.0):
         (0.0, 0.0, math.radians(10.0)),
         field,
         (math.cos(psi / 2), 0.0, 0.0, math.sin(psi / 2)),
+    )
+
+
+def of_kind(*kinds, **more):
+    """Run a test that takes `sensor` with each of some kinds."""
+    return pytest.mark.parametrize(
+        "sensor", [{"kind": kind, **more} for kind in kinds], indirect=True, ids=kinds
     )
 
 

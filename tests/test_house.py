@@ -9,8 +9,9 @@ import pytest
 from imu_logs import samples
 
 import speckle3d
-from xsens.logs.read import write_csv
+import xsens
 from xsens.logs.samples import ImuLog
+from xsens.logs.textlogs import write_csv
 
 HEAVY = ("numba", "llvmlite", "h5py", "numpy", "scipy", "SimpleITK", "matplotlib", "pydantic")
 
@@ -43,25 +44,26 @@ def test_every_module_of_the_sensor_package_stays_clear_of_numba_and_h5py(python
     assert loaded_after(python, code, ("numba", "h5py")) == []
 
 
-@pytest.mark.parametrize("name", speckle3d.__all__)
-def test_public_names_are_there_and_documented(name):
-    assert getattr(speckle3d, name).__doc__
-    assert name in dir(speckle3d)
+@pytest.mark.parametrize(
+    ("package", "name"), [(package, name) for package in (speckle3d, xsens) for name in package.__all__]
+)
+def test_public_names_are_there_and_documented(package, name):
+    assert getattr(package, name).__doc__
+    assert name in dir(package)
+    assert package.__all__ == sorted(package.__all__)
 
 
-def test_public_names_are_listed_once_and_for_the_type_checker_too(project):
-    source = (project / "speckle3d" / "__init__.py").read_text(encoding="utf-8")
-    for_checker = source[source.index("if TYPE_CHECKING") : source.index("_HOME")]
-    assert list(speckle3d.__all__) == sorted(set(speckle3d.__all__))
-    assert set(speckle3d._HOME) == set(speckle3d.__all__)
-    for name in speckle3d.__all__:
-        assert re.search(rf"\b{name}\b", for_checker), name
+def test_the_lists_of_public_names_are_installed_with_the_packages(project):
+    settings = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    for package in (speckle3d, xsens):
+        assert "__init__.pyi" in settings["package-data"][package.__name__]
 
 
 def test_the_version_is_the_distributions_and_a_misspelt_name_an_attribute_error():
     assert speckle3d.__version__ == importlib.metadata.version("speckle3d")
-    with pytest.raises(AttributeError, match="'speckle3d' has no attribute 'trak'"):
-        _ = speckle3d.trak
+    for package in (speckle3d, xsens):
+        with pytest.raises(AttributeError, match="trak"):
+            _ = package.trak
 
 
 def test_the_version_stands_in_one_place(project):

@@ -101,7 +101,7 @@ def imu_convert(
     rate_hz: RateHz = None,
 ) -> None:
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
-    from xsens.logs.read import write_csv
+    from xsens.logs.textlogs import write_csv
 
     _require_another(out, log_file)
     log = read(log_file, rate_hz)
@@ -131,7 +131,7 @@ def imu_orient(
     as_json: Json = False,
 ) -> None:
     """Find the sensor's orientation from its log, and put it into a sweep, on its own clock."""
-    from xsens.logs.read import write_csv
+    from xsens.logs.textlogs import write_csv
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
@@ -204,7 +204,8 @@ def _require_another(out: Path | None, log_file: Path) -> None:
 
 def read(path: Path, rate_hz: float | None) -> ImuLog:
     """Read a log of any kind."""
-    from xsens.logs.read import Hints, read_log
+    from xsens.logs.parts import Hints
+    from xsens.logs.read import read_log
 
     return read_log(path, None if rate_hz is None else Hints(rate_hz=rate_hz))
 

@@ -199,3 +199,7 @@ def _group(file: h5py.File, name: str) -> h5py.Group:
     if found is None:
         raise InvalidInputError(f"/{name}: expected a group, got none")
     return found
+
+
+load_calibration = read_calibration
+"""Its public name, `speckle3d.load_calibration`."""

@@ -81,3 +81,7 @@ def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:
         for name in ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
     )
     return RFSettings(rate, speed, centre, (float(band[0]), float(band[1])))
+
+
+load_curves = read_curves
+"""Its public name, `speckle3d.load_curves`."""

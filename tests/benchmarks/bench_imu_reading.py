@@ -12,7 +12,7 @@ import pytest
 from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
 
 from xsens.logs.read import read_log
-from xsens.messages.catalogue import Framer
+from xsens.messages.framing import Framer
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
 RATE_HZ, MINUTES = 256.0, 10

@@ -1,1 +1,1 @@
-"""Errors of orientation against a reference."""
+"""Errors of orientation against a reference: angles between frames, streams, figures."""

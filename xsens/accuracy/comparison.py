@@ -1,4 +1,4 @@
-"""How far two streams of orientation are apart, as a total angle, in heading and in inclination."""
+"""Compare two streams of orientation by total angle, heading and inclination."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Comparison:
     Attributes
     ----------
     time_s : ndarray, shape (m,)
-        Samples of the first stream that the second covers.
+        Times of the first stream's samples that the second covers.
     total_rad, heading_rad, inclination_rad : ndarray, shape (m,)
-        The whole angle, the signed angle about up, and what is left without it (Laidig et al. 2021); as
-        the streams are.
+        The whole angle, the signed angle about up, and the angle that remains without it (Laidig et al.
+        2021); a constant heading offset is included.
     heading_offset_rad : float
         Mean difference in heading.
     """
@@ -49,7 +49,7 @@ class Comparison:
 
     @property
     def heading_rms_without_offset_rad(self) -> float:
-        """The same if both agreed on where north is."""
+        """Root mean square of the heading's difference less its mean."""
         off = np.angle(np.exp(1j * (self.heading_rad - self.heading_offset_rad)))
         return _rms(off)
 
@@ -62,7 +62,7 @@ class Comparison:
 def compare_orientations(
     one: TimedRotations | Orientation, other: TimedRotations | Orientation
 ) -> Comparison:
-    """Compare two streams on one clock, the sensor's own orientation with the filter's, say.
+    """Compare two streams on one clock, for example the sensor's own orientation with the filter's.
 
     Parameters
     ----------
@@ -80,6 +80,18 @@ def compare_orientations(
     ----------
     .. [1] D. Laidig et al., "BROAD - A benchmark for robust inertial orientation estimation", Data 6(7),
     2021.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from xsens import TimedRotations, compare_orientations
+    >>> time_s = np.array([0.0, 0.1, 0.2])
+    >>> level = TimedRotations(time_s, Rotation.identity(3))
+    >>> turned = TimedRotations(time_s, Rotation.from_euler("z", np.full((3, 1), 0.1)))
+    >>> found = compare_orientations(turned, level)
+    >>> round(found.heading_rms_rad, 6), round(found.inclination_rms_rad, 6)
+    (0.1, 0.0)
     """
     one, other = _stream(one), _stream(other)
     common = other.covers(one.time_s)
@@ -99,13 +111,13 @@ def compare_orientations(
 
 
 def _stream(given: object) -> TimedRotations:
-    given = getattr(given, "rotations", given)
-    if not isinstance(given, TimedRotations):
+    stream = getattr(given, "rotations", given)
+    if not isinstance(stream, TimedRotations):
         raise InvalidInputError(
             f"expected TimedRotations or an Orientation, as orient(log) gives, got {type(given).__name__}: "
             "a log's own orientation is log.rotations()"
         )
-    return given
+    return stream
 
 
 def _difference(one: Rotation, other: Rotation) -> FloatArray:

@@ -1,6 +1,6 @@
-"""Angles the sensor measured beside the reference's, along turns about one axis: best and worst examples.
+"""Draw angles measured by the sensor beside the reference's along turns about one axis: worst and best.
 
-Drawn without pyplot: no window system, no global state. Apart from the numbers, which need no matplotlib.
+Drawn without pyplot: no window system, no global state. Only this module of the room needs matplotlib.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from speckle3d.core.errors import InsufficientDataError
 from xsens.accuracy.angles import ANGLES, PairErrors
 
 OFF_AXIS_RAD = np.deg2rad(0.5)
-"""How far a frame may be turned about the two other axes: half of what the sensor claims at rest, which is
-seen in the graphs no more than its own errors."""
+"""Largest rotation of a frame about the two other axes: half of the sensor's claimed error at rest, no more
+visible in the graphs than that error."""
 
 FEWEST_FRAMES = 4
-"""A trend is not seen in fewer."""
+"""Fewer show no trend."""
 
 _SHORTEST = 0.75
-"""Of the longest turn about the same axis: a short one would always be the best example."""
+"""Shortest turn shown, as a fraction of the longest about its axis: short ones have the smallest errors."""
 
 _COLOURS = {"roll": "#009E73", "yaw": "#D55E00", "tilt": "#0072B2"}
 
@@ -39,9 +39,9 @@ class Turn:
     experiment, angle : str
     frame : ndarray of int, shape (m,)
     reference_rad : ndarray, shape (m,)
-        From the first frame on; it starts at zero and grows.
+        Angle from the first frame; it starts at zero and grows.
     measured_rad : ndarray, shape (k, m)
-        By every calibration.
+        Measured angle by every calibration.
     """
 
     experiment: str
@@ -52,7 +52,7 @@ class Turn:
 
     @property
     def drift_rad(self) -> FloatArray:
-        """Largest error along the turn, by calibration, shape (k,)."""
+        """Largest error along the turn by every calibration, shape (k,)."""
         return np.asarray(np.abs(self.measured_rad - self.reference_rad).max(axis=1))
 
 
@@ -70,7 +70,7 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     Parameters
     ----------
     experiments : mapping of str to PairErrors
-        By name; examples are chosen from all experiments and calibrations by their largest error.
+        Errors by name; examples are chosen from all experiments and calibrations by their largest error.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _turns(name: str, errors: PairErrors, axis: int) -> Iterator[Turn]:
 
 
 def _seen_from(start: int, errors: PairErrors) -> tuple[IntArray, FloatArray, FloatArray]:
-    """All frames seen from one: its pairs, those that end at it taken the other way round, and itself."""
+    """Frames, reference and measured angles from one frame to itself and all others."""
     n = errors.frames
     others = np.delete(np.arange(n), start)
     low, high = np.minimum(start, others), np.maximum(start, others)

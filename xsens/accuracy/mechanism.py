@@ -1,4 +1,4 @@
-"""Settings of a mechanism that holds the probe at known orientations, as comma-separated text.
+"""Read the settings of a mechanism that holds the probe at known orientations from comma-separated text.
 
 ::
 
@@ -7,9 +7,9 @@
     -16.4,-5.5,0,12.0,14.5
     -14.5,-5.5,0,17.0,19.5
 
-Degrees. The columns may be in any order and separated by commas, semicolons, tabs or blanks; ``roll`` may be
-missing and is then 0; ``time_s`` is the sensor's clock, when the mechanism had come to rest, and ``until_s``
-when it left. Without a header the columns are tilt, yaw and, if there is a third, roll.
+Angles are in degrees. The columns may be in any order and separated by commas, semicolons, tabs or blanks;
+``roll`` may be missing and is then 0; on the sensor's clock, ``time_s`` is when the mechanism came to rest
+and ``until_s`` when it left. Without a header the columns are tilt, yaw and, if there is a third, roll.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.streams import TimedRotations
+from xsens.logs.read import read_bounded
+from xsens.logs.texttables import number
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
 
 _LARGEST_BYTES = 16 * 2**20
-"""A mechanism set by hand or motor to a quarter of a million orientations: no file of settings is larger."""
+"""Enough for a quarter of a million orientations, more than a mechanism is set to by hand or motor."""
 
 _AXIS = {"roll": "Z", "yaw": "Y", "tilt": "X"}
 
@@ -44,9 +45,9 @@ class MechanismSettings:
     Attributes
     ----------
     base_from_image : Rotation, length n
-        The probe as set, seen from the mechanism's base.
+        The probe's orientation as set, relative to the mechanism's base.
     time_s, until_s : ndarray, shape (n,), optional
-        On the sensor's clock, from when to when the mechanism stood still; without `until_s` a moment.
+        Start and end of the mechanism's standstill, on the sensor's clock; without `until_s` a moment.
     """
 
     base_from_image: Rotation
@@ -88,29 +89,28 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     Raises
     ------
     FileError
-        If the file cannot be read.
+        If the file cannot be read, is no file, or is larger than 16 MB.
     InvalidInputError
-        Naming the file and the line that is not what it must be.
+        With file and line, if the text is not as described.
     """
     sequence = _sequence(turns)
-    text = _read(Path(path))
+    text = read_bounded(path, _LARGEST_BYTES).decode("utf-8-sig", errors="replace")
     table = _table(text, str(path))
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
     order = "".join(_AXIS[name] for name in sequence)
     rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
-    try:
+    with naming(str(path)):
         return MechanismSettings(rotation, table.get("time_s"), table.get("until_s"))
-    except InvalidInputError as error:
-        raise type(error)(f"{path}: {error}") from error
 
 
 def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
-    """The sensor's reading for each setting, averaged over the time the mechanism stood still.
+    """Reading of the sensor for each setting, averaged over the time the mechanism stood still.
 
     Raises
     ------
     InsufficientDataError
-        If the settings have no times and are not as many as the readings, or the sensor has no reading there.
+        If the sensor has no reading at the time of a setting, or the settings have no times and their number
+        is not that of the readings.
     """
     if settings.time_s is None:
         if len(sensor) != len(settings):
@@ -139,23 +139,12 @@ def _sequence(turns: str) -> list[str]:
     return names
 
 
-def _read(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_BYTES + 1)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(data) > _LARGEST_BYTES:
-        raise InvalidInputError(f"{path}: expected at most {_LARGEST_BYTES} bytes of settings, got more")
-    return data.decode("utf-8-sig", errors="replace")
-
-
 def _table(text: str, where: str) -> dict[str, FloatArray]:
     """Columns by name."""
     lines = list(_lines(text))
     if not lines:
         raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got an empty file")
-    named = any(_number(cell) is None for cell in lines[0][1])
+    named = any(math.isnan(number(cell)) for cell in lines[0][1])
     names = _names(lines[0][1], f"{where}:{lines[0][0]}") if named else list(_COLUMNS[: len(lines[0][1])])
     if not named and len(names) not in (2, 3):
         raise InvalidInputError(
@@ -168,7 +157,7 @@ def _table(text: str, where: str) -> dict[str, FloatArray]:
 
 
 def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and cells of the lines that say something."""
+    """Line numbers and cells of the lines that are not empty or comments."""
     for at, line in enumerate(text.splitlines(), 1):
         content = line.partition("#")[0].strip()
         if not content:
@@ -198,15 +187,8 @@ def _name(cell: str) -> str:
 def _row(cells: list[str], names: list[str], where: str) -> list[float]:
     if len(cells) != len(names):
         raise InvalidInputError(f"{where}: expected {len(names)} columns, got {len(cells)}")
-    values = [_number(cell) for cell in cells]
+    values = [number(cell) for cell in cells]
     for cell, value in zip(cells, values, strict=True):
-        if value is None or not math.isfinite(value):
+        if not math.isfinite(value):
             raise InvalidInputError(f"{where}: expected a finite number, got {cell[:40]!r}")
-    return [value for value in values if value is not None]
-
-
-def _number(cell: str) -> float | None:
-    try:
-        return float(cell)
-    except ValueError:
-        return None
+    return values

@@ -1,1 +1,1 @@
-"""From samples to orientation."""
+"""Samples to orientation: filter, smoother, detectors of rest and magnetic disturbance."""

@@ -1,14 +1,14 @@
-"""The error-state Kalman filter of orientation, one short increment at a time.
+"""Error-state Kalman filter of orientation, which advances by short increments.
 
-Error state, 13: attitude (world axes, z the heading), gyroscope bias as inclination knows it (sensor axes),
-velocity (world axes), gyroscope bias as heading knows it, and how far the field's heading here is from
-north. Two copies of one bias keep magnetism out of inclination: the magnetometer corrects heading and the
-heading's copy alone (a Schmidt filter, whose covariance stays honest), everything else corrects both.
-Without a magnetometer there is one bias and the heading's copy is unused.
+Error state, 13: attitude (world axes, z the heading), gyroscope bias as estimated without the magnetometer
+(sensor axes), velocity (world axes), gyroscope bias as estimated with it, and the angle between the local
+field's heading and north. Two copies of one bias keep magnetism out of inclination: the magnetometer corrects
+heading and the second copy alone (a Schmidt filter, which accounts for the states it leaves uncorrected),
+every other observation corrects both. Without a magnetometer the second copy is unused.
 
-The accelerometer is integrated to velocity, which a hand keeps near zero: over many swings that shows
-gravity through any movement, where the accelerometer itself shows it only at rest. The attitude error is
-the invariant one (velocity turns with it), so heading and velocity do not mix.
+The accelerometer is integrated to velocity, which stays near zero in a hand: over many swings that shows the
+direction of gravity in spite of movement, where the accelerometer itself shows it only at rest. The attitude
+error is the invariant one (velocity turns with it), so that errors of heading and velocity stay separate.
 
 References
 ----------
@@ -21,17 +21,14 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
-from xsens.fusion.disturbance import FieldMonitor
-from xsens.fusion.increments import Increment
-from xsens.fusion.quaternions import turn_matrix
-from xsens.fusion.restandstart import RestDetector, Start, upright
+from xsens.fusion.detectors import FieldMonitor, RestDetector
+from xsens.fusion.increments import Increment, turn_matrix
 from xsens.fusion.settings import FusionSettings
 
 SIZE = 13
@@ -39,49 +36,28 @@ ANGLE, BIAS, SPEED, HEADING_BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(
 HEADING, STRAY = 2, 12
 
 _START_S = 1.0
-"""Inclination at the start is the direction of the mean force of so long, and heading the field's."""
+"""Inclination and heading at the start are those of the mean force and field over this time."""
 
 _REST_SPEED_M_S = 0.02
 _REST_TIME_S = 0.5
-"""A resting sensor's velocity, and how long the accelerometer's error persists."""
+"""Standard deviation of a resting sensor's velocity, and how long the accelerometer's error persists."""
 
 _REST_BIAS_RAD = math.radians(0.03)
-"""How well one second of rest shows the bias: an MT9-B's Allan deviation at 1 s is 0.05 deg/s."""
+"""Error of the bias after one second of rest: an MT9-B's Allan deviation at 1 s is 0.05 deg/s."""
 
 _REST_NOISE = 0.1
-"""A resting sensor's attitude wanders by so much of the angle random walk; not integrated, so this stands
-for turning too slow to notice."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The filter at the end of an increment.
-
-    Attributes
-    ----------
-    matrix : ndarray, shape (3, 3)
-        World from sensor.
-    bias_rad_s : ndarray, shape (3,)
-    sd_rad : ndarray, shape (3,)
-        Of the attitude about the world's axes.
-    resting, disturbed : bool
-    """
-
-    matrix: FloatArray
-    bias_rad_s: FloatArray
-    sd_rad: FloatArray
-    resting: bool
-    disturbed: bool
+"""Random walk of a resting sensor's attitude, as a fraction of the gyroscope's. The gyroscope is not
+integrated at rest; this allows for turning too slow to notice."""
 
 
 class ErrorStateFilter:
-    """Orientation from increments. The world is x magnetic north, y west, z up."""
+    """Estimate orientation from increments. The world is x magnetic north, y west, z up."""
 
     def __init__(self, settings: FusionSettings, first: Increment) -> None:
-        """Start at the beginning of `first`, which is still to be given to `advance`; its bias is taken."""
+        """Start before `first`, with its bias; `first` must then be given to `advance`."""
         self.settings = settings
         self._magnetic = settings.use_magnetometer
-        self._start: Start | None = Start()
+        self._start: _Start | None = _Start()
         self._point(first)
         self.velocity = np.zeros(3)
         self.bias = first.bias_rad_s.copy()
@@ -96,11 +72,11 @@ class ErrorStateFilter:
 
     @property
     def started(self) -> bool:
-        """Whether the first second, in which the direction of up is found, is over."""
+        """Whether the first second, which finds the direction of up, is over."""
         return self._start is None
 
     def resume(self, increment: Increment, pause_s: float) -> None:
-        """Find up and north again after a pause, before `increment`; bias and reference field are kept."""
+        """Find up and north again after a pause before `increment`; keep bias and reference field."""
         fresh = _start_covariance(self.settings)
         walk = self.settings.bias_walk_rad_s_sqrt_s**2 * pause_s
         for row in (BIAS, HEADING_BIAS):
@@ -109,13 +85,13 @@ class ErrorStateFilter:
         fresh[BIAS, BIAS] += walk * np.eye(3)
         fresh[HEADING_BIAS, HEADING_BIAS] += walk * np.eye(3)
         self.kalman.P = fresh
-        self._start, self._stray = Start(), 0.0
+        self._start, self._stray = _Start(), 0.0
         self._point(increment)
         self._rest = RestDetector(self.settings)
 
     def _point(self, first: Increment) -> None:
-        """Up and north by one increment alone."""
-        self._level, self._heading = upright(first.velocity_m_s), 0.0
+        """Set up and north from one increment alone."""
+        self._level, self._heading = _upright(first.velocity_m_s), 0.0
         if first.field_au is not None and self._magnetic:
             field = self._level @ first.field_au
             self._heading = -math.atan2(field[1], field[0])
@@ -127,16 +103,16 @@ class ErrorStateFilter:
 
     @property
     def heading_bias(self) -> FloatArray:
-        """Gyroscope bias, shape (3,), by everything that is known."""
+        """Gyroscope bias, shape (3,), by all observations."""
         return self._heading_bias if self._magnetic else self.bias
 
-    def snapshot(self) -> Snapshot:
-        """What is believed now."""
-        sd = np.sqrt(np.diag(self.kalman.P)[ANGLE])
-        return Snapshot(self.matrix, self.heading_bias.copy(), sd, self.resting, self.disturbed)
+    @property
+    def sd_rad(self) -> FloatArray:
+        """Standard deviation of the attitude about the world's axes, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.kalman.P)[ANGLE]))
 
     def advance(self, increment: Increment) -> None:
-        """Go on by one increment and correct by what it shows."""
+        """Predict over one increment and correct by its observations."""
         self._decide_rest(increment)
         before = self._level
         self._predict(increment)
@@ -155,7 +131,7 @@ class ErrorStateFilter:
         self.resting = self._rest.rests(increment, self.bias, sd)
 
     def _begin(self, increment: Increment) -> None:
-        """Level by the mean force since the start, and point north by the mean field."""
+        """Set up from the mean force since the start, and north from the mean field."""
         start = self._start
         assert start is not None
         start.add(increment)
@@ -217,7 +193,7 @@ class ErrorStateFilter:
     # -- correction
 
     def _correct_velocity(self, duration: float) -> None:
-        """The velocity is a hand's: zero, but for a persistent error (or a resting sensor's)."""
+        """Correct by a velocity of zero, whose error is a hand's, or smaller at rest, and persists."""
         s = self.settings
         variance = 2.0 * s.speed_m_s**2 * s.speed_time_s
         if self.resting:
@@ -226,7 +202,7 @@ class ErrorStateFilter:
         self._inject()
 
     def _correct_bias(self, increment: Increment) -> None:
-        """A resting sensor's gyroscope reads its bias; each copy is told so by itself."""
+        """Correct both copies of the bias, one by one, by the gyroscope's reading at rest."""
         variance = _REST_BIAS_RAD**2 / increment.duration_s * np.eye(3)
         tilt = increment.rate_rad_s - self.bias
         if not self._magnetic:
@@ -256,7 +232,7 @@ class ErrorStateFilter:
         self._masked_update(shows, np.array([residual]), np.array([[variance]]), _HEADING_ONLY)
 
     def _doubt_heading(self, room_au: FloatArray) -> None:
-        """The field known from turning replaces the first one: a heading far from it was iron's."""
+        """Correct a heading found beside iron, if it is far from that of the room's field."""
         place = self.settings.field_sd_rad**2
         residual = _wrapped(-math.atan2(room_au[1], room_au[0]) - self._heading - self._stray)
         if residual**2 > 9.0 * (self.kalman.P[HEADING, HEADING] + place):
@@ -266,7 +242,7 @@ class ErrorStateFilter:
     def _masked_update(
         self, shows: FloatArray, residual: FloatArray, variance: FloatArray, mask: FloatArray
     ) -> None:
-        """Correct the states of `mask` alone (Schmidt); the others' errors count as noise."""
+        """Correct the states of `mask` alone (Schmidt); the errors of the others count as noise."""
         kalman = self.kalman
         cross = kalman.P @ shows.T
         gain = mask[:, None] * np.linalg.solve(shows @ cross + variance, cross.T).T
@@ -276,7 +252,7 @@ class ErrorStateFilter:
         self._inject()
 
     def _inject(self) -> None:
-        """Put the estimated error where it belongs and start again from none."""
+        """Apply the estimated error to the state and reset it to zero."""
         error = self.kalman.x[:, 0]
         angle = error[ANGLE].copy()
         if self._magnetic:
@@ -289,6 +265,43 @@ class ErrorStateFilter:
         self._heading_bias = self._heading_bias + error[HEADING_BIAS]
         self._stray += float(error[STRAY])
         self.kalman.x = np.zeros((SIZE, 1))
+
+
+class _Start:
+    """Mean force and field of the first increments."""
+
+    def __init__(self) -> None:
+        self.duration_s = self.field_s = 0.0
+        self._turn = np.eye(3)  # first axes from the present ones
+        self._force, self._field = np.zeros(3), np.zeros(3)
+
+    def add(self, increment: Increment) -> None:
+        """Add the next increment."""
+        self._force = self._force + self._turn @ increment.velocity_m_s
+        if increment.field_au is not None:
+            self._field = self._field + self._turn @ increment.field_au * increment.duration_s
+            self.field_s += increment.duration_s
+        self._turn = self._turn @ increment.turn
+        self.duration_s += increment.duration_s
+
+    def level(self) -> FloatArray:
+        """Rotation from the sensor's to level axes at the end of the last increment."""
+        return _upright(self._force) @ self._turn
+
+    def field(self) -> FloatArray:
+        """Mean field, in the sensor's axes at the end of the last increment."""
+        return self._field @ self._turn / self.field_s
+
+
+def _upright(force: FloatArray) -> FloatArray:
+    """The shortest rotation that takes `force` to up."""
+    norm = float(np.linalg.norm(force))
+    up = force / norm if norm > 0.0 else np.array([0.0, 0.0, 1.0])
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
+    if sine < 1e-9:
+        return np.diag([1.0, math.copysign(1.0, cosine), math.copysign(1.0, cosine)])
+    return turn_matrix(axis / sine * math.atan2(sine, cosine))
 
 
 def _observer(states: slice) -> FloatArray:
@@ -309,7 +322,7 @@ _INCLINATION = 1.0 - _HEADING_ONLY
 def _start_covariance(settings: FusionSettings) -> FloatArray:
     """Covariance at the start: the heading is unknown, both copies of the bias are one."""
     covariance = np.zeros((SIZE, SIZE))
-    heading = math.pi if settings.use_magnetometer else 1e-6  # without, the heading starts at zero by decree
+    heading = math.pi if settings.use_magnetometer else 1e-6  # without, it starts at zero by definition
     i = np.arange(3)
     tilt = (2.0 * settings.speed_m_s / (settings.gravity_m_s2 * _START_S)) ** 2
     covariance[i, i] = tilt, tilt, heading**2

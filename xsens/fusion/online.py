@@ -1,4 +1,4 @@
-"""Orientation while the samples come: the filter behind a method that takes one sample or many."""
+"""`OnlineFilter`: orientation while samples arrive, one by one or in pieces."""
 
 from __future__ import annotations
 
@@ -11,31 +11,30 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from xsens.fusion.errorstate import ErrorStateFilter
-from xsens.fusion.increments import Samples, blocks_of
-from xsens.fusion.plausible import FASTEST_RAD_S, real_field, require_metres
-from xsens.fusion.quaternions import turn_matrix
+from xsens.fusion.increments import Samples, blocks_of, turn_matrix
+from xsens.fusion.readings import FASTEST_RAD_S, real_field, require_metres
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 
 _JUDGED_S = 0.99
-"""The accelerometer's unit is judged by the median of the first second; less rounding."""
+"""The accelerometer's unit is judged by the median of the first second, less rounding of the steps."""
 
 
 @dataclass(frozen=True)
 class OnlineState:
-    """What the filter believes after the last sample.
+    """Estimate of the filter after the last sample.
 
     Attributes
     ----------
     world_from_sensor : Rotation, single
-        x magnetic north, y west, z up. Until the magnetometer has spoken, x is where it was at the start.
+        x magnetic north, y west, z up. Without readings of the magnetometer x is where it was at the start.
     standard_deviation_rad : ndarray, shape (3,)
-        About the world's axes: two of inclination, one of heading; of the last whole increment.
+        About the world's axes: two of inclination, one of heading; at the end of the last whole increment.
     gyro_bias_rad_s : ndarray, shape (3,)
     disturbed : bool
-        Whether the magnetic field is not trusted.
+        True while the magnetic field is not trusted.
     resting : bool
     started : bool
-        Whether the first second, in which up and north are found, is over.
+        True when the first second, which finds up and north, is over.
     """
 
     world_from_sensor: Rotation
@@ -47,14 +46,23 @@ class OnlineState:
 
 
 class OnlineFilter:
-    """The filter of `xsens.orient`, fed as the sensor speaks.
+    """The filter of `xsens.orient` for samples as they arrive.
 
     Samples are gathered to increments of `FusionSettings.block_s`; between two of them the gyroscope alone
-    carries the orientation, so `state` is always that of the last sample.
+    carries the orientation, so that `state` is always that of the last sample.
 
     Parameters
     ----------
     settings : FusionSettings, optional
+
+    Examples
+    --------
+    >>> from xsens import OnlineFilter
+    >>> live = OnlineFilter()
+    >>> for _ in range(200):
+    ...     live.push(0.01, [0, 0, 0], [0, 0, 9.81], [0.4, 0, -0.9])
+    >>> live.state.started, live.state.disturbed
+    (True, False)
     """
 
     def __init__(self, settings: FusionSettings | None = None) -> None:
@@ -73,7 +81,7 @@ class OnlineFilter:
         accelerometer_m_s2: npt.ArrayLike,
         magnetometer_au: npt.ArrayLike | None = None,
     ) -> None:
-        """Take in samples.
+        """Add samples.
 
         Parameters
         ----------
@@ -81,17 +89,17 @@ class OnlineFilter:
             Time from the sample before to each sample; more than 0.1 s is a pause, after which up and north
             are found again.
         gyroscope_rad_s, accelerometer_m_s2 : array_like, shape (3,) or (m, 3)
-            A sample without gyroscope (NaN) is left out, one without accelerometer takes the last there was.
+            A sample without gyroscope (NaN) is left out, one without accelerometer takes the last reading.
         magnetometer_au : array_like, shape (3,) or (m, 3), optional
-            Rows may be NaN; rows of zeros count as such.
+            Rows may be NaN; rows of zeros count as missing too.
 
         Raises
         ------
         MismatchError
             If the shapes do not fit together.
         InvalidInputError
-            If a step is not positive and finite, the gyroscope cannot be in rad/s or, by its median over the
-            first second, the accelerometer in m/s^2.
+            If a step is not positive and finite, the gyroscope is not in rad/s or, by its median over the
+            first second, the accelerometer is not in m/s^2.
         """
         steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
         for step, rate, force, field in zip(steps, rates, forces, fields, strict=True):
@@ -100,26 +108,25 @@ class OnlineFilter:
 
     @property
     def state(self) -> OnlineState | None:
-        """What is believed after the last sample; None before there is a first increment."""
+        """Estimate after the last sample; None before the first whole increment."""
         kalman = self._kalman
         if kalman is None:
             return None
-        snapshot = kalman.snapshot()
-        matrix = snapshot.matrix
-        if not snapshot.resting:
+        matrix, bias = kalman.matrix, kalman.heading_bias
+        if not kalman.resting:
             for each in self._pending:
-                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - snapshot.bias_rad_s) * each.step_s[0])
+                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - bias) * each.step_s[0])
         return OnlineState(
             Rotation.from_matrix(matrix),
-            snapshot.sd_rad,
-            snapshot.bias_rad_s,
-            snapshot.disturbed,
-            snapshot.resting,
+            kalman.sd_rad,
+            bias.copy(),
+            kalman.disturbed,
+            kalman.resting,
             kalman.started,
         )
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
-        """Refuse an accelerometer in other units when there is a second of it."""
+        """Raise if the accelerometer is in other units, after a second of it."""
         if self._judged_s >= _JUDGED_S or not np.isfinite(force).all():
             return
         self._first.append(force)
@@ -128,7 +135,7 @@ class OnlineFilter:
             try:
                 require_metres(np.array(self._first), "accelerometer_m_s2")
             except InvalidInputError:
-                self._judged_s = 0.0  # nor may what comes next pass unjudged
+                self._judged_s = 0.0  # so that the next second is judged too
                 raise
             finally:
                 self._first = []
@@ -144,7 +151,7 @@ class OnlineFilter:
         if step_s > BRIDGED_S and self._kalman is not None:
             self._advance()
             self._pause_s = step_s
-        # How the sensor turned in a pause is not known; the first sample's own step is not either.
+        # The turn in a pause is not known, nor is the first sample's own step.
         step_s = step_s if step_s <= BRIDGED_S else self._settings.block_s
         self._pending.append(Samples(np.array([step_s]), rate[None], self._force[None], field[None]))
         self._pending_s += step_s
@@ -153,7 +160,7 @@ class OnlineFilter:
             self._advance()
 
     def _advance(self) -> None:
-        """Make an increment of what is pending."""
+        """Make an increment of the pending samples."""
         if not self._pending:
             return
         bias = np.zeros(3) if self._kalman is None else self._kalman.bias

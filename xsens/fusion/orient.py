@@ -1,35 +1,24 @@
-"""Orientation of a log from its gyroscope, its accelerometer and, for heading alone, its magnetometer."""
+"""`orient`: orientation of a log from gyroscope, accelerometer and, for heading alone, magnetometer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.errorstate import ErrorStateFilter
-from xsens.fusion.forward import Pass, forward, within_steps
-from xsens.fusion.increments import Samples
-from xsens.fusion.plausible import (
-    UNKNOWN_HEADING_RAD,
-    contradiction,
-    real_field,
-    require_metres,
-    require_radians,
-    require_rising_in_seconds,
-)
+from xsens.fusion.increments import Samples, quaternion_product, quaternions_of
+from xsens.fusion.readings import UNKNOWN_HEADING_RAD, require_log, usable_samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
-from xsens.fusion.smoothing import Smoothed, smooth
+from xsens.fusion.smoothing import Pass, Smoothed, forward, smooth
 from xsens.logs.samples import ImuLog
 
 _SHORTEST_S = 3.0
-"""Shorter stretches are filtered, not smoothed: they hold little more than the filter's start."""
+"""Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +38,9 @@ class Orientation:
     resting : ndarray of bool, shape (m,)
     smoothed : bool
     notes : tuple of str
-        What was missing or bridged.
+        What was missing or interpolated.
     magnetic : bool
-        Whether the heading is by the magnetic field; else it is relative to the start.
+        True if the heading is by the magnetic field, false if it is relative to the start.
     """
 
     rotations: TimedRotations
@@ -69,7 +58,7 @@ class Orientation:
 
 @dataclass(frozen=True)
 class _Result:
-    """Of one stretch, per sample; quaternions scalar first."""
+    """Orientation of one stretch, a row per sample; quaternions scalar first."""
 
     wxyz: FloatArray
     sd_rad: FloatArray
@@ -87,7 +76,7 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
         With gyroscope and accelerometer. Without a magnetometer, the heading is relative to the start.
     settings : FusionSettings, optional
     smooth : bool
-        Use what comes after each sample as well as what comes before; without, as a live filter would.
+        Use the readings after each sample as well as those before; without, as a live filter would.
 
     Raises
     ------
@@ -98,12 +87,24 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
 
     Notes
     -----
-    After a pause of more than 0.1 s nothing is known of how the sensor turned: up and north are found
-    again, the bias and the field's reference are kept.
+    How the sensor turned in a pause of more than 0.1 s is not known: up and north are found again after it;
+    the bias and the field's reference are kept.
+
+    Examples
+    --------
+    A sensor at rest, its x axis to magnetic north:
+
+    >>> import numpy as np
+    >>> from xsens import ImuLog, orient
+    >>> time_s = np.arange(500) / 100.0
+    >>> up, still, field = (np.tile(v, (500, 1)) for v in ([0, 0, 9.81], [0, 0, 0.0], [0.4, 0, -0.9]))
+    >>> found = orient(ImuLog(time_s, up, still, field))
+    >>> bool(found.rotations.world_from_sensor.magnitude().max() < 1e-6)
+    True
     """
-    _require_log(log)
+    require_log(log)
     settings = settings or FusionSettings()
-    used, samples, notes = _usable(log)
+    used, samples, notes = usable_samples(log)
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)
@@ -111,7 +112,9 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, smooth)
-    joined = _Result(*(np.concatenate(parts) for parts in zip(*map(_fields, results), strict=True)))
+    joined = _Result(
+        *(np.concatenate(parts) for parts in zip(*(vars(each).values() for each in results), strict=True))
+    )
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
@@ -126,52 +129,6 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
         tuple(notes),
         settings.use_magnetometer,
     )
-
-
-# -- samples
-
-
-def _require_log(log: object) -> None:
-    """A path is a mistake soon made."""
-    if not isinstance(log, ImuLog):
-        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
-
-
-def _usable(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
-    """Indices of samples with a gyroscope reading, the samples, and what had to be done to them."""
-    source = log.source or "log"
-    if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
-        lacking = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
-        none = " and ".join(f"no {name}" for name, values in lacking.items() if values is None)
-        why = "".join(f"; {note}" for note in log.notes if note.startswith("columns not understood"))
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {none}{why}")
-    used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
-    force = log.accelerometer_m_s2[used]
-    there = np.isfinite(force).all(axis=1)
-    if used.size < 2 or there.sum() < 2:
-        raise InsufficientDataError(
-            f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
-        )
-    time_s, notes = log.time_s[used], []
-    steps = np.diff(time_s)
-    require_rising_in_seconds(steps, source)
-    require_metres(force[there], source)
-    require_radians(log.gyroscope_rad_s[used], source)
-    if used.size < len(log):
-        notes.append(f"{len(log) - used.size} samples without gyroscope left out")
-    if not there.all():
-        notes.append(f"{int((~there).sum())} accelerometer readings missing: interpolated")
-        force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
-    field = np.full((used.size, 3), np.nan)
-    if log.magnetometer_au is not None:
-        field, zeros = real_field(log.magnetometer_au[used])
-        if zeros:
-            notes.append(f"magnetometer reads zero in {zeros} of {used.size} samples: left out")
-    against = contradiction(time_s, log.gyroscope_rad_s[used], force)
-    if against is not None:
-        notes.append(against)
-    step_s = np.concatenate([[np.median(steps)], steps])
-    return used, Samples(step_s, log.gyroscope_rad_s[used], force, field), notes
 
 
 # -- stretches
@@ -204,7 +161,7 @@ def _from_filter(done: Pass) -> _Result:
     starts = Rotation.from_matrix([step.start for step in steps]).as_quat(scalar_first=True)
     resting = np.array([step.resting for step in steps])
     biases = np.array([step.start_bias_rad_s for step in steps])
-    wxyz = within_steps(done, starts, biases, resting)
+    wxyz = _within_steps(done, starts, biases, resting)
     sd = np.sqrt([np.diag(step.covariance)[:3] for step in steps])
     disturbed = np.array([step.disturbed for step in steps])
     after = np.array([step.bias_rad_s for step in steps])
@@ -212,9 +169,9 @@ def _from_filter(done: Pass) -> _Result:
 
 
 def _from_smoother(done: Pass, found: Smoothed) -> _Result:
-    """Within a step by the gyroscope, with what it misses at the step's end spread over the step."""
+    """Result by the gyroscope within each step; its error at the step's end is spread over the step."""
     nodes = Rotation.from_matrix(found.matrices)
-    wxyz = within_steps(done, nodes[:-1].as_quat(scalar_first=True), found.bias_rad_s[:-1], found.resting)
+    wxyz = _within_steps(done, nodes[:-1].as_quat(scalar_first=True), found.bias_rad_s[:-1], found.resting)
     ends = Rotation.from_quat([q[-1] for q in wxyz], scalar_first=True)
     missed = (nodes[1:] * ends.inv()).as_rotvec()
     spread = []
@@ -223,6 +180,31 @@ def _from_smoother(done: Pass, found: Smoothed) -> _Result:
         correction = Rotation.from_rotvec(share[:, None] * missed[k])
         spread.append((correction * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True))
     return _per_sample(done, spread, found.sd_rad[1:], found.bias_rad_s[1:], found.disturbed, found.resting)
+
+
+def _within_steps(
+    done: Pass, starts: FloatArray, biases_rad_s: FloatArray, resting: BoolArray
+) -> list[FloatArray]:
+    """Orientation of every sample as quaternions, shape (samples, 4) per step, from the steps' starts.
+
+    Parameters
+    ----------
+    done : Pass
+    starts : ndarray, shape (steps, 4)
+        World from sensor, scalar first.
+    biases_rad_s : ndarray, shape (steps, 3)
+    resting : ndarray of bool, shape (steps,)
+        Steps in which the orientation is held.
+    """
+    out = []
+    for k, step in enumerate(done.steps):
+        if resting[k]:
+            out.append(np.tile(starts[k], (len(done.turns[k]), 1)))
+            continue
+        off = step.increment.bias_rad_s - biases_rad_s[k]
+        turns = quaternion_product(done.turns[k], quaternions_of(off * done.time_s[k][:, None]))
+        out.append(quaternion_product(starts[k], turns))
+    return out
 
 
 def _per_sample(
@@ -236,7 +218,3 @@ def _per_sample(
     counts = [len(times) for times in done.time_s]
     each = np.repeat(np.arange(len(counts)), counts)
     return _Result(np.concatenate(wxyz), sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
-
-
-def _fields(result: _Result) -> tuple[npt.NDArray[Any], ...]:
-    return result.wxyz, result.sd_rad, result.bias_rad_s, result.disturbed, result.resting

@@ -1,21 +1,24 @@
-"""What the orientation filter believes about sensors, hands and rooms, in one place, each with its reason."""
+"""Settings of the orientation filter: properties of sensors, hands and rooms, each with its reason."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
 
+from scipy.constants import g
+
 from speckle3d.core.errors import InvalidInputError
 
 _DEG = math.pi / 180.0
 
 BRIDGED_S = 0.1
-"""The longest pause that is integrated through: a hand's rate changes little in it (tremor: below 12 Hz)."""
+"""The longest pause that is integrated over: a hand's rate changes little in it (tremor: below 12 Hz)."""
 
 
+# A frozen dataclass like DeviceSettings and Hints, not a pydantic model: xsens stands without pydantic.
 @dataclass(frozen=True)
 class FusionSettings:
-    """Parameters of the orientation filter, all of them properties of things that can be measured.
+    """Parameters of the orientation filter, all of them measurable properties.
 
     Attributes
     ----------
@@ -33,27 +36,29 @@ class FusionSettings:
     bias_sd_rad_s : float
         Bias at switching on, 1 deg/s.
     speed_m_s, speed_time_s : float
-        A hand's speed about its mean, zero, and how long it persists.
+        Standard deviation of a hand's speed about its mean, zero, and how long a speed persists.
     force_noise_m_s_sqrt_s : float
         Velocity random walk of the accelerometer, misalignment in quick movement included.
     field_sd_rad, field_place_s : float
-        How far the magnetic field's heading strays from place to place in a room, 4 deg, and how long a
-        moving sensor stays in one place.
+        Standard deviation of the magnetic field's heading from place to place in a room, 4 deg, and how long
+        a moving sensor stays in one place.
     field_noise_rad_sqrt_s : float
-        How it strays within a place: 2 deg/sqrt(Hz).
+        Noise of the field's heading within a place: 2 deg/sqrt(Hz).
     field_off_s : float
-        How long a disturbance that shows in norm and dip persists.
+        How long a disturbance of norm and dip persists.
     norm_tolerance, dip_tolerance_rad : float
-        A field that differs by more from the reference's norm (a fraction) or dip is disturbed.
+        A field that differs by more from the reference's norm (a fraction) or dip is disturbed; 0.1 and
+        10 deg are VQF's defaults (Laidig and Seel, Information Fusion 91, 2023).
     field_memory_s : float
-        Over how long the reference follows an undisturbed field, and a changed field must persist.
+        Time over which the reference follows an undisturbed field, and a changed field must persist.
     rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
-        The sensor rests if neither reading moves by more from its mean of the last half second, for so long.
+        The sensor rests if for the last of these neither reading differs by more from its mean of half a
+        second.
     rest_bias_rad_s : float
         A resting sensor's rate differs from the bias by no more (beyond 3 sd of the bias): slower, steady
         turning is taken for bias.
     use_magnetometer : bool
-        Without, the heading starts at zero and only the gyroscope carries it.
+        Without it the heading starts at zero and only the gyroscope carries it.
 
     Raises
     ------
@@ -62,7 +67,7 @@ class FusionSettings:
     """
 
     block_s: float = 1.0 / 32.0
-    gravity_m_s2: float = 9.80665
+    gravity_m_s2: float = g
     gyro_noise_rad_sqrt_s: float = 0.05 * _DEG
     gyro_scale_noise_sqrt_s: float = 0.002
     bias_walk_rad_s_sqrt_s: float = 0.002 * _DEG

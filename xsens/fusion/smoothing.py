@@ -1,13 +1,14 @@
-"""Back over a recorded stretch: every orientation from what came before it and after.
+"""Run the filter forward over a recorded stretch, and smooth the stretch backward.
 
-Inclination and turning come first, without the magnetometer, by a Rauch-Tung-Striebel pass over the filter's
-steps. Then the heading's offset from north, one number that wanders as slowly as the gyroscope allows, is
-smoothed over the field seen from those orientations. So iron cannot tilt the answer here either.
+Inclination and turning are smoothed first, without the magnetometer, by a Rauch-Tung-Striebel pass over the
+filter's steps. Then the heading's offset from north, one number that wanders as slowly as the gyroscope
+allows, is smoothed over the field seen from those orientations. So iron cannot tilt the smoothed orientation.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,23 +16,148 @@ from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from xsens.fusion.disturbance import FieldMonitor, FieldReading
-from xsens.fusion.errorstate import ANGLE, BIAS, HEADING, SPEED
-from xsens.fusion.forward import Pass, Step, forward
-from xsens.fusion.increments import Samples
-from xsens.fusion.quaternions import turn_matrix
+from xsens.fusion.detectors import FieldMonitor, FieldReading
+from xsens.fusion.errorstate import ANGLE, BIAS, HEADING, SPEED, ErrorStateFilter
+from xsens.fusion.increments import Increment, Samples, blocks_of, turn_matrix
 from xsens.fusion.settings import FusionSettings
+
+_CHUNK = 64
+"""Blocks summed with one bias, about two seconds; its later change is corrected to first order."""
 
 _STATES = 9
 """Attitude, bias and velocity: without the magnetometer there is one bias."""
 
 _FIRST_S = 1.0
-"""The first heading is the mean of so long, as in the filter."""
+"""The first heading is the mean over this time, as in the filter."""
+
+
+# -- forward
+
+
+@dataclass(frozen=True)
+class Step:
+    """State of the filter before and after one increment; matrices are world from sensor.
+
+    Attributes
+    ----------
+    increment : Increment
+    start : ndarray, shape (3, 3)
+        Orientation before the increment.
+    start_bias_rad_s : ndarray, shape (3,)
+    predicted, predicted_velocity_m_s : ndarray, shapes (3, 3) and (3,)
+        After the increment, before the correction.
+    matrix, velocity_m_s, bias_rad_s : ndarray, shapes (3, 3), (3,) and (3,)
+        After the correction.
+    covariance : ndarray, shape (13, 13)
+        After the correction.
+    transition, noise : ndarray, shape (13, 13)
+        Of the prediction.
+    resting, disturbed, started : bool
+    """
+
+    increment: Increment
+    start: FloatArray
+    start_bias_rad_s: FloatArray
+    predicted: FloatArray
+    predicted_velocity_m_s: FloatArray
+    matrix: FloatArray
+    velocity_m_s: FloatArray
+    bias_rad_s: FloatArray
+    covariance: FloatArray
+    transition: FloatArray
+    noise: FloatArray
+    resting: bool
+    disturbed: bool
+    started: bool
+
+
+@dataclass(frozen=True)
+class Pass:
+    """All steps of a stretch, and the turns within the steps.
+
+    Attributes
+    ----------
+    steps : list of Step
+    turns : list of ndarray, shape (samples of the step, 4)
+        ``start_from_sample``, scalar first, with the bias of the step's increment.
+    time_s : list of ndarray, shape (samples of the step,)
+        Time since the step's start.
+    """
+
+    steps: list[Step]
+    turns: list[FloatArray]
+    time_s: list[FloatArray]
+
+
+def forward(
+    samples: Samples, settings: FusionSettings, kept: ErrorStateFilter | None = None, pause_s: float = 0.0
+) -> tuple[Pass, ErrorStateFilter]:
+    """Run the filter over a stretch.
+
+    Parameters
+    ----------
+    samples : Samples
+        One stretch without a pause.
+    settings : FusionSettings
+    kept : ErrorStateFilter, optional
+        The filter at the end of the stretch before, to be continued.
+    pause_s : float
+        Time since the end of that stretch.
+    """
+    done = Pass([], [], [])
+    kalman = kept
+    for part, per_block in _parts(samples, settings):
+        blocks = blocks_of(part, per_block, np.zeros(3) if kalman is None else kalman.bias)
+        for k, increment in enumerate(blocks):
+            if kalman is None:
+                kalman = ErrorStateFilter(settings, increment)
+            elif not done.steps:
+                kalman.resume(increment, pause_s)
+            done.steps.append(_step(kalman, increment))
+            done.turns.append(blocks.turns_wxyz[k])
+            done.time_s.append(np.cumsum(blocks.step_s[k]))
+    assert kalman is not None
+    return done, kalman
+
+
+def _parts(samples: Samples, settings: FusionSettings) -> Iterator[tuple[Samples, int]]:
+    """Runs of whole blocks, then the remaining samples as one block, with the samples per block."""
+    per_block = max(1, round(settings.block_s / float(np.median(samples.step_s))))
+    whole = len(samples) // per_block * per_block
+    for first in range(0, whole, _CHUNK * per_block):
+        yield samples[first : min(first + _CHUNK * per_block, whole)], per_block
+    if whole < len(samples):
+        yield samples[whole:], len(samples) - whole
+
+
+def _step(kalman: ErrorStateFilter, increment: Increment) -> Step:
+    start, bias = kalman.matrix, kalman.heading_bias
+    kalman.advance(increment)
+    predicted, velocity = kalman.predicted
+    return Step(
+        increment=increment,
+        start=start,
+        start_bias_rad_s=bias,
+        predicted=predicted,
+        predicted_velocity_m_s=velocity,
+        matrix=kalman.matrix,
+        velocity_m_s=kalman.velocity,
+        bias_rad_s=kalman.heading_bias,
+        covariance=kalman.kalman.P,
+        transition=kalman.transition,
+        noise=kalman.noise,
+        resting=kalman.resting,
+        disturbed=kalman.disturbed,
+        started=kalman.started,
+    )
+
+
+# -- backward
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A stretch at the ends of its steps, preceded by its start.
+    """Smoothed orientation at the start of a stretch and at the end of each step.
 
     Attributes
     ----------
@@ -39,7 +165,7 @@ class Smoothed:
         World from sensor.
     bias_rad_s : ndarray, shape (steps + 1, 3)
     sd_rad : ndarray, shape (steps + 1, 3)
-        About the world's axes.
+        Standard deviation about the world's axes.
     disturbed, resting : ndarray of bool, shape (steps,)
     """
 
@@ -51,7 +177,7 @@ class Smoothed:
 
 
 def smooth(samples: Samples, settings: FusionSettings) -> tuple[Pass, Smoothed]:
-    """Smooth one stretch; its length must exceed the filter's start, one second."""
+    """Smooth one stretch, which must be longer than the filter's start, one second."""
     done, _ = forward(samples, replace(settings, use_magnetometer=False))
     level = _backward(done.steps)
     if not settings.use_magnetometer:
@@ -63,7 +189,7 @@ def smooth(samples: Samples, settings: FusionSettings) -> tuple[Pass, Smoothed]:
 
 
 def _backward(steps: list[Step]) -> Smoothed:
-    """Rauch-Tung-Striebel over the steps since the filter started, then by the gyroscope to the beginning."""
+    """Smooth the steps since the filter started (Rauch-Tung-Striebel); before, go back by the gyroscope."""
     first = next(k for k, step in enumerate(steps) if step.started)
     used = steps[first:]
     gains, covariances = _gains(used)
@@ -102,7 +228,7 @@ def _gains(steps: list[Step]) -> tuple[FloatArray, FloatArray]:
 
 
 def _begin(steps: list[Step], matrices: list[FloatArray], biases: list[FloatArray]) -> None:
-    """Go on backward by the gyroscope alone through the steps in which the filter started."""
+    """Extend backward by the gyroscope alone through the steps in which the filter started."""
     for step in reversed(steps):
         increment = step.increment
         matrices_after, bias = matrices[-1], biases[-1]
@@ -115,7 +241,7 @@ def _begin(steps: list[Step], matrices: list[FloatArray], biases: list[FloatArra
 
 
 def _pointed_north(steps: list[Step], level: Smoothed, settings: FusionSettings) -> Smoothed:
-    """Turn a smoothed stretch to magnetic north, by the field along it."""
+    """Turn a smoothed stretch to magnetic north by the field along it."""
     readings = _readings(steps, level, settings)
     if all(reading is None for reading in readings):
         return level
@@ -127,7 +253,7 @@ def _pointed_north(steps: list[Step], level: Smoothed, settings: FusionSettings)
 
 
 def _readings(steps: list[Step], level: Smoothed, settings: FusionSettings) -> list[FieldReading | None]:
-    """The field at every step, judged forward and backward in time: the better of both judgements."""
+    """Field at every step, judged forward and backward in time; the better judgement of the two."""
     forward_readings = _judged(steps, level, settings, range(len(steps)))
     backward_readings = _judged(steps, level, settings, range(len(steps) - 1, -1, -1))
     return [_better(a, b) for a, b in zip(forward_readings, backward_readings, strict=True)]
@@ -136,7 +262,7 @@ def _readings(steps: list[Step], level: Smoothed, settings: FusionSettings) -> l
 def _judged(
     steps: list[Step], level: Smoothed, settings: FusionSettings, order: range
 ) -> list[FieldReading | None]:
-    """Judgements in one direction; a first reference that did not prove itself is taken back."""
+    """Judge the field in one direction of time; steps judged by a wrong first reference are judged again."""
     monitor = FieldMonitor(settings)
     readings: list[FieldReading | None] = [None] * len(steps)
     wrong = 0
@@ -168,9 +294,9 @@ def _better(a: FieldReading | None, b: FieldReading | None) -> FieldReading | No
 def _smoothed_heading(
     steps: list[Step], level: Smoothed, readings: list[FieldReading | None], settings: FusionSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle about up that takes the smoothed stretch to north at every node, and its variance, (steps + 1,).
+    """Angle about up that turns the smoothed stretch to north, and its variance, each shape (steps + 1,).
 
-    State: the angle, and what the bias is still off by (sensor axes).
+    State, 5: the angle, the remaining error of the bias (sensor axes), and the field's own stray.
     """
     kalman = KalmanFilter(dim_x=5, dim_z=1)
     kalman.x[0, 0] = _first_angle(steps, readings)
@@ -208,7 +334,7 @@ def _first_angle(steps: list[Step], readings: list[FieldReading | None]) -> floa
 
 
 def _bias_variances(steps: list[Step]) -> FloatArray:
-    """What is left of the bias's variance when the stretch is over."""
+    """Variance of the bias, shape (3,), at the end of the stretch."""
     return np.diag(steps[-1].covariance)[BIAS]
 
 
@@ -227,7 +353,7 @@ def _heading_model(step: Step, matrix: FloatArray, settings: FusionSettings) -> 
 def _heading_variance(
     step: Step, reading: FieldReading, sd_rad: FloatArray, settings: FusionSettings
 ) -> float:
-    """Variance of a reading: the field's unevenness in a place, iron that shows, the inclination's share."""
+    """Variance of a heading reading: unevenness of the field, visible iron, error of the inclination."""
     x, y, z = reading.world_au
     steepness = z * z / max(x * x + y * y, 1e-12)
     tilt = steepness * (sd_rad[0] ** 2 + sd_rad[1] ** 2) / 2.0

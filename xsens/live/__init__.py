@@ -1,1 +1,1 @@
-"""From a port to a crash-safe file."""
+"""A live sensor on a port: configuration, recording to a crash-safe file, display of its state."""

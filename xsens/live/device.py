@@ -1,7 +1,7 @@
-"""A live sensor on a serial port: asked, configured, started and stopped.
+"""Find, configure, start and stop a live sensor on a serial port.
 
-The sensor is in one of two states: it takes settings in the one and sends data in the other. Whatever state
-it is found in, it is first brought to take settings; data still on their way are passed over.
+The sensor is in one of two states: in one it takes settings, in the other it sends data. It is always brought
+to take settings first; data that arrive meanwhile are ignored.
 """
 
 from __future__ import annotations
@@ -11,23 +11,20 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from xsens.messages.catalogue import (
+from xsens.messages.control import (
     BASE_RATE_HZ,
     Configuration,
-    Framer,
-    Message,
     MessageId,
     OutputItem,
     device_id,
-    encode,
     error_of,
     output_configuration,
-    reply_to,
     set_output_configuration,
 )
+from xsens.messages.framing import Framer, Message, encode
 from xsens.messages.mtdata import OutputMode, OutputSettings
 from xsens.messages.rawcounts import RawCalibration
 
@@ -36,13 +33,13 @@ if TYPE_CHECKING:
 
 Content = Literal["as set", "raw", "calibrated", "orientation"]
 
-CONTENTS: tuple[Content, ...] = ("as set", "raw", "calibrated", "orientation")
+CONTENTS: tuple[Content, ...] = get_args(Content)
 
 COMMON_BAUD = (115200, 921600, 460800, 230400, 57600)
-"""Tried in turn: the factory setting first, then faster ones, which are set more often than slower ones."""
+"""Order in which rates are tried: the factory setting, then faster ones, which are set more often."""
 
 ANSWER_S = 0.5
-"""Time for an answer: a sensor gives it within a few milliseconds, an adapter's driver may hold it for 16."""
+"""Time for an answer: a sensor takes a few milliseconds, an adapter's driver may add 16."""
 
 _POLL_S = 0.05
 _TRIES = 3
@@ -64,22 +61,27 @@ _STATUS = OutputItem(0xE020, _EVERY)
 
 
 class DeviceError(FileError):
-    """The sensor is not there, does not answer, or refuses what it is told."""
+    """The sensor is not there, does not answer, or refuses a setting."""
 
 
 @dataclass(frozen=True)
 class DeviceSettings:
-    """What the sensor is to send.
+    """Output of the sensor, and the speed of the line.
 
     Attributes
     ----------
     content : str
         ``"orientation"``: the sensor's own orientation and calibrated data; ``"calibrated"``: the latter
-        only; ``"raw"``: counts; ``"as set"``: whatever it is set to. An MT9-B only knows raw counts.
+        only; ``"raw"``: counts; ``"as set"``: its present setting. An MT9-B sends raw counts always.
     rate_hz : float, optional
         Samples per second; by default as set, and 100 for an MTData2 sensor whose content is chosen here.
     baud : int, optional
-        Of the line; by default the common ones are tried.
+        Speed of the line; by default the common ones are tried.
+
+    Raises
+    ------
+    InvalidInputError
+        If the content is not known or the rate not from 1 to 2000 Hz.
     """
 
     content: Content = "orientation"
@@ -95,7 +97,7 @@ class DeviceSettings:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What the sensor says about itself, after it has been configured.
+    """Identity and settings that the sensor reports after it has been configured.
 
     Attributes
     ----------
@@ -103,9 +105,9 @@ class DeviceInfo:
     kind : str
         ``"MT9-B"``, ``"legacy"`` (MTData) or ``"MTData2"``.
     rate_hz : float
-        Samples per second; NaN if it does not say.
+        Samples per second; NaN if it does not report them.
     header : tuple of Message
-        What a reader of its data needs: configuration and calibration, as the sensor sent them.
+        Configuration and calibration as the sensor sent them; a reader of its data needs them.
     """
 
     device_id: int
@@ -115,7 +117,7 @@ class DeviceInfo:
 
 
 class Device:
-    """A conversation with the sensor on an open port.
+    """A sensor on an open port, which answers requests and sends data.
 
     Parameters
     ----------
@@ -125,7 +127,7 @@ class Device:
     Attributes
     ----------
     tap : callable, optional
-        Given every byte that arrives, before anything is made of it.
+        Called with all bytes that arrive, before they are decoded.
     """
 
     def __init__(self, port: Serial) -> None:
@@ -143,15 +145,15 @@ class Device:
 
     @property
     def baud(self) -> int:
-        """Of the line."""
+        """Speed of the line."""
         return int(self._port.baudrate)
 
     def close(self) -> None:
-        """Close the port; the sensor goes on with what it does."""
+        """Close the port; the sensor's state does not change."""
         self._port.close()
 
     def receive(self) -> list[Message]:
-        """Messages that arrive now, after at most a twentieth of a second's wait.
+        """Messages that arrive within a twentieth of a second.
 
         Raises
         ------
@@ -182,21 +184,21 @@ class Device:
             raise DeviceError(f"{self._port.name}: the port is gone: {reason}") from error
 
     def request(self, request: Message, tries: int = _TRIES) -> Message:
-        """Send and wait for the answer; data and what else arrives meanwhile are passed over.
+        """Send a request and wait for the answer; other messages that arrive meanwhile are ignored.
 
         Raises
         ------
         DeviceError
             If there is no answer after `tries`, or the answer is an error.
         """
-        while self._waiting():  # an answer that came too late to an earlier request is none to this
+        while self._waiting():  # a late answer to an earlier request is not one to this
             self.receive()
         for _ in range(tries):
             self.send(request)
             deadline = time.monotonic() + ANSWER_S
             while time.monotonic() < deadline:
                 for message in self.receive():
-                    if message.mid == reply_to(request.mid):
+                    if message.mid == request.mid + 1:
                         return message
                     self._refuse(message, request)
         raise DeviceError(
@@ -205,7 +207,7 @@ class Device:
         )
 
     def _refuse(self, message: Message, request: Message) -> None:
-        """Errors end a request; a sensor that wakes up would measure unless told to stay."""
+        """Raise at an error; tell a sensor that wakes up not to begin measuring."""
         if message.mid == MessageId.ERROR:
             raise DeviceError(
                 f"{self._port.name}: message {request.mid:#04x} was answered by {error_of(message)}"
@@ -214,23 +216,23 @@ class Device:
             self.send(Message(MessageId.WAKE_UP_ACK))
 
     def ask(self, mid: int) -> Message | None:
-        """Answer to a request without payload; None if this sensor has none to it."""
+        """Answer to a request without payload; None if this sensor does not answer it."""
         try:
             return self.request(Message(mid), tries=2)
         except DeviceError:
             return None
 
     def go_to_config(self, tries: int = _TRIES) -> None:
-        """Make the sensor take settings; it stops sending data."""
+        """Bring the sensor to take settings; it stops sending data."""
         self.request(Message(MessageId.GO_TO_CONFIG), tries)
 
     def go_to_measurement(self) -> None:
-        """Make the sensor send data."""
+        """Bring the sensor to send data."""
         self.request(Message(MessageId.GO_TO_MEASUREMENT))
 
 
 def connect(port_name: str, baud: int | None = None) -> Device:
-    """Open a port with a sensor on it and make the sensor take settings.
+    """Open a port with a sensor on it and bring the sensor to take settings.
 
     Raises
     ------
@@ -281,12 +283,12 @@ def open_port(port_name: str, baud: int) -> Serial:
 
 
 def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
-    """Configure a sensor that takes settings, and ask it for all that a reader of its data needs.
+    """Configure a sensor that takes settings, and ask it for what a reader of its data needs.
 
     Raises
     ------
     DeviceError
-        If it does not answer, or refuses.
+        If the sensor does not answer, or refuses a setting.
     """
     number = device_id(device.request(Message(MessageId.REQ_DID)))
     current = device.ask(MessageId.OUTPUT_CONFIGURATION)
@@ -306,7 +308,7 @@ def _describe(device: Device, number: int, kind: str) -> DeviceInfo:
 
 
 def _rate_hz(header: tuple[Message, ...]) -> float:
-    """By the configuration, or failing that by the calibration block; NaN if neither says."""
+    """Rate by the configuration, else by the calibration block; NaN if neither holds it."""
     for message in header:
         if message.mid == MessageId.CONFIGURATION:
             return Configuration.from_message(message).rate_hz

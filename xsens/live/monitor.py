@@ -1,4 +1,4 @@
-"""What a live sensor is doing, from its own messages: rate, losses, orientation, and whether iron is near."""
+"""State of a live sensor from its own messages: rate, losses, orientation, and magnetic disturbance."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from xsens.fusion.online import OnlineFilter
+from xsens.fusion.settings import FusionSettings
 from xsens.live.device import DeviceInfo
-from xsens.logs.bytelogs import parse_stream
-from xsens.logs.logparts import Hints
+from xsens.logs.parts import Hints
+from xsens.logs.read import parse_stream
 from xsens.logs.samples import ImuLog
-from xsens.messages.catalogue import Framer, MessageId, encode
+from xsens.messages.control import MessageId
+from xsens.messages.framing import Framer, encode
 
 RATE_OVER_S = 2.0
-"""Long against an adapter's 16 ms between two handfuls of bytes, short against a person's patience."""
-
-FIELD_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
-"""Beyond which the field counts as disturbed, as in VQF (Laidig and Seel, Information Fusion 91, 2023)."""
+"""Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
 
 REFERENCE_S = 1.0
-"""Time at the start over which the field is taken as the place's own."""
+"""Time at the start over which the reference field is averaged."""
 
 _WORD = 1 << 16
 _MOST_PENDING = 1 << 20
@@ -36,28 +35,28 @@ _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 @dataclass(frozen=True)
 class LiveState:
-    """A sensor being recorded, as it is now.
+    """Present state of a sensor being recorded.
 
     Attributes
     ----------
     connected : bool
     elapsed_s : float
-        Since measuring began.
+        Time since measuring began.
     samples, lost : int
-        Received, and missing by the sensor's own counter while it was connected.
+        Samples received, and missing by the sensor's own counter while it was connected.
     interruptions : int
-        How often it was away.
+        How often the connection was lost.
     rate_hz : float
-        Received over the last two seconds.
+        Samples received per second over the last two seconds.
     bytes_written : int
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
         Norm of the magnetic field over that at the start; NaN without a magnetometer.
     dip_change_rad : float
-        Of the field's angle to the vertical; NaN without a magnetometer.
+        Change of the field's angle to the vertical; NaN without a magnetometer.
     note : str
-        What went wrong last; empty if nothing did.
+        The last problem; empty if there was none.
     """
 
     connected: bool
@@ -77,11 +76,12 @@ class LiveState:
         """Whether the field differs from that at the start; None if there is none."""
         if not np.isfinite(self.field):
             return None
-        off = abs(self.field - 1.0) > FIELD_TOLERANCE or abs(self.dip_change_rad) > DIP_TOLERANCE_RAD
-        return bool(off)
+        limits = FusionSettings()
+        norm_off = abs(self.field - 1.0) > limits.norm_tolerance
+        return bool(norm_off or abs(self.dip_change_rad) > limits.dip_tolerance_rad)
 
     def line(self) -> str:
-        """Everything in one line."""
+        """The state in one line of text."""
         parts = [f"{self.elapsed_s:6.1f} s", f"{self.samples} samples", f"{self.lost} lost"]
         parts.append(f"{self.rate_hz:.1f} Hz" if self.connected else "NOT CONNECTED")
         if self.interruptions:
@@ -98,7 +98,7 @@ class LiveState:
 
 
 class Monitor:
-    """Counts what a recording thread hears, and makes sense of it when asked for the state."""
+    """Count what a recording thread receives; decode it when asked for the state."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -114,7 +114,7 @@ class Monitor:
         self._field = _Field()
 
     def started(self, info: DeviceInfo) -> None:
-        """The sensor begins to measure, counting from anywhere."""
+        """Note that the sensor begins to measure; its counter may start anywhere."""
         with self._lock:
             self._digest()
             self._header = b"".join(encode(message) for message in info.header)
@@ -125,7 +125,7 @@ class Monitor:
             self._attitude = _Attitude(info.rate_hz)
 
     def arrived(self, received: bytes) -> None:
-        """Bytes have come, in whatever pieces."""
+        """Take in received bytes, in pieces of any size."""
         with self._lock:
             now_s = time.monotonic()
             data = [message for message in self._framer.feed(received) if message.mid in _DATA]
@@ -136,14 +136,14 @@ class Monitor:
                 self._digest()
 
     def interrupted(self, reason: str) -> None:
-        """The sensor is away, or still is."""
+        """Note that the connection is lost, or still is."""
         with self._lock:
             self._digest()
             self._interruptions += self._connected
             self._connected, self._note = False, reason
 
     def state(self, bytes_written: int) -> LiveState:
-        """How it goes now."""
+        """The state now, given the size of the file."""
         with self._lock:
             self._digest()
             return LiveState(
@@ -161,7 +161,7 @@ class Monitor:
             )
 
     def _rate_hz(self) -> float:
-        """Samples after the first arrival that is still counted, over the time since."""
+        """Samples after the oldest arrival that is kept, over the time since it."""
         while len(self._arrivals) > 2 and self._arrivals[-1][0] - self._arrivals[0][0] > RATE_OVER_S:
             self._arrivals.popleft()
         if not self._connected or len(self._arrivals) < 2:
@@ -182,7 +182,7 @@ class Monitor:
         self._field.follow(log, rotations)
 
     def _count_lost(self, log: ImuLog) -> int:
-        """Count what is missing within the log; returned is what is missing before it."""
+        """Count the samples missing within the log and before it; return the latter."""
         self._lost += log.lost
         if log.counter is None:
             return 0
@@ -195,7 +195,7 @@ class Monitor:
 
 
 class _Attitude:
-    """The sensor's own orientation if it sends one, else the filter's."""
+    """Latest orientation: the sensor's own if it sends one, else the filter's."""
 
     def __init__(self, rate_hz: float = float("nan")) -> None:
         self.latest: Rotation | None = None
@@ -203,7 +203,7 @@ class _Attitude:
         self._step_s = 1.0 / rate_hz if rate_hz > 0 else float("nan")
 
     def follow(self, log: ImuLog, lost_before: int) -> Rotation | None:
-        """Take in some samples; orientation of each, if the sensor sent them."""
+        """Take in some samples; return the orientation of each if the sensor sent all of them."""
         if log.world_from_sensor is None or not log.oriented.any():
             self._filtered(log, lost_before)
             return None
@@ -224,14 +224,14 @@ class _Attitude:
             self._filter.push(
                 [first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
             )
-        except InvalidInputError:  # damage: what is recorded stays, and the display begins anew
+        except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts
             self._filter = OnlineFilter()
         state = self._filter.state
         self.latest = None if state is None else state.world_from_sensor
 
 
 class _Field:
-    """The magnetic field beside that of the first second: its norm and its angle to the vertical."""
+    """Norm of the magnetic field and its angle to the vertical, compared with those of the first second."""
 
     def __init__(self) -> None:
         self.ratio = self.dip_change_rad = float("nan")

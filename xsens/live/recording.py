@@ -1,52 +1,47 @@
-"""Recording a live sensor to a file that a crash cannot spoil, through unplugging and plugging in again.
+"""Record a live sensor to a file that survives a crash, unplugging and plugging in again.
 
-What arrives is appended to the file as it comes, before anything is made of it: ending the program in any way
-loses only what the sensor has not sent. The file is the sensor's own messages. Each stretch of measuring
+Bytes are appended to the file as they arrive, before they are decoded: ending the program in any way loses
+only what the sensor has not yet sent. The file holds the sensor's own messages. Each stretch of measuring
 begins with its configuration, its calibration, and the time of the computer's clock (as a UTC message), by
-which a reader can tell how long the sensor was away.
+which a reader can tell how long the sensor was disconnected.
 """
 
 from __future__ import annotations
 
 import os
-import struct
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor
-from xsens.messages.catalogue import Message, MessageId, encode
-
-UTC_TIME = 0x61
-"""Message id of the answer to a request for the time."""
+from xsens.messages.control import MessageId, utc_message
+from xsens.messages.framing import encode
 
 SILENCE_S = 2.0
-"""A sensor that sends nothing for so long is asked whether it is still there; its slowest rate is 1 Hz."""
+"""A sensor silent for so long is taken for disconnected and asked to answer; its slowest rate is 1 Hz."""
 
 RETRY_S = 0.1
-"""A sensor with new power waits half a second for somebody to keep it from measuring in its own way."""
-_ALL_VALID = 7
+"""Pause between two searches for a sensor: after power-up it waits only half a second for settings."""
 
 
 class RawFile:
-    """Bytes appended to a file, each piece handed to the operating system at once.
+    """A file to which bytes are appended, each piece handed to the operating system at once.
 
     Parameters
     ----------
     path : path
     append : bool
-        Go on in a file that is there already, instead of refusing it.
+        Continue an existing file instead of refusing it.
 
     Raises
     ------
     FileError
-        If the file is there and `append` is false, or it cannot be written.
+        If the file exists and `append` is false, or it cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], append: bool = False) -> None:
@@ -60,7 +55,7 @@ class RawFile:
             raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def append(self, data: bytes) -> None:
-        """Add bytes; all of them are the operating system's when this returns."""
+        """Append bytes; the operating system has all of them when this returns."""
         left = memoryview(data)
         try:
             while left:
@@ -70,13 +65,13 @@ class RawFile:
         self.written += len(data)
 
     def sync(self) -> None:
-        """Have it on the disk, against a failure of the power and not only of the program."""
+        """Write to the disk, so that the bytes survive a power failure, not only one of the program."""
         if self._file >= 0:
             with suppress(OSError):  # pipes and some network file systems cannot
                 os.fsync(self._file)
 
     def close(self) -> None:
-        """Have everything on the disk and close; closing twice does nothing."""
+        """Write everything to the disk and close; closing twice does nothing."""
         self.sync()
         if self._file >= 0:
             os.close(self._file)
@@ -84,28 +79,28 @@ class RawFile:
 
 
 class Recorder:
-    """A sensor being recorded, in a thread of its own, so that no slow display can make it miss bytes.
+    """Record a sensor in a thread of its own, so that a slow display loses no bytes.
 
     Parameters
     ----------
     port : str
         Name of the serial port.
     path : path
-        New file, or one to go on in if `append`.
+        New file, or an existing one to continue if `append`.
     settings : DeviceSettings
     append : bool
 
     Attributes
     ----------
     info : DeviceInfo
-        What the sensor says about itself.
+        Identity and settings that the sensor reports.
 
     Raises
     ------
     DeviceError
         If no sensor answers, or refuses its settings.
     FileError
-        If the port cannot be opened or the file not be written.
+        If the port cannot be opened or the file cannot be written.
     """
 
     def __init__(
@@ -139,13 +134,13 @@ class Recorder:
         self.close()
 
     def close(self) -> None:
-        """Stop the sensor, take what it has still sent, and close port and file."""
+        """Stop the sensor, record what it sends until then, and close port and file."""
         self._stop.set()
         self._thread.join()
         self._file.close()
 
     def state(self) -> LiveState:
-        """How it goes; what has been recorded is then on the disk.
+        """State of the recording, after writing all of it to the disk.
 
         Raises
         ------
@@ -160,7 +155,7 @@ class Recorder:
         return self._monitor.state(self._file.written)
 
     def _record(self, device: Device | None) -> None:
-        """The thread: stretches of measuring until told to stop."""
+        """Run in the thread: measure, and find the sensor again when it is lost, until told to stop."""
         try:
             while device is not None:
                 try:
@@ -201,7 +196,7 @@ class Recorder:
                 raise DeviceError(f"{self._port}: the sensor has been silent for {SILENCE_S:g} s")
 
     def _found_again(self, device: Device) -> Device | None:
-        """The same sensor, ready to measure; None if told to stop before it is there."""
+        """The same sensor, ready to measure; None if told to stop before it is found."""
         found: Device | None = device
         while not self._stop.is_set():
             try:
@@ -234,21 +229,21 @@ def record(
     interval_s: float = 0.25,
     duration_s: float = float("inf"),
 ) -> Iterator[LiveState]:
-    """Record a sensor and say how it goes, until the time is over or the iteration is left.
+    """Record a sensor and yield its state, until the time is over or the iteration is left.
 
     Parameters
     ----------
     port, path, settings, append
         As for `Recorder`.
     interval_s : float
-        Between two states.
+        Time between two states.
     duration_s : float
-        Of the recording.
+        Length of the recording.
 
     Yields
     ------
     LiveState
-        The last one when all is in the file.
+        The last one when the whole recording is in the file.
     """
     with Recorder(port, path, settings, append) as recorder:
         end = time.monotonic() + duration_s
@@ -256,10 +251,3 @@ def record(
             time.sleep(min(interval_s, left))
             yield recorder.state()
     yield recorder.state()
-
-
-def utc_message(now: datetime | None = None) -> Message:
-    """The computer's time, in the form in which the sensors tell theirs."""
-    t = now or datetime.now(UTC)
-    fields = (t.microsecond * 1000, t.year, t.month, t.day, t.hour, t.minute, t.second, _ALL_VALID)
-    return Message(UTC_TIME, struct.pack(">IH6B", *fields))

@@ -1,1 +1,1 @@
-"""From files to samples on one clock."""
+"""Files and streams of the sensor to samples on one clock."""

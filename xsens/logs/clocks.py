@@ -1,7 +1,7 @@
-"""When the samples of a log were taken, and where some are missing, by what the sensor stamped on them.
+"""Rebuild the times of samples and find missing ones from the sensor's counter and clock.
 
-A counter of 16 bits and a clock of 32 wrap round; both are made to rise. A sensor that was unplugged starts
-both anew: how long it was away is told only by the computer's clock, if the recording holds it.
+A counter of 16 bits and a clock of 32 bits wrap round; both are unwrapped. A sensor that was unplugged starts
+both anew: the length of that pause is known only from the computer's clock, if the recording holds it.
 """
 
 from __future__ import annotations
@@ -16,34 +16,35 @@ from speckle3d.core.errors import InvalidInputError
 from xsens.logs.samples import Gap
 
 UNKNOWN_PAUSE_S = 1.0
-"""Taken as the pause before a new start that no clock tells of; longer than interpolation bridges."""
+"""Assumed pause before a new start of unknown length; longer than interpolation bridges."""
 
 _TICK_SPAN = 1 << 32
 _RARE = 0.01
 _LONGER = 1.6
-"""A step of the clock longer than this many periods is a gap, unless the clock is irregular."""
+"""A clock step of more periods is a gap, unless the clock is irregular."""
 
 _LONGER_STILL = (2.5, 10.0, float("inf"))
-"""...and what else may be the shortest gap, where that agrees better with the mean rate."""
+"""Other limits, used if they agree better with a constant rate."""
 
 
 @dataclass(frozen=True)
 class Stamps:
-    """What the messages of `m` samples say about their time.
+    """Time stamps of `m` samples as sent.
 
     Attributes
     ----------
     counter, ticks : ndarray of int, shape (m,), optional
         As sent, wrapping round.
     counter_span : int
-        Where the counter wraps round to 0.
+        Value at which the counter wraps round to 0.
     tick_s : float
+        Duration of a tick.
     period_s : float
-        Of sampling, as configured; NaN if not known.
+        Sampling period as configured; NaN if not known.
     others : ndarray of int, shape (m,), optional
-        How many messages before each sample were counted by the sensor, but were no samples.
+        Number of messages before each sample that the sensor counted, but that were no samples.
     starts : ndarray of bool, shape (m,), optional
-        Before which samples the sensor was started anew.
+        True for samples before which the sensor was started anew.
     computer_s : ndarray, shape (m,), optional
         The computer's clock at those starts; NaN elsewhere.
     """
@@ -60,12 +61,12 @@ class Stamps:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Time of the samples that are kept.
+    """Times of the samples that are kept.
 
     Attributes
     ----------
     kept : ndarray of bool, shape (m,)
-        False for samples that came twice.
+        False for repeated samples.
     time_s : ndarray, shape (kept,)
     counter : ndarray of int, shape (kept,), optional
     gaps : tuple of Gap
@@ -80,7 +81,7 @@ class Timeline:
 
 
 def timeline(stamps: Stamps) -> Timeline:
-    """Rebuild the clock.
+    """Rebuild the times of samples from their stamps.
 
     Raises
     ------
@@ -99,9 +100,9 @@ def timeline(stamps: Stamps) -> Timeline:
 
 
 def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Timeline:
-    """Clock of samples that come with their times, and perhaps with a counter that does not wrap round.
+    """Find repeats and gaps in samples that have times, and perhaps a counter that does not wrap round.
 
-    Samples whose time does not rise beyond all before are left out.
+    Samples not later than all before them are left out.
     """
     before = np.concatenate(([-np.inf], np.maximum.accumulate(time_s)[:-1]))
     kept = time_s > before
@@ -118,7 +119,7 @@ def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Ti
 
 
 def _first_of_repeats(stamps: Stamps) -> BoolArray:
-    """False for a sample whose stamps are those of the one before."""
+    """False for a sample with the same stamps as the one before."""
     same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
     repeated = np.logical_and.reduce(same)
     if stamps.starts is not None:
@@ -134,10 +135,10 @@ def _only(stamps: Stamps, kept: BoolArray) -> Stamps:
 
 @dataclass(frozen=True)
 class _Steps:
-    """From each kept sample to the next: seconds, samples missing between, and new starts.
+    """Steps from each kept sample to the next: seconds, samples missing between, and new starts.
 
-    `counts` is how far the counter rose; `unknown` marks the new starts that no clock tells of; `irregular`
-    that the clock's steps vary too much to tell single losses.
+    `counts` is the rise of the counter; `unknown` marks new starts after a pause of unknown length;
+    `irregular` is true if the clock's steps vary too much to tell single losses.
     """
 
     seconds: FloatArray
@@ -171,7 +172,7 @@ def _steps(stamps: Stamps) -> _Steps:
 def _seconds(
     ticks: IntArray | None, tick_s: float, samples: FloatArray | None, period_s: float
 ) -> FloatArray:
-    """By the clock, else by the counter."""
+    """Seconds of each step by the clock, else by the counter."""
     if ticks is not None:
         return np.asarray(ticks * tick_s)
     assert samples is not None  # one of the two is there
@@ -184,7 +185,7 @@ def _rise(values: IntArray | None, span: int) -> IntArray | None:
 
 
 def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None) -> BoolArray:
-    """Whether the sensor's clock, or failing that its counter, went back or is known to have been reset."""
+    """Mark steps over which the sensor's clock, or else its counter, went back or was reset."""
     if ticks is not None:
         anew = (ticks > _TICK_SPAN // 2) | (ticks == 0)
         known = None if stamps.computer_s is None else np.isfinite(stamps.computer_s)
@@ -195,7 +196,7 @@ def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None
 
 
 def _samples(counts: IntArray | None, others: IntArray | None, anew: BoolArray) -> FloatArray | None:
-    """How many sampling periods each step of the counter is; a sensor may count several for each sample."""
+    """Sampling periods of each step of the counter; a sensor may count several for each sample."""
     if counts is None:
         return None
     own = np.maximum(counts - (0 if others is None else np.diff(others)), 1)
@@ -203,7 +204,7 @@ def _samples(counts: IntArray | None, others: IntArray | None, anew: BoolArray) 
 
 
 def _stride(steps: IntArray) -> int:
-    """What all steps are multiples of, but for rare ones, as where the counter wraps round."""
+    """Greatest common divisor of all steps but rare ones, such as those where the counter wraps round."""
     values, often = np.unique(steps, return_counts=True)
     return int(np.gcd.reduce(values[often >= _RARE * steps.size])) or 1
 
@@ -211,7 +212,7 @@ def _stride(steps: IntArray) -> int:
 def _unlike_stride(
     samples: FloatArray | None, counts: IntArray | None, seconds: FloatArray, period_s: float, anew: BoolArray
 ) -> FloatArray | None:
-    """Periods of each step where every other sample is lost, say, which only the known period tells."""
+    """Sampling periods of each step, corrected by the known period if, say, every other sample is lost."""
     if samples is None or counts is None or not period_s > 0.0 or not seconds.size:
         return samples
     times = float(np.median(seconds / (period_s * samples[~anew])))
@@ -223,9 +224,9 @@ def _unlike_stride(
 def _missing(
     seconds: FloatArray, samples: FloatArray | None, period_s: float, span: int, anew: BoolArray
 ) -> tuple[IntArray, bool]:
-    """Samples taken between two, by the counter; by the clock where the counter wrapped or is not there.
+    """Number of missing samples in each step, and whether the clock is too irregular to tell all.
 
-    Also whether that is a clock too irregular to tell all.
+    By the counter; by the clock where the counter wrapped or there is none.
     """
     by_clock = seconds / period_s if period_s > 0.0 else np.ones(seconds.size)
     if samples is None:
@@ -237,10 +238,10 @@ def _missing(
 
 
 def _by_clock(periods: FloatArray) -> tuple[FloatArray, bool]:
-    """Periods of each step, whole, and whether the clock is irregular.
+    """Whole periods of each step, and whether the clock is irregular.
 
-    A clock that trembles has long steps without a loss, but short ones after them: then time is nearer to a
-    straight line over the samples if the long steps are not counted as several.
+    A clock with jitter has long steps without a loss, but short ones after them: then time is nearer to a
+    straight line over the samples if the long steps count as one period.
     """
     counted = [np.where(periods > limit, np.round(periods), 1.0) for limit in (_LONGER, *_LONGER_STILL)]
     if np.array_equal(counted[0], counted[-1]):
@@ -259,12 +260,12 @@ def _off_line(index: FloatArray, time: FloatArray) -> float:
 
 
 def _pauses(stamps: Stamps, anew: BoolArray, seconds: FloatArray) -> FloatArray:
-    """Seconds before each new start by the computer's clock, shape (m - 1,); NaN where it does not tell."""
+    """Pause before each new start by the computer's clock, shape (m - 1,); NaN where that is not known."""
     pauses = np.full(anew.size, np.nan)
     if stamps.computer_s is None:
         return pauses
     running = np.concatenate(([0.0], np.cumsum(np.where(anew, 0.0, seconds))))
-    behind = stamps.computer_s - running  # constant while the sensor runs: what it was away is in between
+    behind = stamps.computer_s - running  # constant while the sensor runs, and larger by each pause
     told = np.flatnonzero(np.isfinite(behind))
     for before, after in pairwise(told):
         if anew[before:after].sum() == 1:

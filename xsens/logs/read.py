@@ -1,25 +1,21 @@
-"""Logs of the sensor, of whatever kind: the kind is told by the content, never by the name."""
+"""Read logs of the sensor; the kind of a log is told by its content, never by its name."""
 
 from __future__ import annotations
 
 import os
-import secrets
 import stat
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError
-from xsens.logs.bytelogs import parse_stream
-from xsens.logs.filekinds import other_kind
-from xsens.logs.logparts import Hints
+from speckle3d.core.arrays import ByteArray, IntArray
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from xsens.logs.clocks import Stamps
+from xsens.logs.datamessages import legacy_log, mtdata2_log
+from xsens.logs.parts import Hints, Parts
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
-from xsens.messages.framing import find_frames
-
-__all__ = ["Hints", "parse_stream", "parse_text", "read_log", "write_csv"]
+from xsens.messages.control import MessageId, utc_time_s
+from xsens.messages.framing import Frames, find_frames
 
 PathLike = str | os.PathLike[str]
 
@@ -29,55 +25,86 @@ MOST_BYTES = 1 << 27
 _SNIFFED = 1 << 16
 _DAMAGED = 0.01
 _TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
-"""Which bytes text has none of, but for damage."""
+"""Bytes that text does not hold unless it is damaged."""
 
-_COLUMNS = {
-    "accelerometer_m_s2": "accelerometer_{}_m_s2",
-    "gyroscope_rad_s": "gyroscope_{}_rad_s",
-    "magnetometer_au": "magnetometer_{}_au",
-}
+_BEGINNINGS = (
+    (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
+    (b"MATLAB 7.3 MAT-file", "a MATLAB file"),
+    (b"MATLAB 5.0 MAT-file", "a MATLAB file"),
+    (b"\x93NUMPY", "a NumPy array"),
+    (b"PK\x03\x04", "a ZIP archive (or a spreadsheet)"),
+    (b"\x1f\x8b", "a gzip archive"),
+    (b"\x89PNG\r\n\x1a\n", "a PNG image"),
+    (b"\xff\xd8\xff", "a JPEG image"),
+    (b"%PDF-", "a PDF document"),
+    (b"PAR1", "a Parquet file"),
+    (b"ObjectType = ", "a MetaImage header"),
+    (b"NRRD000", "an NRRD image"),
+)
+"""First bytes of files that are no log of the sensor, so that an error can name what was given instead."""
+
+_DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
+_STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
+"""Messages after which the sensor's counter may have begun anew."""
 
 
 def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
-    """Read a log: MT9 software ``.bin``, ``.mtb``, raw bytes of a port, or text of any known kind.
+    r"""Read a log: MT9 software ``.bin``, ``.mtb``, raw bytes of a port, or text of any known kind.
 
     Parameters
     ----------
     path : path
     hints : Hints, optional
-        What is known beside the file.
+        Facts known beside the file.
 
     Returns
     -------
     ImuLog
-        Its notes say what was skipped, assumed or not compensated.
+        Its notes tell what was skipped, assumed or not compensated.
 
     Raises
     ------
     FileError
         If the file cannot be read, is no file, or is larger than `MOST_BYTES`.
     InvalidInputError
-        If it holds no samples of the sensor, or not what is needed to understand them.
+        If it holds no samples of the sensor, or lacks what is needed to understand them.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, xsens
+    >>> rows = [f"{time_s},0,0,9.8\n" for time_s in (0.0, 0.01, 0.02, 0.05)]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder, "log.csv")
+    ...     _ = path.write_text("time_s,acc_x,acc_y,acc_z\n" + "".join(rows))
+    ...     log = xsens.read_log(path)
+    >>> len(log), log.lost
+    (4, 2)
     """
-    data = _content(path)
+    data = read_bounded(path, MOST_BYTES)
     if not data:
         raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
-    if (other := other_kind(data)) is not None:
+    if (other := _other_kind(data)) is not None:
         raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
     if _is_text(data):
         return parse_text(_text(data), hints, str(path))
     return parse_stream(data, hints, str(path))
 
 
-def _content(path: PathLike) -> bytes:
-    """All bytes of a file of bounded size; never waits on a pipe, never reads from a device."""
+def read_bounded(path: PathLike, most_bytes: int) -> bytes:
+    """Read a file of bounded size whole; never wait on a pipe, never read from a device.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, is no file, or is larger than `most_bytes`.
+    """
     try:
         with open(path, "rb", opener=_without_waiting) as file:
             found = os.fstat(file.fileno())
             if not stat.S_ISREG(found.st_mode):
                 raise FileError(f"{path}: expected a file, got something else")
-            if found.st_size > MOST_BYTES:
-                raise FileError(f"{path}: expected at most {MOST_BYTES} bytes, got {found.st_size}")
+            if found.st_size > most_bytes:
+                raise FileError(f"{path}: expected at most {most_bytes} bytes, got {found.st_size}")
             return file.read(found.st_size)
     except FileError:
         raise
@@ -91,7 +118,7 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def _is_text(data: bytes) -> bool:
-    """Whether hardly any byte is a control character, and no message of the sensor is there."""
+    """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
     head = np.frombuffer(data[:_SNIFFED], dtype=np.uint8)
     controls = int((_TEXT_CONTROLS[head]).sum())
     return (_is_wide(data) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
@@ -105,61 +132,80 @@ def _text(data: bytes) -> str:
     return data.decode("utf-16" if _is_wide(data) else "utf-8-sig", errors="replace")
 
 
-def write_csv(path: PathLike, log: ImuLog) -> None:
-    """Write samples as a plain comma-separated file, which `read_log` reads back exactly.
+def _other_kind(data: bytes) -> str | None:
+    """Kind of a file that is clearly no log, in words; None if it may be one."""
+    for beginning, kind in _BEGINNINGS:
+        if data.startswith(beginning):
+            return kind
+    return "nothing but zeros" if not data.strip(b"\0") else None
 
-    Columns: ``time_s``, ``counter``, ``accelerometer_x_m_s2`` and so on, ``gyroscope_x_rad_s``,
-    ``magnetometer_x_au``, ``quaternion_w`` to ``quaternion_z`` (``world_from_sensor``, x magnetic north, z
-    up); only those the log has, blank where a sample lacks them. Gaps and notes are comments before them.
+
+# -- the sensor's own bytes
+
+
+def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: str = "stream") -> ImuLog:
+    """Read the samples in a run of bytes from the sensor.
+
+    The bytes may start in the middle of a message and have losses; the notes tell what was skipped.
+
+    Parameters
+    ----------
+    data : bytes or ndarray of uint8
+    hints : Hints, optional
+    source : str
+        Name of the bytes in errors.
 
     Raises
     ------
-    FileError
-        If the file cannot be written; then no part of it is left.
+    InvalidInputError
+        If they hold no data message, or lack what is needed to understand one.
     """
-    names, columns = _table(log)
-    lines = (*_comments(log), ",".join(names), *_lines(columns), "")
-    _write_whole(Path(path), "\n".join(lines))
+    frames = find_frames(data)
+    with naming(source):
+        which = _of_one_kind(frames)
+        parts = Parts(source, (*_skipped(frames), *_left_out(frames, which)))
+        read = legacy_log if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_log
+        return read(frames, which, _stretches(frames, which), parts, hints or Hints())
 
 
-def _table(log: ImuLog) -> tuple[list[str], list[list[str]]]:
-    named: list[tuple[str, FloatArray | IntArray]] = [("time_s", log.time_s)]
-    if log.counter is not None:
-        named.append(("counter", log.counter))
-    for attribute, name in _COLUMNS.items():
-        vectors = getattr(log, attribute)
-        if vectors is not None:
-            named += [(name.format(axis), vectors[:, i]) for i, axis in enumerate("xyz")]
-    if log.world_from_sensor is not None:
-        quaternions = log.world_from_sensor.as_quat(scalar_first=True)
-        quaternions[~log.oriented] = np.nan
-        named += [(f"quaternion_{axis}", quaternions[:, i]) for i, axis in enumerate("wxyz")]
-    return [name for name, _ in named], [_cells(values) for _, values in named]
+def _of_one_kind(frames: Frames) -> IntArray:
+    """Indices of the data messages of the most common kind and bus id."""
+    data = np.flatnonzero(np.isin(frames.mid, _DATA))
+    if not data.size:
+        raise InvalidInputError(
+            f"expected messages with data, got {len(frames)} others in {frames.data.size} bytes"
+        )
+    kinds = frames.mid[data].astype(np.int64) * 256 + frames.bid[data]
+    names, counts = np.unique(kinds, return_counts=True)
+    return np.asarray(data[kinds == names[counts.argmax()]])
 
 
-def _cells(values: FloatArray | IntArray) -> list[str]:
-    return ["" if number != number else repr(number) for number in values.tolist()]
+def _skipped(frames: Frames) -> tuple[str, ...]:
+    runs = frames.skipped()
+    if not runs:
+        return ()
+    size = sum(length for _, length in runs)
+    return (f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message",)
 
 
-def _lines(columns: list[list[str]]) -> Iterator[str]:
-    return map(",".join, zip(*columns, strict=True))
+def _left_out(frames: Frames, which: IntArray) -> tuple[str, ...]:
+    others = int(np.isin(frames.mid, _DATA).sum()) - which.size
+    return (f"{others} data messages of another kind or unit were left out",) if others else ()
 
 
-def _comments(log: ImuLog) -> Iterator[str]:
-    for note in (f"source: {log.source}", *(f"note: {note}" for note in log.notes)):
-        yield "# " + " ".join(note.split())
-    yield f"# gaps: {len(log.gaps)}"
-    for gap in log.gaps:
-        yield f"# gap: after sample {gap.after_index}, {gap.lost} lost, {gap.duration_s!r} s"
+def _stretches(frames: Frames, which: IntArray) -> Stamps:
+    """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
+    starts = np.zeros(which.size, dtype=bool)
+    computer_s = np.full(which.size, np.nan)
+    starts[_next_data(np.flatnonzero(np.isin(frames.mid, _STARTS)), which)[0]] = True
+    for after, i in zip(*_next_data(np.flatnonzero(frames.mid == MessageId.UTC_TIME), which), strict=True):
+        computer_s[after] = utc_time_s(frames.message(int(i)))
+    return Stamps(starts=starts, computer_s=computer_s)
 
 
-def _write_whole(path: Path, text: str) -> None:
-    """Beside the file, then in its place: it appears whole or not at all."""
-    part = path.with_name(f".part-{secrets.token_hex(4)}-{path.name}")
-    try:
-        part.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(part, path)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+def _next_data(messages: IntArray, which: IntArray) -> tuple[IntArray, IntArray]:
+    """Positions in `which` of the first data after each of `messages`, and the last message before those."""
+    after = np.searchsorted(which, messages)
+    after, messages = after[after < which.size], messages[after < which.size]
+    last = np.append(after[1:] != after[:-1], True)[: after.size]
+    return after[last], messages[last]

@@ -1,4 +1,4 @@
-"""What a log of the sensor holds, whatever file it came from: samples on the sensor's own clock.
+"""`ImuLog`: samples of one sensor on its own clock, whatever file they were read from.
 
 The world of an orientation is x magnetic north, y west, z up (the MT9-B's own, NWU), whatever frame the
 sensor was set to.
@@ -15,26 +15,27 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.streams import DEFAULT_MAX_GAP_S, TimedRotations
+from speckle3d.core.streams import DEFAULT_MAX_GAP_S
+from speckle3d.core.streams import TimedRotations as TimedRotations
 
 _VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 
 _PAUSE = 2.5
-"""A step of so many periods is no trembling of a clock."""
+"""A clock step of more periods is a pause, not jitter."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A pause in which the sensor sampled, but nothing arrived.
+    """A pause between two samples in which samples were lost.
 
     Attributes
     ----------
     after_index : int
         Index of the last sample before the pause.
     lost : int
-        How many samples are missing; 0 if only the pause is known.
+        Number of missing samples; 0 if only the pause is known.
     duration_s : float
-        From the last sample before to the first after.
+        From the last sample before the pause to the first after it.
     """
 
     after_index: int
@@ -58,13 +59,14 @@ class ImuLog:
     counter : ndarray of int, shape (m,), optional
         The sensor's own count, made to rise beyond its word length.
     gaps : tuple of Gap
-        In order; found from the counter or the clock.
+        In order of time; found from the counter or the clock.
     notes : tuple of str
-        What was skipped, assumed, or is not compensated.
+        What was skipped, assumed, or not compensated.
     source : str
-        Where the samples came from.
+        Name of the file or stream.
     oriented : ndarray of bool, shape (m,), optional
-        Which samples carry the sensor's own orientation; by default all, or none without `world_from_sensor`.
+        True where a sample has the sensor's own orientation; by default everywhere, or nowhere without
+        `world_from_sensor`.
 
     Raises
     ------
@@ -72,6 +74,14 @@ class ImuLog:
         If the clock does not rise or there is no sample.
     MismatchError
         If the lengths differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from xsens import ImuLog
+    >>> log = ImuLog(np.arange(5) / 100.0, gyroscope_rad_s=np.zeros((5, 3)))
+    >>> len(log), log.rate_hz, log.lost
+    (5, 100.0, 0)
     """
 
     time_s: FloatArray
@@ -122,26 +132,26 @@ class ImuLog:
         if not known.any():
             return float(1.0 / np.median(steps))
         period_s = np.median(steps[known] / taken[known])
-        regular = known & (steps < _PAUSE * period_s * taken)  # without pauses that nobody told of
+        regular = known & (steps < _PAUSE * period_s * taken)  # without pauses that are no known gap
         return float(taken[regular].sum() / steps[regular].sum())
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
+        """Time from the first sample to the last."""
         return float(self.time_s[-1] - self.time_s[0])
 
     @property
     def lost(self) -> int:
-        """How many samples are known to be missing."""
+        """Number of samples known to be missing."""
         return sum(gap.lost for gap in self.gaps)
 
     def rotations(self, max_gap_s: float = DEFAULT_MAX_GAP_S) -> TimedRotations:
-        """The sensor's own orientation, of the samples that carry it.
+        """The sensor's own orientation as a stream of the samples that have it.
 
         Raises
         ------
         InsufficientDataError
-            If no sample does.
+            If no sample has it.
         """
         if self.world_from_sensor is None or not self.oriented.any():
             raise InsufficientDataError(

@@ -1,30 +1,33 @@
-"""Logs as text: exports of the MT9 software, of MT Manager and of Xsens DOT, and plain comma-separated files.
+"""Read text logs: exports of the MT9 software, MT Manager and Xsens DOT, and plain comma-separated files.
 
-The MT9 software's name no columns: time, then 3 angles; or acceleration, rate of turn, field and perhaps
-temperature; or 9 of a matrix. All others name theirs, which come in any order.
+Exports of the MT9 software name no columns: time, then 3 angles; or acceleration, rate of turn, field and
+perhaps temperature; or the 9 elements of a matrix. All other files name their columns, in any order.
+Plain files are written here too.
 """
 
 from __future__ import annotations
 
+import os
 import re
+import secrets
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import FileError, InvalidInputError, naming
 from xsens.logs.clocks import Stamps, timeline_of_times
-from xsens.logs.columnnames import PLAIN_VECTORS, Names, incomplete, not_understood
-from xsens.logs.logparts import TRANSPOSED, Hints, Parts, assembled, on_clock
+from xsens.logs.parts import Hints, Parts, are_rotations, assembled, from_angles, on_clock, orientations_of
 from xsens.logs.samples import Gap, ImuLog
-from xsens.logs.texttables import TextTable, read_table
-from xsens.logs.worlds import (
-    Orientations,
-    are_rotations,
-    from_angles,
-    from_matrices,
-    from_quaternions,
-    rows_or_columns,
+from xsens.logs.texttables import TextTable, number, read_table
+
+Names = tuple[str, ...]
+
+PLAIN_VECTORS: tuple[Names, ...] = tuple(
+    tuple(f"{sensor}_{axis}_{unit}" for axis in "xyz")
+    for sensor, unit in (("accelerometer", "m_s2"), ("gyroscope", "rad_s"), ("magnetometer", "au"))
 )
 
 _VENDOR_VECTORS: tuple[Names, ...] = tuple(
@@ -43,6 +46,9 @@ _COUNTERS = ("packetcounter", "counter")
 _ALL = (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS, *_ANGLES, _MATRIX, _COUNTERS, (_TIME, _TICKS))
 _KNOWN = frozenset(name for names in _ALL for name in names)
 
+_MEASURED = re.compile(r"(acc|gyr|mag)[a-z]*(?:[ _.]?([xyz])(?![a-z]))?", re.ASCII)
+_SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
+_MOST_NAMED = 9
 _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.]+)\s*hz", re.IGNORECASE)
 _GAP = re.compile(r"# gap: after sample (\d+), (\d+) lost, (\S+) s$")
 _ENOUGH = 1000
@@ -53,7 +59,7 @@ _MT9_COLUMNS = {4: "angles", 10: "matrix or vectors", 11: "vectors"}
 
 @dataclass(frozen=True)
 class _Dialect:
-    """What a program's exports do not say: units, and the world of orientations."""
+    """Facts that a program's exports leave out: units, and the world of orientations."""
 
     tick_s: float = 1e-4
     gyroscope_to_rad: float = 1.0
@@ -73,14 +79,14 @@ _PLAIN = _Dialect(world="NWU")
 
 
 def parse_text(text: str, hints: Hints | None = None, source: str = "text") -> ImuLog:
-    """Samples in a table of numbers.
+    """Read the samples in a table of numbers.
 
     Parameters
     ----------
     text : str
     hints : Hints, optional
     source : str
-        What to call it in errors.
+        Name of the text in errors.
 
     Raises
     ------
@@ -91,11 +97,8 @@ def parse_text(text: str, hints: Hints | None = None, source: str = "text") -> I
         table = read_table(text, _KNOWN)
         out = table.left_out
         parts = Parts(source, (f"{out} lines of another length were left out",) if out else ())
-        return (
-            _named(table, parts, hints or Hints())
-            if table.names
-            else _unnamed(table, parts, hints or Hints())
-        )
+        read = _named if table.names else _unnamed
+        return read(table, parts, hints or Hints())
 
 
 def _dialect(table: TextTable) -> _Dialect:
@@ -117,17 +120,11 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
         told = _gaps_told(table.header, len(log))
         return log if told is None else replace(log, gaps=told)
     rate = _RATE.search("\n".join(table.header))
-    period_s = _period(rate.group(1)) if rate else float("nan")
+    rate_hz = number(rate.group(1)) if rate else float("nan")
+    period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
     ticks = _whole(table.column(_TICKS))
     stamps = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
     return on_clock(stamps, len(table.values), parts, hints)
-
-
-def _period(rate_hz: str) -> float:
-    try:
-        return 1.0 / float(rate_hz)
-    except (ValueError, ZeroDivisionError):
-        return float("nan")
 
 
 def _first(table: TextTable, names: Names) -> FloatArray | None:
@@ -135,7 +132,7 @@ def _first(table: TextTable, names: Names) -> FloatArray | None:
 
 
 def _timed(table: TextTable) -> tuple[TextTable, int]:
-    """Lines whose stamps are all there, and how many others there are."""
+    """Lines that lack no counter or time, and how many others there are."""
     good = np.ones(len(table.values), dtype=bool)
     for name in (*_COUNTERS, _TICKS):
         good &= _is_whole(table.column(name))
@@ -158,13 +155,16 @@ def _whole(column: FloatArray | None) -> IntArray | None:
 
 
 def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -> Parts:
-    found = [
-        next((v for names in both if (v := table.columns(*names)) is not None), None)
-        for both in zip(PLAIN_VECTORS, _VENDOR_VECTORS, strict=True)
-    ]
-    orientations, notes = _orientations(table, found[0], hints.world or dialect.world)
-    odd = not_understood(table.names, _KNOWN, dialect is _PLAIN)
-    odd = (*odd, *incomplete(table.names, (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS[:1])))
+    found = [table.first(names) for names in zip(PLAIN_VECTORS, _VENDOR_VECTORS, strict=True)]
+    orientations, notes = orientations_of(
+        hints.world or dialect.world,
+        found[0],
+        table.first(_QUATERNIONS),
+        table.columns(*_MATRIX),
+        table.first(_ANGLES),
+    )
+    odd = _not_understood(table.names, dialect is _PLAIN)
+    odd = (*odd, *_incomplete(table.names, (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS[:1])))
     if all(vectors is None for vectors in (*found, orientations)):
         got = "; ".join(odd) or "got none"
         raise InvalidInputError(
@@ -186,45 +186,17 @@ def _with_vectors(
     return replace(parts, accelerometer_m_s2=acceleration, gyroscope_rad_s=rate, magnetometer_au=field)
 
 
-def _orientations(
-    table: TextTable, acceleration: FloatArray | None, world: str
-) -> tuple[Orientations | None, tuple[str, ...]]:
-    for names in _QUATERNIONS:
-        if (quaternions := table.columns(*names)) is not None:
-            return from_quaternions(quaternions, world), ()
-    if (flat := table.columns(*_MATRIX)) is not None:
-        return _of_matrices(flat, acceleration, world)
-    for names in _ANGLES:
-        if (angles := table.columns(*names)) is not None:
-            return from_angles(angles, world), ()
-    return None, ()
-
-
-def _of_matrices(
-    flat: FloatArray, acceleration: FloatArray | None, world: str
-) -> tuple[Orientations, tuple[str, ...]]:
-    matrices, turned = rows_or_columns(flat.reshape(-1, 3, 3), acceleration)
-    return from_matrices(matrices, world), ((TRANSPOSED,) if turned else ())
-
-
 def _gaps_told(header: tuple[str, ...], samples: int) -> tuple[Gap, ...] | None:
-    """Gaps that a plain file tells, as `xsens.logs.read.write_csv` writes them; None if it does not."""
+    """Gaps listed in a plain file, as `write_csv` does; None if it lists none, not even their number."""
     if not any(line.startswith("# gaps:") for line in header):
         return None
     told = [match.groups() for line in header if (match := _GAP.match(line)) is not None]
-    gaps = (Gap(int(after), int(lost), _seconds(pause)) for after, lost, pause in told)
+    gaps = (Gap(int(after), int(lost), number(pause)) for after, lost, pause in told)
     return tuple(gap for gap in gaps if gap.after_index < samples - 1)
 
 
-def _seconds(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
-
-
 def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
-    """The MT9 software's exports, told apart by how many columns they have."""
+    """Log of an export of the MT9 software; its kind is told by the number of columns."""
     count = table.values.shape[1]
     _require_unnamed(table, count)
     if count not in _MT9_COLUMNS:
@@ -237,19 +209,137 @@ def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
 
 
 def _require_unnamed(table: TextTable, count: int) -> None:
-    """Refuse columns that have names, but none that is known besides the time."""
+    """Refuse columns that have names of which only the time is known."""
     for line in table.header[-1:]:
         for separator in ",;\t":
             names = tuple(cell.strip().strip('"').lower() for cell in line.lstrip("# ").split(separator))
             if len(names) == count and any(name in _KNOWN or name.startswith("time") for name in names):
-                raise InvalidInputError("; ".join(not_understood(names, _KNOWN, plain=True)))
+                raise InvalidInputError("; ".join(_not_understood(names, plain=True)))
 
 
 def _mt9(values: FloatArray, parts: Parts, world: str) -> Parts:
     if values.shape[1] == 3:
         return replace(parts, orientations=from_angles(values, world))
     if values.shape[1] == 9 and np.mean(are_rotations(values[:_ENOUGH].reshape(-1, 3, 3))) > 0.5:
-        orientations, _ = _of_matrices(values, None, world)
+        orientations, _ = orientations_of(world, None, matrices=values)
         note = "matrices are taken row by row: nothing in this file can tell"
         return replace(parts, orientations=orientations).noting(note)
     return _with_vectors(parts, values[:, :3], values[:, 3:6], values[:, 6:9])
+
+
+# -- columns that are not understood
+
+
+def _not_understood(names: Names, plain: bool) -> tuple[str, ...]:
+    """Note that lists unknown columns, with the known names that they may stand for.
+
+    All are listed if the file is a `plain` one. A program's exports hold many other columns: of theirs, only
+    names that look like a sensor's are listed. Names are in lower case.
+    """
+    unknown = [name for name in names if name and name not in _KNOWN]
+    if not plain:
+        unknown = [name for name in unknown if _SENSOR_LIKE.match(name)]
+    if not unknown:
+        return ()
+    named = [_with_likely(name) for name in unknown[:_MOST_NAMED]]
+    more = (f"and {len(unknown) - _MOST_NAMED} more",) if len(unknown) > _MOST_NAMED else ()
+    return (f"columns not understood: {', '.join((*named, *more))}",)
+
+
+def _incomplete(names: Names, groups: Iterable[Names]) -> tuple[str, ...]:
+    """Notes on columns that were left out because others of their group are missing."""
+    notes = []
+    for group in groups:
+        missing = [name for name in group if name not in names]
+        there = [name for name in group if name in names]
+        if missing and there:
+            notes.append(f"{', '.join(there)} left out: expected {', '.join(missing)} beside")
+    return tuple(notes)
+
+
+def _with_likely(name: str) -> str:
+    short = name if len(name) <= 40 else f"{name[:40]}..."
+    match = _MEASURED.match(name)
+    if match is None or match[2] is None:
+        return short
+    group = next(names for names in PLAIN_VECTORS if names[0].startswith(match[1]))
+    return f"{short} (expected {group['xyz'.index(match[2])]})"
+
+
+# -- writing
+
+
+def write_csv(path: str | os.PathLike[str], log: ImuLog) -> None:
+    """Write samples as a plain comma-separated file, which `read_log` reads back exactly.
+
+    Columns: ``time_s``, ``counter``, ``accelerometer_x_m_s2`` and so on, ``gyroscope_x_rad_s``,
+    ``magnetometer_x_au``, ``quaternion_w`` to ``quaternion_z`` (``world_from_sensor``, x magnetic north, z
+    up); only those the log has, blank where a sample lacks them. Gaps and notes are comments before them.
+
+    Parameters
+    ----------
+    path : path
+    log : ImuLog
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written; then no part of it is left.
+
+    Examples
+    --------
+    >>> import os, tempfile, numpy as np, xsens
+    >>> log = xsens.ImuLog(np.array([0.0, 0.01]), gyroscope_rad_s=np.full((2, 3), 0.1))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "log.csv")
+    ...     xsens.write_csv(path, log)
+    ...     xsens.read_log(path).rate_hz
+    100.0
+    """
+    names, columns = _csv_table(log)
+    lines = (*_comments(log), ",".join(names), *_csv_lines(columns), "")
+    _write_whole(Path(path), "\n".join(lines))
+
+
+def _csv_table(log: ImuLog) -> tuple[list[str], list[list[str]]]:
+    named: list[tuple[str, FloatArray | IntArray]] = [("time_s", log.time_s)]
+    if log.counter is not None:
+        named.append(("counter", log.counter))
+    for names, vectors in zip(
+        PLAIN_VECTORS, (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au), strict=True
+    ):
+        if vectors is not None:
+            named += [(name, vectors[:, i]) for i, name in enumerate(names)]
+    if log.world_from_sensor is not None:
+        quaternions = log.world_from_sensor.as_quat(scalar_first=True)
+        quaternions[~log.oriented] = np.nan
+        named += [(f"quaternion_{axis}", quaternions[:, i]) for i, axis in enumerate("wxyz")]
+    return [name for name, _ in named], [_csv_cells(values) for _, values in named]
+
+
+def _csv_cells(values: FloatArray | IntArray) -> list[str]:
+    return ["" if number != number else repr(number) for number in values.tolist()]
+
+
+def _csv_lines(columns: list[list[str]]) -> Iterator[str]:
+    return map(",".join, zip(*columns, strict=True))
+
+
+def _comments(log: ImuLog) -> Iterator[str]:
+    for note in (f"source: {log.source}", *(f"note: {note}" for note in log.notes)):
+        yield "# " + " ".join(note.split())
+    yield f"# gaps: {len(log.gaps)}"
+    for gap in log.gaps:
+        yield f"# gap: after sample {gap.after_index}, {gap.lost} lost, {gap.duration_s!r} s"
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Write beside the file, then rename, so that it appears whole or not at all."""
+    part = path.with_name(f".part-{secrets.token_hex(4)}-{path.name}")
+    try:
+        part.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(part, path)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,22 +1,21 @@
-"""Tables of numbers in text, by whatever separator: blank cells are NaN, lines of another length left out."""
+"""Read tables of numbers in text: blank cells are NaN, and lines of another length are left out."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.decimals import read_decimals
 
 SEPARATORS = ("\t", ";", ",", " ")
-"""In order of trust: a tab is nothing else, a comma may be a decimal point, a space may be anything."""
+"""In order of trust: a tab only separates, a comma may be a decimal point, a space may be padding."""
 
 _LONGEST_HEADER = 64
-"""Lines, not counting comments, in which the names of the columns, or the first numbers, must come."""
+"""Lines, not counting comments, among which the names of the columns or the first numbers must be."""
 
 _COMMENT = "#"
 _LONGEST_LINE = 1 << 16
@@ -25,14 +24,14 @@ _MOST_COLUMNS = 256
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table as found.
+    """A table of numbers, and the lines before it.
 
     Attributes
     ----------
     header : tuple of str
-        Lines before the table, without the names.
+        Lines before the table, without the line of names.
     names : tuple of str
-        Of the columns; empty if there are none.
+        Names of the columns, in lower case; empty if there are none.
     values : ndarray, shape (rows, columns)
     left_out : int
         Lines of another length than the first.
@@ -44,17 +43,21 @@ class TextTable:
     left_out: int
 
     def column(self, name: str) -> FloatArray | None:
-        """The column of that name, shape (rows,); None if there is none, or it is blank."""
+        """The column called `name`, shape (rows,); None if there is none, or it is blank."""
         if name not in self.names:
             return None
         values = self.values[:, self.names.index(name)]
         return values if np.isfinite(values).any() else None
 
     def columns(self, *names: str) -> FloatArray | None:
-        """Columns side by side, shape (rows, len(names)); None if any is not there."""
+        """Columns side by side, shape (rows, len(names)); None if one is missing."""
         found = [self.column(name) for name in names]
         there = [column for column in found if column is not None]
         return np.stack(there, axis=1) if len(there) == len(found) else None
+
+    def first(self, groups: Iterable[tuple[str, ...]]) -> FloatArray | None:
+        """Columns of the first group of names of which none is missing; None if there is no such group."""
+        return next((found for names in groups if (found := self.columns(*names)) is not None), None)
 
 
 def read_table(text: str, known: frozenset[str]) -> TextTable:
@@ -64,7 +67,7 @@ def read_table(text: str, known: frozenset[str]) -> TextTable:
     ----------
     text : str
     known : frozenset of str
-        Names of columns, in lower case, of which a line of names holds two at least.
+        Names of columns, in lower case; a line that holds at least two of them is the line of names.
 
     Raises
     ------
@@ -86,7 +89,7 @@ def read_table(text: str, known: frozenset[str]) -> TextTable:
 
 
 def _lines(text: str) -> Iterator[tuple[str, int, int]]:
-    """Lines, where each begins, and where the next does."""
+    """Lines, with the positions in the text where each and the next begin."""
     at = 0
     while at < len(text):
         end = text.find("\n", at)
@@ -96,7 +99,7 @@ def _lines(text: str) -> Iterator[tuple[str, int, int]]:
 
 
 def _begins_table(line: str, known: frozenset[str]) -> tuple[str, tuple[str, ...], int] | None:
-    """Separator, names and number of the columns, if `line` has their names or the first numbers."""
+    """Separator, names and number of the columns, if `line` holds their names or the first numbers."""
     if len(line) > _LONGEST_LINE or line.startswith(_COMMENT):
         return None
     for separator in SEPARATORS:
@@ -129,66 +132,42 @@ def _table(
     body = body.replace("\r", "").strip("\n")
     if separator != "," and "," in body:
         body = body.replace(",", ".")
-    values, left_out = None, 0
-    if separator != " ":
-        values = read_decimals(body.encode("ascii", "replace"), separator, count)
-    if values is None:
-        values = _quickly(body, separator, count)
-    if values is None:
-        values, left_out = _line_by_line(body, separator, count)
-    if not len(values):
+    lines = body.split("\n")
+    if separator == " ":
+        even = [line for line in lines if len(line.split()) == count]
+    else:
+        even = [line for line in lines if line.count(separator) == count - 1]
+    if not even:
         raise InvalidInputError(f"expected lines of {count} numbers, got none")
-    return TextTable(header, names, values, left_out)
+    return TextTable(header, names, _numbers(even, separator, count), len(lines) - len(even))
 
 
-def _quickly(body: str, separator: str, count: int) -> FloatArray | None:
-    """All lines at once; None if any has another length or holds what is no number."""
-    if separator == " " or not _even(body, separator, count):
-        return None
-    body = _blanks_named(body, separator).replace(separator, " ")
-    rows = body.count("\n") + 1
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # older NumPy only warns of what is no number
-            flat = np.fromstring(body, sep=" ")
-    except (ValueError, DeprecationWarning):
-        return None
-    return flat.reshape(rows, count) if flat.size == rows * count else None
+def _numbers(lines: list[str], separator: str, count: int) -> FloatArray:
+    """Numbers of lines of `count` cells each, shape (lines, count), NaN where a cell is no number.
 
-
-def _even(body: str, separator: str, count: int) -> bool:
-    """Whether every line has `count` cells."""
-    characters = np.frombuffer(body.encode("ascii", "replace"), dtype=np.uint8)
-    lines = np.flatnonzero(characters == ord("\n"))
-    separators = np.concatenate(([0], np.cumsum(characters == ord(separator))))
-    per_line = np.diff(separators[np.concatenate(([0], lines, [characters.size]))])
-    return bool((per_line == count - 1).all())
+    `numpy.loadtxt` refuses blank cells, which are then filled in, and words; if there are words, all cells
+    are read one by one, which takes seven times as long.
+    """
+    delimiter = None if separator == " " else separator
+    with suppress(ValueError):
+        return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2)
+    with suppress(ValueError):
+        filled = _blanks_named("\n".join(lines), separator).split("\n")
+        return np.loadtxt(filled, delimiter=delimiter, comments=None, ndmin=2)
+    rows = [[number(cell) for cell in _cells(line, separator)] for line in lines]
+    return np.array(rows, dtype=float).reshape(-1, count)
 
 
 def _blanks_named(body: str, separator: str) -> str:
-    """Cells of nothing as ``nan``."""
-    blank = separator * 2
-    while blank in body:
-        body = body.replace(blank, f"{separator}nan{separator}")
-    body = body.replace(f"\n{separator}", f"\nnan{separator}").replace(f"{separator}\n", f"{separator}nan\n")
-    body = f"nan{body}" if body.startswith(separator) else body
-    return f"{body}nan" if body.endswith(separator) else body
+    """Write ``nan`` into blank cells."""
+    while separator * 2 in body:
+        body = body.replace(separator * 2, f"{separator}nan{separator}")
+    body = f"\n{body}\n".replace(f"\n{separator}", f"\nnan{separator}")
+    return body.replace(f"{separator}\n", f"{separator}nan\n")[1:-1]
 
 
-def _line_by_line(body: str, separator: str, count: int) -> tuple[FloatArray, int]:
-    """Lines of `count` cells, NaN for what is no number, and how many lines had another length."""
-    rows: list[list[float]] = []
-    left_out = 0
-    for line in body.split("\n"):
-        cells = _cells(line, separator)
-        if len(cells) == count:
-            rows.append([_number(cell) for cell in cells])
-        else:
-            left_out += 1
-    return np.array(rows, dtype=float).reshape(-1, count), left_out
-
-
-def _number(cell: str) -> float:
+def number(cell: str) -> float:
+    """The number in a cell; NaN if it is none."""
     try:
         return float(cell)
     except ValueError:

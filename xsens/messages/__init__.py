@@ -1,1 +1,1 @@
-"""Between bytes and messages."""
+"""Bytes to messages: framing, ids and control messages, data messages, the calibration block."""

@@ -1,9 +1,9 @@
-"""Messages among bytes: the framing that all of the vendor's sensors share.
+"""Find messages in bytes and write them: the framing that all of the vendor's sensors share.
 
 A message is ``FA, bus id, message id, length, payload, checksum``; a length of 255 says that a 16-bit length
 follows. All bytes after the first, the checksum included, sum to zero modulo 256. Streams start in the middle
-of a message and lose bytes, so every byte FA may begin a message and none must: a message counts if its
-checksum holds, and of two that overlap the one counts whose end is where another begins.
+of a message and lose bytes, and payloads contain FA too. So a message is accepted wherever its checksum
+holds; of two that overlap, the one that another message follows directly.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ beyond it are damage, and waiting for so many bytes would stop a live stream."""
 
 _EXTENDED = 0xFF
 _BLOCK = 1 << 22
-"""Bytes looked at in one go, which bounds the memory that a file of nothing but FA takes."""
+"""Bytes scanned at a time, which bounds the memory that a file of nothing but FA takes."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,14 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """Bytes of `message`, with preamble, length and checksum."""
+    """Bytes of `message`, with preamble, length and checksum.
+
+    Examples
+    --------
+    >>> from xsens import Message, encode
+    >>> encode(Message(0x30)).hex()
+    'faff3000d1'
+    """
     size = len(message.payload)
     length = bytes([size]) if size < _EXTENDED else bytes([_EXTENDED, size >> 8, size & 0xFF])
     body = bytes([message.bid, message.mid]) + length + message.payload
@@ -67,19 +74,26 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> list[Message]:
-    """Messages in `data`, in order; bytes that belong to none are left out (see `find_frames`)."""
+    """Messages in `data`, in order; bytes that belong to none are left out (see `find_frames`).
+
+    Examples
+    --------
+    >>> from xsens import decode
+    >>> decode(bytes.fromhex("0000 faff3000d1 00"))
+    [Message(mid=48, payload=b'', bid=255)]
+    """
     return list(find_frames(data).messages())
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Where the messages lie in a run of bytes.
+    """Positions of the messages in a run of bytes.
 
     Attributes
     ----------
     data : ndarray of uint8, shape (size,)
     start, end : ndarray of int, shape (n,)
-        First byte, and the one after the checksum; in order, without overlap.
+        First byte of each message and the one after its checksum; in order, without overlap.
     """
 
     data: ByteArray
@@ -113,7 +127,7 @@ class Frames:
         return self.end - 1 - self.payload_start
 
     def payloads(self) -> ByteArray:
-        """Payloads as rows, shape (n, size); they must all be as long as the first."""
+        """Payloads as rows, shape (n, size); all must be as long as the first."""
         size = int(self.payload_size[0]) if len(self) else 0
         if size == 0 or not len(self):
             return np.zeros((len(self), size), dtype=np.uint8)
@@ -137,9 +151,9 @@ class Frames:
 
 
 def find_frames(data: bytes | ByteArray) -> Frames:
-    """Every message in `data`, wherever it starts and whatever lies between.
+    """Find every message in `data`, which may hold other bytes before, between and after them.
 
-    Time and memory grow with the size of `data` alone, whatever lengths it claims.
+    Time and memory are proportional to the size of `data`, whatever lengths the bytes claim.
     """
     array = np.frombuffer(data, dtype=np.uint8) if not isinstance(data, np.ndarray) else data
     starts, ends, at = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
@@ -153,12 +167,21 @@ def find_frames(data: bytes | ByteArray) -> Frames:
 
 
 class Framer:
-    """Finds messages in a live stream, whatever pieces it comes in.
+    """Find messages in a live stream that arrives in pieces of any size.
 
     Attributes
     ----------
     skipped_bytes : int
-        How many belonged to no message so far.
+        Bytes so far that belonged to no message.
+
+    Examples
+    --------
+    >>> from xsens import Framer
+    >>> framer = Framer()
+    >>> framer.feed(bytes.fromhex("faff30"))
+    []
+    >>> framer.feed(bytes.fromhex("00d1"))
+    [Message(mid=48, payload=b'', bid=255)]
     """
 
     def __init__(self) -> None:
@@ -166,11 +189,11 @@ class Framer:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Messages completed by `data`; an unfinished one is kept for the next call."""
+        """Messages that `data` completes; the bytes of an unfinished one are kept for the next call."""
         return self._take(self._rest + data, False)
 
     def close(self) -> list[Message]:
-        """Messages that an unfinished one seemed to hold, now that no more bytes will come."""
+        """Messages inside an apparent longer one that the end of the stream leaves unfinished."""
         return self._take(self._rest, True)
 
     def _take(self, data: bytes, final: bool) -> list[Message]:
@@ -182,9 +205,9 @@ class Framer:
 
 
 def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
-    """First and end bytes of messages in `data`, and how many bytes need not be looked at again.
+    """First and end bytes of messages in `data`, and how many bytes need not be scanned again.
 
-    Unless `final`, a message that may be finished by bytes to come keeps its bytes.
+    Unless `final`, a message that later bytes may complete is not counted among the latter.
     """
     start, end, whole = _candidates(data)
     unfinished = np.zeros(0, dtype=np.int64) if final else start[~whole]
@@ -194,7 +217,7 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
 
 
 def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, BoolArray]:
-    """Where messages may begin, where they would end, and whether all of their bytes are there."""
+    """First and end bytes of possible messages, and whether `data` holds all of their bytes."""
     start = np.flatnonzero(data == PREAMBLE)
     last = data.size - 1
     length = data[np.minimum(start + 3, last)].astype(np.int64)
@@ -213,7 +236,7 @@ def _checksum_holds(data: ByteArray, start: IntArray, end: IntArray) -> BoolArra
 
 
 def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> tuple[IntArray, IntArray, int]:
-    """Of messages that may overlap, those that count, and where the first still unfinished one begins."""
+    """Choose among messages that may overlap; also where the first still unfinished one begins."""
     counts = _clear(start, end, unfinished)
     rest = np.flatnonzero(~counts)
     if rest.size:
@@ -227,7 +250,7 @@ def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> t
 
 
 def _clear(start: IntArray, end: IntArray, unfinished: IntArray) -> BoolArray:
-    """Which messages overlap no other and no unfinished one: nearly all, and they need no choice."""
+    """Mark messages that overlap no other and no unfinished one: nearly all, and they need no choice."""
     if not start.size:
         return np.zeros(0, dtype=bool)
     reach = np.maximum.accumulate(end)
@@ -244,7 +267,7 @@ def _is_in(points: IntArray, increasing: IntArray) -> BoolArray:
 
 
 def _choose(start: list[int], end: list[int], followed: list[bool], unfinished: list[int]) -> list[int]:
-    """Indices of the messages that count."""
+    """Indices of the accepted ones among messages that overlap, one after the other."""
     chosen: list[int] = []
     free = wait = i = 0
     while i < len(start):
@@ -265,7 +288,7 @@ def _choose(start: list[int], end: list[int], followed: list[bool], unfinished: 
 
 
 def _followed_within(i: int, start: list[int], end: list[int], followed: list[bool]) -> int:
-    """The first message that begins inside message `i` and is followed by another; else `i`."""
+    """Index of the first message that begins inside message `i` and is followed by another; else `i`."""
     j = i + 1
     while j < len(start) and start[j] < end[i]:
         if followed[j]:

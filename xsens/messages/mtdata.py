@@ -1,29 +1,58 @@
-"""What the legacy data message MTData carries: raw counts, calibrated values, orientation.
+"""Decode the legacy data message MTData, and the number formats it shares with MTData2.
 
-Nothing in the message says how it is laid out; output mode and settings do, from the configuration or from
-whoever set them. A unit on a bus with a master, and the MT9-B, put the counter first instead of last.
+The message does not describe its own layout: output mode and settings do, known from the configuration or
+from whoever set them. A unit on a bus with a master, and the MT9-B, put the counter first instead of last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntFlag
+from enum import IntEnum, IntFlag
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import ByteArray
+from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from xsens.messages.numberformats import NumberFormat, bytes_from_numbers, numbers_from_bytes
 
-Values = dict[str, npt.NDArray[np.float64]]
+Values = dict[str, FloatArray]
 """Field name to values, shape (n, count); whole numbers are exact."""
 
 
+class NumberFormat(IntEnum):
+    """Formats of real numbers, all big-endian; the values are those of the vendor's two-bit fields.
+
+    FP12.20 is a 32-bit integer over 2**20; FP16.32 a 48-bit integer over 2**32, its 32 bits of fraction
+    before its 16 bits of integer. Every value of each format is exact as float64.
+    """
+
+    FLOAT32 = 0
+    FP12_20 = 1
+    FP16_32 = 2
+    FLOAT64 = 3
+
+    @property
+    def size(self) -> int:
+        """Bytes of one number."""
+        return (4, 4, 6, 8)[self]
+
+
+def numbers_from_bytes(rows: ByteArray, form: NumberFormat) -> FloatArray:
+    """Decode rows of bytes, shape (n, k * size), as float64, shape (n, k)."""
+    packed = np.ascontiguousarray(rows)
+    if form in (NumberFormat.FLOAT32, NumberFormat.FLOAT64):
+        with np.errstate(invalid="ignore"):  # signalling NaNs, which damage can make
+            return packed.view(f">f{form.size}").astype(np.float64)
+    if form is NumberFormat.FP12_20:
+        return packed.view(">i4") / 2.0**20
+    parts = packed.reshape(len(rows), -1, 6)
+    fraction = np.ascontiguousarray(parts[..., :4]).view(">u4")[..., 0]
+    whole = np.ascontiguousarray(parts[..., 4:]).view(">i2")[..., 0]
+    return np.asarray(whole + fraction / 2.0**32)
+
+
 class OutputMode(IntFlag):
-    """What the sensor sends."""
+    """Parts that the sensor sends."""
 
     TEMPERATURE = 0x0001
     CALIBRATED = 0x0002
@@ -34,11 +63,11 @@ class OutputMode(IntFlag):
     STATUS = 0x0800
     RAW = 0x4000
     MT9 = 0x8000
-    """The MT9-B's raw record, its counter first."""
+    """The MT9-B's raw record, which begins with the counter."""
 
 
 class OutputSettings(IntFlag):
-    """In what manner; orientation and number format are fields of two bits, for which see `DataLayout`."""
+    """Options of the parts; orientation and number format are fields of two bits, see `DataLayout`."""
 
     COUNTER = 0x1
     UTC = 0x2
@@ -56,7 +85,7 @@ class OutputSettings(IntFlag):
 
 @dataclass(frozen=True)
 class Field:
-    """One run of values in a message: `kind` is real, or a numpy type of big-endian whole numbers."""
+    """A run of values in a message: `kind` is real, or a NumPy type of big-endian whole numbers."""
 
     name: str
     count: int
@@ -82,19 +111,19 @@ _ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matri
 
 @dataclass(frozen=True)
 class DataLayout:
-    """Which fields follow one another in an MTData payload.
+    """Order of the fields in an MTData payload.
 
     Attributes
     ----------
     mode, settings : int
         See `OutputMode` and `OutputSettings`.
     counter_first : bool
-        As from a unit behind a master; always so in mode `OutputMode.MT9`.
+        True for a unit behind a master; mode `OutputMode.MT9` always begins with the counter.
 
     Raises
     ------
     InvalidInputError
-        If the mode asks for nothing, or for raw counts together with anything else.
+        If the mode has no part, or raw counts together with another part.
     """
 
     mode: int
@@ -117,17 +146,17 @@ class DataLayout:
 
     @property
     def number_format(self) -> NumberFormat:
-        """How real numbers are written."""
+        """Format of real numbers."""
         return NumberFormat((self.settings >> 8) & 3)
 
     @property
     def frame(self) -> str:
-        """World of the orientation: NWU, or NED if so set."""
+        """World of the orientation: NED if that is set, else NWU."""
         return "NED" if self.settings & OutputSettings.NED else "NWU"
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
-        """In the order of the message."""
+        """Fields in the order of the message."""
         if self.mode == OutputMode.MT9:
             return (_COUNTER, *_RAW)
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
@@ -188,34 +217,7 @@ class DataLayout:
             at += width
         return values
 
-    def _decoded(self, field: Field, rows: ByteArray) -> npt.NDArray[np.float64]:
+    def _decoded(self, field: Field, rows: ByteArray) -> FloatArray:
         if field.kind == "real":
             return numbers_from_bytes(rows, self.number_format)
         return np.ascontiguousarray(rows).view(field.kind).astype(np.float64)
-
-    def encode(self, values: Mapping[str, npt.ArrayLike]) -> ByteArray:
-        """Payloads as rows of bytes, shape (n, size), from values of shape (n, count) by field name.
-
-        Raises
-        ------
-        InvalidInputError
-            If a field is missing, has another shape, or does not fit its format.
-        """
-        parts = []
-        for field in self.fields:
-            if field.name not in values:
-                raise InvalidInputError(f"MTData of mode {self.mode:#06x}: expected {field.name}, got none")
-            parts.append(self._encoded(field, np.atleast_2d(np.asarray(values[field.name], dtype=float))))
-        if len({len(part) for part in parts}) > 1:
-            raise InvalidInputError("MTData: expected as many rows of every field")
-        return np.concatenate(parts, axis=1)
-
-    def _encoded(self, field: Field, array: npt.NDArray[np.float64]) -> ByteArray:
-        if array.ndim != 2 or array.shape[1] != field.count:
-            raise InvalidInputError(f"{field.name}: expected shape (n, {field.count}), got {array.shape}")
-        if field.kind == "real":
-            return bytes_from_numbers(array, self.number_format)
-        most = np.iinfo(field.kind).max
-        if not ((array >= 0) & (array <= most) & (array == np.floor(array))).all():
-            raise InvalidInputError(f"{field.name}: expected whole numbers from 0 to {most}")
-        return np.ascontiguousarray(array.astype(field.kind)).view(np.uint8)

@@ -1,24 +1,30 @@
-"""What the self-describing data message MTData2 carries: items of identifier, size and data.
+"""Decode the self-describing data message MTData2: items of identifier, size and data.
 
-The last four bits of an identifier say how its real numbers are written and in which world: ENU, NED or NWU.
-Items that are not known, or not as long as they should be, are kept as bytes.
+The last four bits of an identifier give the format of its real numbers and their world: ENU, NED or NWU.
+Items that are unknown, or of another length than they should have, are kept as bytes.
+
+A sensor repeats few arrangements of items: each is taken apart once, and `columns` reads its numbers from all
+messages that share it. Only damage makes many arrangements; those are taken apart one by one.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from speckle3d.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.numberformats import NumberFormat, bytes_from_numbers, numbers_from_bytes
+from xsens.messages.framing import Frames
+from xsens.messages.mtdata import NumberFormat, numbers_from_bytes
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What an identifier stands for: `reals` real numbers, or whole numbers packed as `whole`, or bytes."""
+    """Meaning of an identifier: `reals` real numbers, or whole numbers packed as `whole`, or bytes."""
 
     name: str
     reals: int = 0
@@ -91,14 +97,20 @@ _WORLDS = ("ENU", "NED", "NWU")
 
 
 def kind_of(identifier: int) -> Kind | None:
-    """What `identifier` stands for, whatever its format and world; None if it is not known."""
+    """Meaning of `identifier` in any format and world; None if it is not known."""
     exact = KINDS.get(identifier)
     general = KINDS.get(identifier & 0xFFF0)
     return exact if exact else general if general and general.reals and identifier & 0xC != 0xC else None
 
 
+def name_of(identifier: int) -> str:
+    """Name of an item; the identifier in hexadecimal if it is not known."""
+    kind = kind_of(identifier)
+    return kind.name if kind else f"{identifier:#06x}"
+
+
 def number_format(identifier: int) -> NumberFormat:
-    """How the real numbers of an item are written."""
+    """Format of an item's real numbers."""
     return NumberFormat(identifier & 3)
 
 
@@ -110,14 +122,6 @@ def world_of(identifier: int) -> str:
     return _WORLDS[code]
 
 
-def identifier_of(name: str, form: NumberFormat = NumberFormat.FLOAT32, world: str = "ENU") -> int:
-    """Identifier of the item called `name`, with its format and world where it has any."""
-    for identifier, kind in KINDS.items():
-        if kind.name == name:
-            return identifier | (form | _WORLDS.index(world) << 2 if kind.reals else 0)
-    raise InvalidInputError(f"MTData2 item: expected one of {len(KINDS)} names, got {name!r}")
-
-
 @dataclass(frozen=True)
 class Item:
     """One item of a message.
@@ -126,7 +130,7 @@ class Item:
     ----------
     identifier : int
     values : tuple of float, tuple of int, or bytes
-        Real numbers, whole numbers, or what is not known, as `kind_of` says.
+        Real numbers or whole numbers by `kind_of`; bytes if the item is not understood.
     """
 
     identifier: int
@@ -134,13 +138,12 @@ class Item:
 
     @property
     def name(self) -> str:
-        """What it is called; the identifier in hexadecimal if it is not known."""
-        kind = kind_of(self.identifier)
-        return kind.name if kind else f"{self.identifier:#06x}"
+        """Name of the item; the identifier in hexadecimal if it is not known."""
+        return name_of(self.identifier)
 
 
 def size_of(identifier: int) -> int | None:
-    """Bytes of an item's data; None if they may be any number."""
+    """Bytes of an item's data; None if the length is not fixed."""
     kind = kind_of(identifier)
     if kind is None or not (kind.reals or kind.whole):
         return None
@@ -148,7 +151,7 @@ def size_of(identifier: int) -> int | None:
 
 
 def parts(payload: bytes) -> Iterator[tuple[int, int, int]]:
-    """Identifier, first byte and size of the data of each item.
+    """Identifier, and first byte and size of the data, of each item in a payload.
 
     Raises
     ------
@@ -167,7 +170,7 @@ def parts(payload: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def decode_items(payload: bytes) -> list[Item]:
-    """Items of a message, in its order.
+    """Items of a payload, in its order.
 
     Raises
     ------
@@ -187,33 +190,118 @@ def _decoded(identifier: int, data: bytes) -> tuple[float, ...] | tuple[int, ...
     return tuple(numbers_from_bytes(row, number_format(identifier))[0].tolist())
 
 
-def encode_items(items: Iterable[Item]) -> bytes:
-    """Payload that holds `items`.
+# -- many messages at once
 
-    Raises
-    ------
-    InvalidInputError
-        If an item has too many or too few numbers, or one that does not fit.
+Arrangement = tuple[tuple[int, int], ...]
+"""Identifier and first byte of each wanted item."""
+
+_MOST_ARRANGEMENTS = 32
+"""Arrangements that messages of one length may have before they are taken apart one by one."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Numbers of one item from all messages that hold it.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (n,)
+        Indices of the messages, rising.
+    values : ndarray, shape (n, count)
     """
-    return b"".join(map(_encoded, items))
+
+    rows: IntArray
+    values: FloatArray
 
 
-def _encoded(item: Item) -> bytes:
-    data = item.values if isinstance(item.values, bytes) else _packed(item, item.values)
-    if not 0 <= item.identifier <= 0xFFFF or len(data) > 0xFF:
-        raise InvalidInputError(
-            f"{item.name}: expected an identifier of 16 bits and at most 255 bytes, got {len(data)} bytes"
-        )
-    return struct.pack(">HB", item.identifier, len(data)) + data
+def columns(frames: Frames, wanted: frozenset[str]) -> tuple[dict[int, Column], int]:
+    """Numbers of the `wanted` items by identifier, and how many messages are damaged.
+
+    Parameters
+    ----------
+    frames : Frames
+        MTData2 messages.
+    wanted : frozenset of str
+        Names of items whose numbers are all of one type.
+    """
+    found: dict[int, list[Column]] = defaultdict(list)
+    damaged = 0
+    for rows, payloads in _by_length(frames):
+        for arrangement, same in _by_arrangement(payloads, wanted):
+            if arrangement is None:
+                damaged += same.size
+                continue
+            some = payloads if same.size == len(payloads) else payloads[same]
+            for identifier, at in arrangement:
+                found[identifier].append(Column(rows[same], _numbers(identifier, some, at)))
+    return {identifier: _joined(pieces) for identifier, pieces in found.items()}, damaged
 
 
-def _packed(item: Item, values: tuple[float, ...]) -> bytes:
-    kind = kind_of(item.identifier)
-    if kind is None or not (kind.whole or len(values) == kind.reals):
-        raise InvalidInputError(f"{item.name}: expected bytes or {kind.reals if kind else 0} numbers")
-    if kind.reals:
-        return bytes_from_numbers([values], number_format(item.identifier)).tobytes()
+def _by_length(frames: Frames) -> Iterator[tuple[IntArray, ByteArray]]:
+    sizes = frames.payload_size
+    for size in np.unique(sizes):
+        rows = np.flatnonzero(sizes == size)
+        yield rows, frames[rows].payloads()
+
+
+def _by_arrangement(
+    payloads: ByteArray, wanted: frozenset[str]
+) -> Iterator[tuple[Arrangement | None, IntArray]]:
+    """Arrangements (None if damaged) and the indices of the payloads, all of one length, that have them."""
+    left = np.arange(len(payloads))
+    for _ in range(_MOST_ARRANGEMENTS):
+        if not left.size:
+            return
+        items = _items(payloads[left[0]].tobytes())
+        same = _like_the_first(payloads[left], items or [])
+        yield _wanted(items, wanted), left[same]
+        left = left[~same]
+    others: dict[Arrangement | None, list[int]] = defaultdict(list)
+    for row in left.tolist():
+        others[_wanted(_items(payloads[row].tobytes()), wanted)].append(row)
+    yield from ((arrangement, np.array(rows)) for arrangement, rows in others.items())
+
+
+def _like_the_first(payloads: ByteArray, items: list[tuple[int, int, int]]) -> BoolArray:
+    """Mark payloads with the first one's identifiers and sizes; without items, the first alone."""
+    heads = [at + k for _, at, _ in items for k in (-3, -2, -1)]
+    if not heads:
+        return np.asarray(np.arange(len(payloads)) == 0)
+    return np.asarray((payloads[:, heads] == payloads[0, heads]).all(axis=1))
+
+
+def _items(payload: bytes) -> list[tuple[int, int, int]] | None:
     try:
-        return struct.pack(kind.whole, *values)
-    except struct.error as error:
-        raise InvalidInputError(f"{item.name}: {error}") from error
+        return list(parts(payload))
+    except InvalidInputError:
+        return None
+
+
+def _wanted(items: list[tuple[int, int, int]] | None, wanted: frozenset[str]) -> Arrangement | None:
+    if items is None:
+        return None
+    return tuple((i, at) for i, at, size in items if name_of(i) in wanted and size == size_of(i))
+
+
+def _numbers(identifier: int, payloads: ByteArray, at: int) -> FloatArray:
+    size = size_of(identifier)
+    kind = kind_of(identifier)
+    assert size is not None  # _wanted passes only items of fixed size
+    assert kind is not None
+    data = payloads[:, at : at + size]
+    if kind.reals:
+        return numbers_from_bytes(data, number_format(identifier))
+    return np.ascontiguousarray(data).view(_whole_type(kind)).astype(np.float64)
+
+
+def _whole_type(kind: Kind) -> np.dtype[np.void]:
+    code = {"B": "u1", "H": "u2", "I": "u4"}[kind.whole[-1]]
+    return np.dtype(f">{code}")
+
+
+def _joined(pieces: list[Column]) -> Column:
+    if len(pieces) == 1:
+        return pieces[0]
+    rows = np.concatenate([piece.rows for piece in pieces])
+    order = np.argsort(rows, kind="stable")
+    return Column(rows[order], np.concatenate([piece.values for piece in pieces])[order])

@@ -1,8 +1,8 @@
-"""Raw counts to units, by the calibration block that the sensor keeps and its logs begin with.
+"""Convert raw counts to units by the calibration block that the sensor keeps and its logs begin with.
 
-The block's layout is not published; what is known of it was found by comparing logs with gravity. A vector of
-counts ``u`` becomes ``M^-1 ((u - b) / g)``. Parts of the block are not understood, among them most likely the
-dependence on temperature: expect about 1 % of gravity.
+The block's layout is not published; it was found by comparing logs with gravity. A vector of counts ``u``
+becomes ``M^-1 ((u - b) / g)``. Parts of the block are not understood, among them most likely the dependence
+on temperature: expect an error of about 1 % of gravity.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.catalogue import BASE_RATE_HZ, MessageId
+from xsens.messages.control import BASE_RATE_HZ, MessageId
 from xsens.messages.framing import Message
 
 BLOCK_SIZE = 168
-"""Bytes of the payload; blocks of later sensors are longer and their layout is not known."""
+"""Bytes of the payload; blocks of later sensors are longer, in an unknown layout."""
 
 NOT_COMPENSATED = (
     "raw counts: dependence on temperature is not compensated (expect about 1 % of gravity), "
@@ -29,26 +29,26 @@ NOT_COMPENSATED = (
 _ID, _PERIOD, _OFFSETS, _GAINS = 0, 81, 87, 105
 _ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER, _HOUSING = 8, 26, 132, 150
 _ROWS = 2048
-"""Converted at a time: stays in the cache, and is too little for a team of threads to be woken for it."""
+"""Rows converted at a time: they stay in the cache, and are too few for BLAS to wake a team of threads."""
 
 _Q14, _Q8 = 2.0**14, 2.0**8
 
 
 @dataclass(frozen=True)
 class RawCalibration:
-    """A unit's calibration block, as far as it is understood.
+    """The understood part of a unit's calibration block.
 
     Attributes
     ----------
     device_id : int
     period : int
-        Of sampling, in 1/115200 s.
+        Sampling period, in 1/115200 s.
     offsets : ndarray, shape (3, 3)
         Counts at zero of accelerometer, gyroscope and magnetometer, each x, y, z.
     gains : ndarray, shape (3, 3)
         Counts per m/s², rad/s and unit of field.
     misalignments : ndarray, shape (3, 3, 3)
-        Of each of the three, ``sensing axes from sensor axes``.
+        ``sensing axes from sensor axes`` of each of the three sensors.
     housing : ndarray, shape (3, 3)
         Alignment with the housing, not applied.
 
@@ -77,7 +77,7 @@ class RawCalibration:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second; NaN if the block does not say."""
+        """Samples per second; NaN if the block does not hold the period."""
         return BASE_RATE_HZ / self.period if self.period else float("nan")
 
     @classmethod
@@ -87,7 +87,7 @@ class RawCalibration:
         Raises
         ------
         InvalidInputError
-            If it is another message, a block of another kind of sensor, or nonsense.
+            If it is another message, a block of another kind of sensor, or has impossible values.
         """
         data = message.payload
         if message.mid != MessageId.EMTS or len(data) != BLOCK_SIZE:
@@ -101,26 +101,13 @@ class RawCalibration:
         gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [65536.0, 256.0, 1.0] / _Q8
         return cls(number, period, offsets, gains, np.stack(matrices), _matrix(data, _HOUSING))
 
-    def message(self) -> Message:
-        """Encode; what is not understood is left zero."""
-        data = bytearray(BLOCK_SIZE)
-        struct.pack_into(">I", data, _ID, self.device_id)
-        struct.pack_into(">H", data, _PERIOD, self.period)
-        data[_OFFSETS:_GAINS] = np.round(self.offsets).astype(">u2").tobytes()
-        gains = np.round(self.gains * _Q8).astype(">u4").reshape(9, 1).view(np.uint8)
-        data[_GAINS : _GAINS + 27] = gains[:, 1:].tobytes()
-        for at, matrix in zip((_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER), self.misalignments, strict=True):
-            data[at : at + 18] = np.round(matrix * _Q14).astype(">i2").tobytes()
-        data[_HOUSING : _HOUSING + 18] = np.round(self.housing * _Q14).astype(">i2").tobytes()
-        return Message(MessageId.EMTS, bytes(data))
-
     def to_units(self, counts: npt.ArrayLike) -> FloatArray:
         """Acceleration in m/s², rate of turn in rad/s and field in arbitrary units.
 
         Parameters
         ----------
         counts : array_like, shape (n, 3, 3)
-            Of accelerometer, gyroscope and magnetometer, each x, y, z.
+            Counts of accelerometer, gyroscope and magnetometer, each x, y, z.
 
         Returns
         -------
@@ -134,11 +121,6 @@ class RawCalibration:
             some = slice(at, at + _ROWS)
             np.matmul(rows[some] - self.offsets.ravel(), mixing.reshape(9, 9).T, out=values[some])
         return np.moveaxis(values.reshape(-1, 3, 3), 1, 0)
-
-    def to_counts(self, values: FloatArray) -> npt.NDArray[np.uint16]:
-        """Counts, shape (n, 3, 3), that `to_units` takes to `values`, shape (3, n, 3), clipped to 16 bits."""
-        sensed = np.stack([values[i] @ self.misalignments[i].T for i in range(3)], axis=1)
-        return np.clip(np.round(sensed * self.gains + self.offsets), 0, 0xFFFF).astype(np.uint16)
 
 
 def _matrix(data: bytes, at: int) -> FloatArray:

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -108,12 +110,12 @@ class TestPairErrors:
     @pytest.mark.parametrize(
         ("sensor", "reference", "calibrations", "error", "message"),
         [
-            (some(0, 3), some(1, 4), some(2, 1), MismatchError, "one reference per reading, got 4 and 3"),
-            (some(0, 1), some(1, 1), some(2, 1), InsufficientDataError, "at least 2 orientations, got 1"),
-            (some(0, 1)[0], some(1, 1)[0], some(2, 1), InsufficientDataError, "orientations, got 0"),
-            (some(0, 3), some(1, 3), [], InsufficientDataError, "at least one calibration, got none"),
-            (some(0, 3), some(1, 3), some(2, 0), InsufficientDataError, "one calibration, got none"),
-            (some(0, 3200), some(1, 3200), some(2, 1), InvalidInputError, "take fewer orientations"),
+            (some(0, 3), some(1, 4), some(2, 1), MismatchError, "4 and 3"),
+            (some(0, 1), some(1, 1), some(2, 1), InsufficientDataError, "got 1"),
+            (some(0, 1)[0], some(1, 1)[0], some(2, 1), InsufficientDataError, "got 0"),
+            (some(0, 3), some(1, 3), [], InsufficientDataError, "sensor_from_image"),
+            (some(0, 3), some(1, 3), some(2, 0), InsufficientDataError, "sensor_from_image"),
+            (some(0, 3200), some(1, 3200), some(2, 1), InvalidInputError, "3200"),
         ],
     )
     def test_refuses_what_it_cannot_compare(self, sensor, reference, calibrations, error, message):
@@ -136,9 +138,10 @@ class TestTable:
     def test_reads_like_table_2(self):
         error = np.deg2rad([[[-0.3651, -1.35200, -0.1017], [0.2465, 0.4254, 0.2299]]])
         errors = PairErrors(np.array([0, 0]), np.array([1, 2]), np.zeros((2, 3)), error)
-        lines = AccuracyTable.of({"Tilt-yaw rotation": errors}).text().splitlines()
-        assert lines[0].split() == ["degrees", "Roll", "Yaw", "Tilt"]
-        assert lines[1] == "Tilt-yaw rotation    -0.0593 ± 0.3058    -0.4633 ± 0.8887    +0.0641 ± 0.1658"
+        head, *_, row = AccuracyTable.of({"Tilt-yaw rotation": errors}).text().splitlines()
+        assert head.split() == ["degrees", "Roll", "Yaw", "Tilt"]
+        cells = ["-0.0593 ± 0.3058", "-0.4633 ± 0.8887", "+0.0641 ± 0.1658"]
+        assert re.split("  +", row) == ["Tilt-yaw rotation", *cells]
 
     def test_values_name_the_experiment_the_angle_and_the_unit(self):
         errors = pair_errors(some(1, 4), some(2, 4), some(3, 2))
@@ -182,9 +185,9 @@ class TestOpticalReference:
     def test_refuses_recordings_of_different_times(self):
         sensor = TimedRotations(np.arange(5.0), some(1, 5), max_gap_s=2.0)
         reference = TimedRotations(np.arange(50.0, 60.0), some(2, 10))
-        with pytest.raises(InsufficientDataError, match=r"got 0: the reference spans 50.000 to 59.000 s"):
+        with pytest.raises(InsufficientDataError, match=r"got 0.* 50.000 to 59.000 s"):
             common_readings(sensor, reference)
-        with pytest.raises(InvalidInputError, match="at least 2, got 1"):
+        with pytest.raises(InvalidInputError, match=r"frames.* 1$"):
             common_readings(sensor, sensor, frames=1)
 
     def test_the_mounting_of_an_uncalibrated_target_comes_from_the_motion(self):
@@ -199,9 +202,9 @@ class TestOpticalReference:
 
     def test_turns_about_one_axis_do_not_tell_the_mounting(self):
         level = about("y", np.linspace(-20, 20, 30)) * some(1, 30, 0.2)
-        with pytest.raises(InsufficientDataError, match=r"about two axes.*how the reference is mounted"):
+        with pytest.raises(InsufficientDataError, match="two axes"):
             mounting_from_motion(level, level)
-        with pytest.raises(InsufficientDataError, match="got 0 about the second"):
+        with pytest.raises(InsufficientDataError, match=" 0 "):
             mounting_from_motion(level[:2], level[:2])
 
 
@@ -234,24 +237,24 @@ class TestMechanism:
         found = read_mechanism_csv(path, turns="tilt, yaw, roll").base_from_image
         assert (found.inv() * inner_yaw).magnitude().max() < 1e-12
         assert (read_mechanism_csv(path).base_from_image.inv() * inner_yaw).magnitude().max() > 0.1
-        with pytest.raises(InvalidInputError, match="expected roll, yaw and tilt in some order, got 'tilt'"):
+        with pytest.raises(InvalidInputError, match=r"turns.*'tilt'"):
             read_mechanism_csv(path, turns="tilt")
 
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("", "expected settings of tilt and yaw, got an empty file"),
-            ("tilt,yaw\n", "expected settings below the header"),
-            ("tilt,roll\n1,2\n", r"settings.csv:1: expected columns tilt and yaw.*got tilt, roll"),
-            ("tilt,yaw,tilt\n1,2,3\n", ":1: expected columns tilt and yaw"),
-            ("1,2,3,4\n", ":1: expected a header or 2 or 3 columns, got 4"),
-            ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: expected 2 columns, got 3"),
-            ("tilt,yaw\n1,x\n", ":2: expected a finite number, got 'x'"),
-            ("tilt,yaw\n1,inf\n", ":2: expected a finite number, got 'inf'"),
-            ("tilt,yaw,until_s\n1,2,3\n", "until_s: expected time_s beside it"),
+            ("", "settings.csv.*empty"),
+            ("tilt,yaw\n", "settings.csv.*none"),
+            ("tilt,roll\n1,2\n", r"settings.csv:1: .*tilt, roll"),
+            ("tilt,yaw,tilt\n1,2,3\n", ":1: .*tilt, yaw, tilt"),
+            ("1,2,3,4\n", ":1: .* 4$"),
+            ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: .* 2 .* 3$"),
+            ("tilt,yaw\n1,x\n", ":2: .*'x'"),
+            ("tilt,yaw\n1,inf\n", ":2: .*'inf'"),
+            ("tilt,yaw,until_s\n1,2,3\n", "until_s: .*time_s"),
             (
                 "tilt,yaw,time_s,until_s\n1,2,3,4\n1,2,5,4\n",
-                r"until_s\[1\]: expected no less than time_s, 5 s",
+                r"until_s\[1\].* 5 s.* 4 s",
             ),
         ],
     )
@@ -260,7 +263,7 @@ class TestMechanism:
             read_mechanism_csv(self.write(tmp_path, text))
 
     def test_a_missing_file_is_a_file_error(self, tmp_path):
-        with pytest.raises(FileError, match=r"none.csv: cannot be read: No such file"):
+        with pytest.raises(FileError, match=r"none\.csv"):
             read_mechanism_csv(tmp_path / "none.csv")
 
     @given(
@@ -278,7 +281,7 @@ class TestMechanism:
         path = tmp_path / "huge.csv"
         with path.open("wb") as file:
             file.truncate(10 * 2**30)
-        with pytest.raises(InvalidInputError, match="expected at most 16777216 bytes"):
+        with pytest.raises(FileError, match=r"huge.csv.*16777216"):
             read_mechanism_csv(path)
 
     def test_readings_are_averaged_while_the_mechanism_stands_still(self):
@@ -297,13 +300,13 @@ class TestMechanism:
     def test_settings_without_times_are_one_per_reading(self):
         sensor = TimedRotations(np.arange(77.0), grid())
         assert readings_at(sensor, MechanismSettings(grid())) is sensor.world_from_sensor
-        with pytest.raises(InsufficientDataError, match=r"3 settings.*got no times and 77 readings"):
+        with pytest.raises(InsufficientDataError, match=r"3 settings.*77 readings"):
             readings_at(sensor, MechanismSettings(grid()[:3]))
 
     def test_times_are_checked(self):
-        with pytest.raises(MismatchError, match="time_s: expected 77 times"):
+        with pytest.raises(MismatchError, match=r"time_s.*77"):
             MechanismSettings(grid(), np.zeros(5))
-        with pytest.raises(InvalidInputError, match=r"time_s\[1\]: expected a finite value"):
+        with pytest.raises(InvalidInputError, match=r"time_s\[1\]"):
             MechanismSettings(grid()[:2], np.array([0.0, np.nan]))
 
 
@@ -348,7 +351,7 @@ class TestFigure:
 
     def test_without_any_turn_there_is_nothing_to_draw(self):
         errors = pair_errors(some(1, 6), some(2, 6), Rotation.identity())
-        with pytest.raises(InsufficientDataError, match="there is no turn to draw"):
+        with pytest.raises(InsufficientDataError):
             figure_turns({"loose": errors})
 
 

@@ -45,8 +45,9 @@ def heading_deg(truth, orientation):
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_heading_of_a_static_sensor_stays(smooth):
-    truth, log = static(600.0)
+@pytest.mark.parametrize("seconds", [90.0, pytest.param(600.0, marks=pytest.mark.slow)])
+def test_heading_of_a_static_sensor_stays(seconds, smooth):
+    truth, log = static(seconds)
     heading = heading_deg(truth, orient(log, smooth=smooth))
     settled = heading[int(30 * RATE_HZ) :]
     # The target: 0.2 degrees over ten minutes after initialisation.
@@ -59,15 +60,15 @@ def test_a_step_of_the_field_moves_the_heading_little(smooth):
         # Fifty microtesla, as much as the earth's field, for five seconds, across.
         return FIELD + np.outer((time_s > 60.0) & (time_s < 65.0), [0.0, 1.0, 0.0])
 
-    truth, log = static(120.0, field=stepped)
+    truth, log = static(95.0, field=stepped)
     heading = heading_deg(truth, orient(log, smooth=smooth))
     part = (log.time_s > 55.0) & (log.time_s < 90.0)
     assert np.ptp(heading[part]) < 1.0
 
 
 def test_iron_cannot_tilt_the_answer():
-    _, clean = static(60.0)
-    _, spoilt = static(60.0, field=lambda t: np.tile([0.1, 0.7, 0.9], (t.size, 1)))
+    _, clean = static(30.0)
+    _, spoilt = static(30.0, field=lambda t: np.tile([0.1, 0.7, 0.9], (t.size, 1)))
     one, other = (orient(log).rotations.world_from_sensor for log in (clean, spoilt))
     up = [r.inv().apply([0.0, 0.0, 1.0]) for r in (one, other)]
     apart = np.rad2deg(np.arccos(np.clip(np.sum(up[0] * up[1], axis=1), -1, 1)))
@@ -83,14 +84,6 @@ def test_without_a_magnetometer_the_heading_starts_at_zero():
     assert abs(np.arctan2(first[1, 0], first[0, 0])) < np.deg2rad(2.0)
     up = [turn.inv().apply([0.0, 0.0, 1.0]) for turn in (turns[-1], truth)]
     assert up[0] @ up[1] > 0.9999
-
-
-def test_a_log_without_gyroscope_or_in_other_units_is_refused():
-    _, log = static(5.0)
-    with pytest.raises(InsufficientDataError, match="gyroscope"):
-        orient(ImuLog(log.time_s, log.accelerometer_m_s2))
-    with pytest.raises(InvalidInputError, match="m/s"):
-        orient(ImuLog(log.time_s, log.accelerometer_m_s2 / 9.81, log.gyroscope_rad_s))
 
 
 def beside_iron(seconds=60.0, seed=4):
@@ -123,26 +116,28 @@ def test_a_start_beside_iron_is_taken_back():
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("steady", [False, True])
-def test_broad_trials_beside_vqf(realdata, steady):
-    gains = []
-    for name in TRIALS:
-        log, true, moving = read_trial(realdata / "broad", name)
-        peer = VQF(1.0 / log.rate_hz)
-        theirs = peer.updateBatch(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)["quat9D"]
-        vqf = errors_deg(theirs, true, moving, steady)[0]
-        ours = []
-        for smooth in (False, True):
-            found = east_first(orient(log, smooth=smooth).rotations.world_from_sensor)
-            ours.append(errors_deg(found, true, moving, steady)[0])
-        # The filter is no worse than VQF on any trial; measured 3.1, 0.8 and 2.2 against 4.0, 2.3 and 4.0,
-        # and without a constant heading 1.12, 0.76 and 1.93 against 1.16, 1.24 and 3.47.
-        assert ours[0] <= vqf, name
-        gains.append(1.0 - ours[1] / vqf)
-        if "magnet" in name:
-            # Measured 1.70 against 4.04, or 1.63 against 3.47; the filter alone is at 0.53 and 0.56 of VQF.
-            assert ours[1] <= 0.5 * vqf
-    assert np.mean(gains) >= 0.2
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [
+        pytest.param(TRIALS[0], (0.2, 0.2), marks=pytest.mark.slow),
+        pytest.param(TRIALS[1], (0.2, 0.05), marks=pytest.mark.slow),
+        (TRIALS[2], (0.5, 0.5)),
+    ],
+)
+def test_broad_trials_beside_vqf(realdata, name, least):
+    log, true, moving = read_trial(realdata / "broad", name)
+    peer = VQF(1.0 / log.rate_hz)
+    vqf = peer.updateBatch(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)["quat9D"]
+    filtered, smoothed = (
+        east_first(orient(log, smooth=smooth).rotations.world_from_sensor) for smooth in (False, True)
+    )
+    for steady, gain in zip((False, True), least, strict=True):
+        ours, smooth, theirs = (errors_deg(q, true, moving, steady)[0] for q in (filtered, smoothed, vqf))
+        # Filter, measured: 3.1, 0.8 and 2.2 against 4.0, 2.3 and 4.0 degrees, and without a constant heading
+        # 1.12, 0.76 and 1.93 against 1.16, 1.24 and 3.47.
+        assert ours <= theirs
+        # Smoother: 2.97, 1.64 and 1.70; without a constant heading 0.85, 1.10 and 1.63.
+        assert smooth <= (1.0 - gain) * theirs
 
 
 def with_field(log, field):
@@ -153,12 +148,13 @@ def with_field(log, field):
 def test_a_magnetometer_that_reads_zero_is_none(smooth):
     truth, log = static(20.0)
     found = orient(with_field(log, np.zeros((len(log), 3))), smooth=smooth)
-    assert "magnetometer reads zero in 2000 of 2000 samples: left out" in found.notes
-    assert "no magnetometer: the heading is relative to the start" in found.notes
+    assert any("zero" in note and "2000 of 2000" in note for note in found.notes)
+    assert not found.magnetic
     some = log.magnetometer_au.copy()
     some[::3] = 0.0
     found = orient(with_field(log, some), smooth=smooth)
-    assert "magnetometer reads zero in 667 of 2000 samples: left out" in found.notes
+    assert any("zero" in note and "667 of 2000" in note for note in found.notes)
+    assert found.magnetic
     assert abs(heading_deg(truth, found)[-1]) < 3.0
 
 
@@ -171,14 +167,16 @@ def test_a_field_straight_down_tells_no_heading(smooth, noise):
         with_field(log, np.tile(turn.inv().apply([0.0, 0.0, -1.0]), (len(log), 1)) + off), smooth=smooth
     )
     assert np.rad2deg(np.median(found.standard_deviation_rad[:, 2])) > 45.0
-    assert any(note.startswith("the heading is not known") for note in found.notes)
+    assert any("heading is not known" in note for note in found.notes)
     assert np.isfinite(found.rotations.world_from_sensor.as_quat()).all()
 
 
-def test_times_in_milliseconds_are_refused():
+def test_readings_in_other_units_are_refused():
     _, log = static(5.0)
-    with pytest.raises(InvalidInputError, match="got a median of 10 s: times in milliseconds"):
+    with pytest.raises(InvalidInputError, match=r"10 s.*milliseconds"):
         orient(ImuLog(1e3 * log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s))
+    with pytest.raises(InvalidInputError, match="m/s"):
+        orient(ImuLog(log.time_s, log.accelerometer_m_s2 / 9.81, log.gyroscope_rad_s))
 
 
 def test_a_gyroscope_in_degrees_is_refused_or_told():
@@ -191,21 +189,21 @@ def test_a_gyroscope_in_degrees_is_refused_or_told():
     told = [note for note in orient(ImuLog(time_s, force, np.rad2deg(rate))).notes if "contradict" in note]
     assert len(told) == 1
     assert "shows 2 %" in told[0]
-    with pytest.raises(InvalidInputError, match="expected a gyroscope in rad/s"):
+    with pytest.raises(InvalidInputError, match="rad/s"):
         orient(ImuLog(time_s, force, 5.0 * np.rad2deg(rate)))
 
 
 def test_what_is_missing_is_named():
     _, log = static(5.0)
-    with pytest.raises(InsufficientDataError, match=r"got no gyroscope$"):
+    with pytest.raises(InsufficientDataError, match=r"no gyroscope$"):
         orient(ImuLog(log.time_s, log.accelerometer_m_s2))
-    with pytest.raises(InsufficientDataError, match=r"got no accelerometer$"):
+    with pytest.raises(InsufficientDataError, match=r"no accelerometer$"):
         orient(ImuLog(log.time_s, None, log.gyroscope_rad_s))
-    with pytest.raises(InvalidInputError, match=r"expected an ImuLog, as read_log\(path\) gives, got str"):
+    with pytest.raises(InvalidInputError, match=r"ImuLog.*str"):
         orient("log.csv")
 
 
 def test_columns_that_were_not_understood_are_named_where_they_are_missed():
     text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_g\n0,0,0,0,1\n0.01,0,0,0,1\n"
-    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_g \(expected accelerometer_x_m_s2\)$"):
+    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_g.*accelerometer_x_m_s2"):
         orient(parse_text(text))

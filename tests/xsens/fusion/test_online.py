@@ -98,7 +98,7 @@ def test_missing_readings_are_bridged_and_bad_ones_refused():
     state = online.state
     assert apart_deg(state.world_from_sensor, Rotation.identity()) < 1e-6
     assert state.standard_deviation_rad[2] > 1.0  # nothing has told the heading
-    with pytest.raises(MismatchError, match="gyroscope_rad_s: expected shape"):
+    with pytest.raises(MismatchError, match="gyroscope_rad_s"):
         online.push(0.01, [0.0, 0.0], [0.0, 0.0, 9.8])
     with pytest.raises(InvalidInputError, match="step_s"):
         online.push(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
@@ -111,9 +111,9 @@ def resting(samples, **changed):
 
 
 def test_other_units_are_refused_as_over_a_whole_log():
-    with pytest.raises(InvalidInputError, match=r"expected an accelerometer in m/s\^2"):
+    with pytest.raises(InvalidInputError, match="accelerometer"):
         OnlineFilter().push(*resting(120, force=[0.0, 0.0, 1.0]))
-    with pytest.raises(InvalidInputError, match="expected rad/s"):
+    with pytest.raises(InvalidInputError, match="rad/s"):
         OnlineFilter().push(*resting(1, gyroscope=[0.0, 90.0, 0.0]))
 
 

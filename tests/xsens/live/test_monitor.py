@@ -3,18 +3,20 @@ import time
 import numpy as np
 import pytest
 import simulated_device as simulated
+from imu_messages import calibration_message, configuration_message, counts_of, mtdata_payloads
 
 from xsens.live.device import DeviceInfo
 from xsens.live.monitor import LiveState, Monitor, _Attitude
 from xsens.logs.samples import ImuLog
-from xsens.messages.catalogue import Configuration, Message, MessageId, UnitConfiguration, encode
+from xsens.messages.control import Configuration, MessageId, UnitConfiguration
+from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
 from xsens.messages.rawcounts import RawCalibration
 
 RATE_HZ = 100.0
 MODE = OutputMode.CALIBRATED | OutputMode.ORIENTATION
 UNIT = UnitConfiguration(7, 54, MODE, 1)
-INFO = DeviceInfo(7, "legacy", RATE_HZ, (Configuration(7, 1152, 0, (UNIT,)).message(),))
+INFO = DeviceInfo(7, "legacy", RATE_HZ, (configuration_message(Configuration(7, 1152, 0, (UNIT,))),))
 
 
 def sent(indices, iron=0.0) -> bytes:
@@ -24,7 +26,7 @@ def sent(indices, iron=0.0) -> bytes:
         acc, gyr, mag, q = simulated.values(index, RATE_HZ, iron)
         names = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au", "quaternion_wxyz", "counter")
         row = dict(zip(names, (acc, gyr, mag, q, index % 65536), strict=True))
-        payload = DataLayout(MODE).encode({name: np.reshape(each, (1, -1)) for name, each in row.items()})
+        payload = mtdata_payloads(DataLayout(MODE), row)
         stream += encode(Message(MessageId.MT_DATA, payload.tobytes()))
     return stream
 
@@ -113,12 +115,12 @@ class TestMonitor:
             np.stack([np.eye(3)] * 3), np.eye(3),
         )  # fmt: skip
         raw = Monitor()
-        raw.started(DeviceInfo(1, "MT9-B", RATE_HZ, (block.message(),)))
+        raw.started(DeviceInfo(1, "MT9-B", RATE_HZ, (calibration_message(block),)))
         for first in (0, 100):
             values = [
                 simulated.values(index, RATE_HZ, iron=first / 1000)[:3] for index in range(first, first + 100)
             ]
-            counts = block.to_counts(np.array(values).transpose(1, 0, 2)).reshape(-1, 9)
+            counts = counts_of(block, np.array(values).transpose(1, 0, 2)).reshape(-1, 9)
             for index, row in enumerate(counts):
                 payload = (first + index).to_bytes(2, "big") + row.astype(">u2").tobytes() + b"\x20\x00"
                 raw.arrived(encode(Message(MessageId.MT_DATA, payload)))

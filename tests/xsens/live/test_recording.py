@@ -10,35 +10,23 @@ import pytest
 
 from speckle3d.core.errors import FileError
 from xsens.live.device import DeviceError, DeviceSettings
-from xsens.live.recording import UTC_TIME, RawFile, Recorder, record, utc_message
+from xsens.live.recording import RawFile, Recorder, record
 from xsens.logs.read import read_log
-from xsens.messages.catalogue import Message, MessageId, decode
+from xsens.messages.control import MessageId
+from xsens.messages.framing import decode
 
 pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
-from simulated_device import KINDS, SimulatedDevice, values, wait_until
+from simulated_device import KINDS, of_kind, values, wait_until
 
 FAST = DeviceSettings(baud=115200)
 
 
 @pytest.fixture
-def sensor(tmp_path, request):
-    """A simulated sensor of the kind that the test is parametrised with, an MT9-B by default."""
-    with SimulatedDevice(tmp_path / "port", **getattr(request, "param", {})) as simulated:
-        yield simulated
-
-
-@pytest.fixture
 def path(tmp_path):
     return tmp_path / "recording.mtb"
-
-
-def of_kind(*kinds, **more):
-    return pytest.mark.parametrize(
-        "sensor", [{"kind": kind, **more} for kind in kinds], indirect=True, ids=kinds
-    )
 
 
 def counters(path) -> list[int]:
@@ -71,8 +59,8 @@ class TestRecording:
         more = {"mt9": [MessageId.EMTS], "mtdata2": [MessageId.OUTPUT_CONFIGURATION_ACK]}.get(sensor.kind, [])
         ack = MessageId.GO_TO_MEASUREMENT_ACK
         data = MessageId.MT_DATA2 if sensor.kind == "mtdata2" else MessageId.MT_DATA
-        assert found == [MessageId.CONFIGURATION, *more, UTC_TIME, ack, data][: len(found)]
-        (told,) = [message.payload for message in messages if message.mid == UTC_TIME]
+        assert found == [MessageId.CONFIGURATION, *more, MessageId.UTC_TIME, ack, data][: len(found)]
+        (told,) = [message.payload for message in messages if message.mid == MessageId.UTC_TIME]
         assert abs(read_utc(told) - before) < timedelta(seconds=5)
 
     def test_each_byte_is_the_operating_systems_as_it_comes(self, sensor, path):
@@ -82,6 +70,7 @@ class TestRecording:
             assert counters(path) == sensor.run  # while it is still being recorded
             sensor.resume()
 
+    @pytest.mark.slow
     def test_killed_it_loses_only_what_was_not_sent(self, sensor, path):
         code = (
             "import sys; from xsens import DeviceSettings, record\n"
@@ -115,7 +104,9 @@ class TestRecording:
             wait_until(lambda: len(sensor.run) > 20)
             assert recorder.state().interruptions == 1
         assert counters(path) == sent + sensor.run
-        stamps = [read_utc(each.payload) for each in decode(path.read_bytes()) if each.mid == UTC_TIME]
+        stamps = [
+            read_utc(each.payload) for each in decode(path.read_bytes()) if each.mid == MessageId.UTC_TIME
+        ]
         assert 0.3 < (stamps[1] - stamps[0]).total_seconds() < 8.0
 
     def test_a_sensor_that_lost_its_power_is_set_again(self, sensor, path):
@@ -152,9 +143,9 @@ class TestRecording:
         assert counters(path) == sent
 
     def test_a_slow_display_costs_no_samples(self, sensor, path):
-        for state in record(str(sensor.path), path, FAST, interval_s=0.05, duration_s=1.0):
+        for state in record(str(sensor.path), path, FAST, interval_s=0.05, duration_s=0.6):
             if not state.samples:
-                time.sleep(0.8)
+                time.sleep(0.45)
         assert counters(path) == sensor.run
 
     def test_leaving_the_iteration_ends_the_recording(self, sensor, path):
@@ -165,7 +156,7 @@ class TestRecording:
 
     def test_a_file_that_is_there_is_left_alone(self, sensor, path):
         path.write_bytes(b"precious")
-        with pytest.raises(FileError, match=r"recording.mtb: there already; expected a new file"):
+        with pytest.raises(FileError, match=r"recording\.mtb"):
             Recorder(str(sensor.path), path, FAST)
         assert path.read_bytes() == b"precious"
 
@@ -177,7 +168,7 @@ class TestRecording:
                 wait_until(lambda: recorder.state() is None)
 
     def test_without_a_sensor_there_is_no_file(self, tmp_path, path):
-        with pytest.raises(DeviceError, match="cannot be opened"):
+        with pytest.raises(DeviceError, match="none"):
             Recorder(str(tmp_path / "none"), path, FAST)
         assert not path.exists()
 
@@ -243,7 +234,7 @@ class TestRawFile:
         assert file.written == 10
 
     def test_a_folder_that_is_not_there_is_named(self, tmp_path):
-        with pytest.raises(FileError, match=r"none/x.mtb: cannot be written: No such file"):
+        with pytest.raises(FileError, match=r"none/x.mtb.*No such file"):
             RawFile(tmp_path / "none" / "x.mtb")
 
     def test_errors_of_the_disk_are_file_errors(self, path, monkeypatch):
@@ -251,7 +242,7 @@ class TestRawFile:
         monkeypatch.setattr(
             os, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
         )
-        with pytest.raises(FileError, match=r"recording.mtb: cannot be written: No space left on device"):
+        with pytest.raises(FileError, match=r"recording.mtb.*No space left"):
             file.append(b"x")
         file.close()
 
@@ -259,8 +250,3 @@ class TestRawFile:
 def read_utc(payload: bytes) -> datetime:
     nanoseconds, year = int.from_bytes(payload[:4], "big"), int.from_bytes(payload[4:6], "big")
     return datetime(year, *payload[6:11], nanoseconds // 1000, tzinfo=UTC)
-
-
-def test_the_time_is_told_as_the_sensors_tell_it():
-    message = utc_message(datetime(2024, 2, 29, 23, 59, 58, 123_456, tzinfo=UTC))
-    assert message == Message(0x61, bytes.fromhex("075bca00 07e8 02 1d 17 3b 3a 07"))

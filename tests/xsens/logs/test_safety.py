@@ -14,19 +14,22 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
+from imu_messages import items_payload
 
 from speckle3d.core.errors import FileError, Speckle3DError
-from xsens.logs.read import MOST_BYTES, parse_stream, parse_text, read_log, write_csv
+from xsens.logs.read import MOST_BYTES, parse_stream, read_log
 from xsens.logs.samples import ImuLog
-from xsens.messages.catalogue import Configuration, MessageId
+from xsens.logs.textlogs import parse_text, write_csv
+from xsens.messages.control import Configuration, MessageId
 from xsens.messages.framing import Framer, Message, encode, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
-from xsens.messages.mtdata2 import Item, decode_items, encode_items
+from xsens.messages.mtdata2 import Item, decode_items
 from xsens.messages.rawcounts import RawCalibration
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
-SECONDS = float(os.environ.get("FUZZ_SECONDS", "2"))
-"""For each kind of input, at most; with ``FUZZ_SECONDS=600`` in the environment, ten minutes each."""
+assert CORPUS, "the corpus lies beside this file"
+SECONDS = float(os.environ.get("FUZZ_SECONDS", "4"))
+"""For each kind of input, at most, in the slow tests; ``FUZZ_SECONDS=600`` makes it ten minutes each."""
 
 PER_SECOND = 75
 """Inputs tried in a second, about."""
@@ -65,7 +68,7 @@ def survives(data, tmp_path=None):
 
 
 def streams():
-    s = samples(12)
+    s = samples(8)
     layout = DataLayout(
         OutputMode.CALIBRATED | OutputMode.ORIENTATION | OutputMode.STATUS,
         OutputSettings.COUNTER | OutputSettings.MATRIX,
@@ -156,7 +159,7 @@ def resealed(draw):
         st.binary(max_size=200),
         st.binary(min_size=22, max_size=22),
         st.binary(min_size=168, max_size=168),
-        st.lists(items, max_size=6).map(encode_items),
+        st.lists(items, max_size=6).map(items_payload),
     )
     messages = draw(st.lists(st.builds(Message, mids, payload, st.just(0xFF)), max_size=12))
     return b"".join(map(encode, messages))
@@ -170,6 +173,7 @@ TEXTS = [
 ]
 
 
+@pytest.mark.parametrize("seconds", [0.5, pytest.param(SECONDS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "inputs",
     [
@@ -181,8 +185,8 @@ TEXTS = [
     ],
     ids=["bytes", "damaged logs", "damaged text", "resealed messages", "numbers"],
 )
-def test_fuzzed(inputs, tmp_path):
-    in_time, limits = fuzzed(SECONDS)
+def test_fuzzed(inputs, seconds, tmp_path):
+    in_time, limits = fuzzed(seconds)
 
     @limits
     @given(inputs)
@@ -228,7 +232,7 @@ def test_a_file_that_claims_ten_gigabytes_is_refused_unread(tmp_path):
         file.truncate(10 * 1024**3)
     tracemalloc.start()
     try:
-        with pytest.raises(FileError, match=f"expected at most {MOST_BYTES} bytes, got 10737418240"):
+        with pytest.raises(FileError, match=f"{MOST_BYTES}.*10737418240"):
             read_log(path)
         assert tracemalloc.get_traced_memory()[1] < 1e6
     finally:
@@ -236,14 +240,14 @@ def test_a_file_that_claims_ten_gigabytes_is_refused_unread(tmp_path):
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path):
-    with pytest.raises(FileError, match="cannot be read: No such file"):
+    with pytest.raises(FileError, match=r"missing.bin.*No such file"):
         read_log(tmp_path / "missing.bin")
-    with pytest.raises(FileError, match="cannot be read: Is a directory"):
+    with pytest.raises(FileError, match="Is a directory"):
         read_log(tmp_path)
-    with pytest.raises(FileError, match="cannot be read: embedded null byte"):
+    with pytest.raises(FileError, match="null byte"):
         read_log("a\0b")
     (tmp_path / "empty.bin").write_bytes(b"")
-    with pytest.raises(Speckle3DError, match="empty file"):
+    with pytest.raises(Speckle3DError, match=r"empty.bin.*empty"):
         read_log(tmp_path / "empty.bin")
 
 
@@ -251,14 +255,14 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
 def test_pipes_and_devices_are_neither_waited_for_nor_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", "/dev/zero"):
-        with pytest.raises(FileError, match="expected a file, got something else"):
+        with pytest.raises(FileError, match=str(path)):
             read_log(path)
 
 
 # Time and memory
 
 
-SIZE = 400_000
+SIZE = 200_000
 
 
 def repeated(piece):
@@ -271,7 +275,7 @@ def many_arrangements():
     pieces = []
     for _ in range(SIZE // 50):
         drawn = zip(rng.choice(identifiers, 3), rng.choice(sizes, 3), strict=True)
-        pieces.append(encode(Message(0x36, encode_items(Item(int(i), bytes(int(n))) for i, n in drawn))))
+        pieces.append(encode(Message(0x36, items_payload(Item(int(i), bytes(int(n))) for i, n in drawn))))
     return b"".join(pieces)
 
 
@@ -299,7 +303,7 @@ HOSTILE = {
 @pytest.mark.parametrize("name", HOSTILE)
 def test_time_and_memory_grow_with_the_size_alone(name, tmp_path):
     """Twice the memory of the worst of them, 35 times the size. Time is guarded, not measured: the worst
-    takes 0.2 s, one that went back to its start at every byte would take hours."""
+    takes 0.1 s, one that went back to its start at every byte would take hours."""
     data = HOSTILE[name]
     begin = time.process_time()
     survives(data, tmp_path)
@@ -316,4 +320,4 @@ def test_what_is_read_can_be_written(tmp_path):
     for data in STREAMS.values():
         log = survives(data)
         write_csv(tmp_path / "log.csv", log)
-        assert len(read_log(tmp_path / "log.csv")) == len(log) == 12
+        assert len(read_log(tmp_path / "log.csv")) == len(log) == 8

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 from imu_logs import calibration, samples
+from imu_messages import calibration_message, counts_of
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.catalogue import MessageId
+from xsens.messages.control import MessageId
 from xsens.messages.framing import Message
 from xsens.messages.rawcounts import RawCalibration
 
@@ -31,7 +32,7 @@ def test_counts_of_a_real_unit():
 def test_units_made_counts_come_back_to_half_a_count():
     unit, s = calibration(), samples(5000)
     sent = np.stack([s[name] for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")])
-    back = unit.to_units(unit.to_counts(sent))
+    back = unit.to_units(counts_of(unit, sent))
     # Half a count over the gain, and as much again for axes that are not square (0.03 at most).
     assert (np.abs(back - sent) < 0.6 / unit.gains[:, None]).all()
 
@@ -48,17 +49,17 @@ def test_the_formula_is_the_one_in_the_docstring():
 
 def test_blocks_come_back():
     unit = calibration(1)
-    back = RawCalibration.from_message(unit.message())
+    back = RawCalibration.from_message(calibration_message(unit))
     for name in ("device_id", "period", "offsets", "gains", "misalignments", "housing"):
         np.testing.assert_array_equal(getattr(back, name), getattr(unit, name))
 
 
 def test_blocks_of_other_sensors_and_nonsense_are_refused():
-    with pytest.raises(InvalidInputError, match="expected message 0x91 of 168 bytes, got 0x91 of 1320"):
+    with pytest.raises(InvalidInputError, match=r"168.*1320"):
         RawCalibration.from_message(Message(MessageId.EMTS, bytes(1320)))
-    with pytest.raises(InvalidInputError, match="expected gains above 0"):
+    with pytest.raises(InvalidInputError, match="gains"):
         RawCalibration.from_message(Message(MessageId.EMTS, bytes(168)))
-    payload = bytearray(calibration().message().payload)
+    payload = bytearray(calibration_message(calibration()).payload)
     payload[8:26] = bytes(18)
-    with pytest.raises(InvalidInputError, match="expected axes nearly square, got determinant 0"):
+    with pytest.raises(InvalidInputError, match="determinant 0"):
         RawCalibration.from_message(Message(MessageId.EMTS, bytes(payload)))

@@ -4,21 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.catalogue import (
-    Configuration,
-    MessageId,
-    OutputItem,
-    State,
-    UnitConfiguration,
-    device_id,
-    error_of,
-    output_configuration,
-    reply_to,
-    request_of,
-    set_output_configuration,
-    state_after,
-    valid_in,
-)
+from xsens.messages.control import MessageId
 from xsens.messages.framing import MOST_PAYLOAD, Framer, Message, decode, encode, find_frames
 
 FEW = settings(deadline=None, max_examples=40)
@@ -46,9 +32,9 @@ def test_every_length_comes_back_and_255_bytes_need_the_long_form(size):
 
 
 def test_messages_too_long_or_of_impossible_ids_are_refused():
-    with pytest.raises(InvalidInputError, match="at most 8192 bytes, got 8193"):
+    with pytest.raises(InvalidInputError, match=r"8192.*8193"):
         Message(0x36, bytes(MOST_PAYLOAD + 1))
-    with pytest.raises(InvalidInputError, match="ids of one byte"):
+    with pytest.raises(InvalidInputError, match="256"):
         Message(256)
 
 
@@ -66,15 +52,6 @@ def test_messages_too_long_or_of_impossible_ids_are_refused():
 def test_the_vendors_examples(data, message):
     assert encode(message).hex() == data
     assert decode(bytes.fromhex(data)) == [message]
-
-
-def test_errors_and_device_ids_are_read():
-    assert error_of(Message(MessageId.ERROR, b"\x04")).startswith("error 4: the message is not valid")
-    assert device_id(Message(MessageId.DEVICE_ID, bytes.fromhex("037003f8"))) == 0x037003F8
-    with pytest.raises(InvalidInputError, match="0x42: expected 1 bytes, got 0"):
-        error_of(Message(MessageId.ERROR))
-    with pytest.raises(InvalidInputError, match="0x01: expected at least 4 bytes, got 2"):
-        device_id(Message(MessageId.DEVICE_ID, b"ab"))
 
 
 # Framing in the presence of damage
@@ -180,79 +157,3 @@ def test_blocks_of_a_large_file_join_without_a_seam(monkeypatch):
     data = b"x" + b"".join(map(encode, sent))
     monkeypatch.setattr("xsens.messages.framing._BLOCK", 1000)
     assert decode(data) == sent
-
-
-# What short messages say
-
-
-def test_the_configuration_of_a_real_unit():
-    """MTi-300, recorded with the vendor's program: 100 Hz, one unit, no legacy output."""
-    payload = (
-        bytes.fromhex("037003f80480") + bytes(90) + bytes.fromhex("0001037003f8000000000000000100270108")
-    )
-    payload += bytes.fromhex("02490501")
-    assert len(payload) == 118
-    c = Configuration.from_message(Message(MessageId.CONFIGURATION, payload))
-    assert (c.device_id, c.period, c.rate_hz) == (0x037003F8, 1152, 100.0)
-    assert c.units == (UnitConfiguration(0x037003F8, 0, 0, 1, bytes.fromhex("0027010802490501")),)
-    assert c.message().payload == payload
-
-
-units = st.builds(
-    UnitConfiguration,
-    st.integers(0, 2**32 - 1),
-    st.integers(0, 2**16 - 1),
-    st.integers(0, 2**16 - 1),
-    st.integers(0, 2**32 - 1),
-    st.binary(min_size=8, max_size=8),
-)
-
-
-@FEW
-@given(st.integers(0, 2**32 - 1), st.integers(0, 65535), st.integers(0, 65535), st.lists(units, max_size=4))
-def test_configurations_come_back(number, period, skip, several):
-    c = Configuration(number, period, skip, tuple(several), date=b"20200102", time=b"03040506")
-    assert Configuration.from_message(c.message()) == c
-    assert not c.rate_hz > 0 or c.rate_hz * period * (skip + 1) == pytest.approx(115200)
-
-
-@pytest.mark.parametrize("size", [0, 97, 99, 117, 119])
-def test_configurations_of_another_length_are_refused(size):
-    payload = (bytes(97) + b"\x01" + bytes(40))[:size]
-    with pytest.raises(InvalidInputError, match="expected"):
-        Configuration.from_message(Message(MessageId.CONFIGURATION, payload))
-
-
-def test_output_configurations_come_back():
-    items = (OutputItem(0x1020, 0xFFFF), OutputItem(0x2010, 400), OutputItem(0xC020, 100))
-    message = set_output_configuration(items)
-    assert encode(message).hex().startswith("faffc00c1020ffff20100190c0200064")
-    assert output_configuration(message) == items
-    assert set_output_configuration(()).payload == b""
-    with pytest.raises(InvalidInputError, match="4 bytes, got 5"):
-        output_configuration(Message(MessageId.OUTPUT_CONFIGURATION_ACK, bytes(5)))
-
-
-def test_states_follow_the_sensors_answers():
-    state = state_after(Message(MessageId.GO_TO_MEASUREMENT_ACK), State.CONFIGURATION)
-    assert state is State.MEASUREMENT
-    assert state_after(Message(MessageId.DEVICE_ID), state) is State.MEASUREMENT
-    assert state_after(Message(MessageId.GO_TO_CONFIG_ACK), state) is State.CONFIGURATION
-    assert state_after(Message(MessageId.MT_DATA2), State.CONFIGURATION) is State.MEASUREMENT
-    assert state_after(Message(0x77), state) is State.MEASUREMENT
-
-
-def test_settings_are_taken_in_one_state_only():
-    assert valid_in(MessageId.OUTPUT_MODE, State.CONFIGURATION)
-    assert not valid_in(MessageId.OUTPUT_MODE, State.MEASUREMENT)
-    assert valid_in(MessageId.REQ_DATA, State.MEASUREMENT)
-    assert not valid_in(MessageId.REQ_DATA, State.CONFIGURATION)
-    for state in State:
-        assert valid_in(MessageId.GO_TO_CONFIG, state)
-
-
-def test_answers_are_matched_to_requests():
-    assert reply_to(MessageId.REQ_CONFIGURATION) == MessageId.CONFIGURATION
-    assert request_of(Message(MessageId.EMTS)) == MessageId.REQ_EMTS
-    for unasked in (MessageId.MT_DATA, MessageId.MT_DATA2, MessageId.ERROR, MessageId.WAKE_UP):
-        assert request_of(Message(unasked)) is None

@@ -2,24 +2,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from imu_messages import bytes_from_numbers, items_payload, mtdata_payloads
 
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from xsens.messages.catalogue import MessageId
-from xsens.messages.columns import columns
+from xsens.messages.control import MessageId
 from xsens.messages.framing import Message, decode, encode, find_frames
-from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
+from xsens.messages.mtdata import DataLayout, NumberFormat, OutputMode, OutputSettings, numbers_from_bytes
 from xsens.messages.mtdata2 import (
     KINDS,
     Item,
+    columns,
     decode_items,
-    encode_items,
-    identifier_of,
     kind_of,
     number_format,
     size_of,
     world_of,
 )
-from xsens.messages.numberformats import NumberFormat, bytes_from_numbers, numbers_from_bytes
 
 FEW = settings(deadline=None, max_examples=60)
 FORMATS = list(NumberFormat)
@@ -64,21 +62,6 @@ def test_bytes_of_numbers_come_back(data, form):
     again = bytes_from_numbers(np.nan_to_num(values, nan=0.5, posinf=0.5, neginf=-0.5), form)
     whole = np.isfinite(values).repeat(form.size, axis=1)
     assert (again == packed)[whole].all()
-
-
-@pytest.mark.parametrize(
-    ("form", "value"),
-    [
-        (NumberFormat.FP12_20, 2048.0),
-        (NumberFormat.FP12_20, -2048.1),
-        (NumberFormat.FP12_20, np.nan),
-        (NumberFormat.FP16_32, 32768.0),
-        (NumberFormat.FP16_32, np.inf),
-    ],
-)
-def test_numbers_beyond_a_fixed_point_format_are_refused(form, value):
-    with pytest.raises(InvalidInputError, match="expected numbers within ±"):
-        bytes_from_numbers([[1.0, value]], form)
 
 
 # Legacy data
@@ -141,13 +124,13 @@ def test_every_mode_and_manner_comes_back(mode, manner, counter_first, seed):
             rng.uniform(-most, most, (4, field.count)) if real else rng.integers(0, most, (4, field.count))
         )
         values[field.name] = drawn
-    payloads = layout.encode(values)
+    payloads = mtdata_payloads(layout, values)
     assert payloads.shape == (4, layout.size)
     back = layout.decode(payloads)
     for name, sent in values.items():
         # Half a bit of FP12.20, the coarsest at this size but float32's 24 bits.
         np.testing.assert_allclose(back[name], sent, rtol=2**-24, atol=2**-21)
-    assert (layout.encode(back) == payloads).all()
+    assert (mtdata_payloads(layout, back) == payloads).all()
 
 
 def test_sizes_of_legacy_data():
@@ -162,26 +145,18 @@ def test_sizes_of_legacy_data():
 
 def test_modes_that_cannot_be_are_refused():
     for mode in (0, OutputMode.RAW | OutputMode.CALIBRATED, 0x0040):
-        with pytest.raises(InvalidInputError, match="output mode: expected raw counts alone"):
+        with pytest.raises(InvalidInputError, match=f"mode.*{mode:#06x}"):
             DataLayout(mode)
-    with pytest.raises(InvalidInputError, match="expected orientation as 0, 1 or 2"):
+    with pytest.raises(InvalidInputError, match="0xc"):
         DataLayout(OutputMode.ORIENTATION, 0xC)
-    with pytest.raises(InvalidInputError, match="expected some output"):
+    with pytest.raises(InvalidInputError, match="0x70"):
         DataLayout(OutputMode.CALIBRATED, 0x70)
 
 
-def test_values_that_do_not_fit_are_refused():
+def test_a_payload_of_another_length_is_refused():
     layout = DataLayout(OutputMode.ORIENTATION, OutputSettings.COUNTER)
-    with pytest.raises(MismatchError, match="expected 18 bytes, got 17"):
+    with pytest.raises(MismatchError, match=r"18 .*17"):
         layout.decode(bytes(17))
-    with pytest.raises(InvalidInputError, match="expected quaternion_wxyz, got none"):
-        layout.encode({"counter": [[1]]})
-    with pytest.raises(InvalidInputError, match=r"quaternion_wxyz: expected shape \(n, 4\), got \(1, 3\)"):
-        layout.encode({"quaternion_wxyz": [[1, 0, 0]], "counter": [[1]]})
-    with pytest.raises(InvalidInputError, match="counter: expected whole numbers from 0 to 65535"):
-        layout.encode({"quaternion_wxyz": [[1, 0, 0, 0]], "counter": [[65536]]})
-    with pytest.raises(InvalidInputError, match="as many rows"):
-        layout.encode({"quaternion_wxyz": [[1, 0, 0, 0]], "counter": [[1], [2]]})
 
 
 # Self-describing data
@@ -223,9 +198,9 @@ def items(draw):
 @settings(deadline=None, max_examples=150)
 @given(st.lists(items(), max_size=8))
 def test_every_kind_of_item_comes_back(sent):
-    payload = encode_items(sent)
+    payload = items_payload(sent)
     assert decode_items(payload) == sent
-    assert encode_items(decode_items(payload)) == payload
+    assert items_payload(decode_items(payload)) == payload
 
 
 def test_every_identifier_has_a_name_of_its_own_and_reals_come_in_all_formats_and_worlds():
@@ -239,20 +214,16 @@ def test_every_identifier_has_a_name_of_its_own_and_reals_come_in_all_formats_an
             if kind.reals and world < 3:
                 assert known is kind
                 assert size_of(identifier | bits) == kind.reals * (4, 4, 6, 8)[bits & 3]
-                assert identifier_of(kind.name, number_format(bits), ("ENU", "NED", "NWU")[world]) == (
-                    identifier | bits
-                )
+                assert number_format(identifier | bits) == bits & 3
     assert [world_of(0x2010 | bits) for bits in (0, 4, 8)] == ["ENU", "NED", "NWU"]
-    with pytest.raises(InvalidInputError, match="expected world 0, 1 or 2, got 3"):
+    with pytest.raises(InvalidInputError, match=r"0x201c.*3"):
         world_of(0x201C)
-    with pytest.raises(InvalidInputError, match="names, got 'speed'"):
-        identifier_of("speed")
 
 
 @FEW
 @given(st.integers(0, 65535), st.binary(max_size=255))
 def test_items_not_known_or_of_another_size_are_kept_as_bytes(identifier, data):
-    payload = encode_items([Item(identifier, data)])
+    payload = items_payload([Item(identifier, data)])
     (item,) = decode_items(payload)
     assert item.identifier == identifier
     if size_of(identifier) != len(data):
@@ -260,26 +231,14 @@ def test_items_not_known_or_of_another_size_are_kept_as_bytes(identifier, data):
     if kind_of(identifier) is None:
         assert item.name == f"{identifier:#06x}"
     if isinstance(item.values, bytes):
-        assert encode_items([item]) == payload
+        assert items_payload([item]) == payload
 
 
 @pytest.mark.parametrize("cut", [1, 2, 4, 6, 8, 19])
 def test_items_that_claim_more_than_is_there_are_refused(cut):
-    payload = encode_items([Item(0x1020, (7,)), Item(0x4020, (1.0, 2.0, 3.0))])
-    with pytest.raises(InvalidInputError, match="MTData2: expected an item of"):
+    payload = items_payload([Item(0x1020, (7,)), Item(0x4020, (1.0, 2.0, 3.0))])
+    with pytest.raises(InvalidInputError):
         decode_items(payload[:cut])
-
-
-def test_items_that_cannot_be_written_are_refused():
-    for item, message in (
-        (Item(0x4020, (1.0, 2.0)), "acceleration_m_s2: expected bytes or 3 numbers"),
-        (Item(0x7777, (1.0,)), "0x7777: expected bytes"),
-        (Item(0x1020, (70000,)), "packet_counter: "),
-        (Item(0x7777, bytes(256)), "at most 255 bytes, got 256"),
-        (Item(0x4021, (5000.0, 0.0, 0.0)), "within ±2048"),
-    ):
-        with pytest.raises(InvalidInputError, match=message):
-            encode_items([item])
 
 
 # Many messages at once
@@ -302,9 +261,9 @@ def mixed(count, seed=0):
 
 @pytest.mark.parametrize("most", [1, 32])
 def test_columns_are_what_each_message_says_by_itself(monkeypatch, most):
-    monkeypatch.setattr("xsens.messages.columns._MOST_ARRANGEMENTS", most)
+    monkeypatch.setattr("xsens.messages.mtdata2._MOST_ARRANGEMENTS", most)
     sent = mixed(300)
-    data = b"".join(encode(Message(MessageId.MT_DATA2, encode_items(items))) for items in sent)
+    data = b"".join(encode(Message(MessageId.MT_DATA2, items_payload(items))) for items in sent)
     wanted = frozenset({"acceleration_m_s2", "magnetic_field_au", "packet_counter"})
     table, damaged = columns(find_frames(data), wanted)
     assert damaged == 0
@@ -316,7 +275,7 @@ def test_columns_are_what_each_message_says_by_itself(monkeypatch, most):
 
 
 def test_columns_count_messages_that_cannot_be_taken_apart():
-    good = encode_items([Item(0x4020, (1.0, 2.0, 3.0))])
+    good = items_payload([Item(0x4020, (1.0, 2.0, 3.0))])
     payloads = [good, good[:-1], b"\x10", good, b""]
     data = b"".join(encode(Message(MessageId.MT_DATA2, p)) for p in payloads)
     table, damaged = columns(find_frames(data), frozenset({"acceleration_m_s2"}))

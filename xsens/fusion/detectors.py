@@ -1,8 +1,9 @@
-"""Whether the magnetic field can be trusted for heading: its norm and dip against a changing reference.
+"""Detect magnetic disturbance and rest.
 
-Iron near the sensor shows in the two components of the field that do not depend on the heading, its
-horizontal strength and its vertical part. A magnet that moves with the sensor adds a vector that is
-constant in the sensor's axes; turning tells it from the room's field, which is constant in the world's.
+Iron near the sensor changes the two components of the field that do not depend on the heading, its horizontal
+strength and its vertical part: these are compared with a reference that follows the room. A magnet that moves
+with the sensor adds a vector that is constant in the sensor's axes; turning separates it from the room's
+field, which is constant in the world's.
 """
 
 from __future__ import annotations
@@ -14,56 +15,57 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
+from xsens.fusion.increments import Increment
 from xsens.fusion.settings import FusionSettings
 
 _SMOOTHING_S = 0.1
-"""The field is judged after smoothing so long: longer than its noise, shorter than a hand's pass by iron."""
+"""Time over which the field is smoothed: longer than its noise, shorter than a hand's pass by iron."""
 
 _UNDISTURBED_AFTER_S = 0.5
-"""A field is trusted again when it has fitted for so long (VQF's default)."""
+"""A field is trusted again when it has fitted for this time (VQF's default)."""
 
 _TURNING_RAD_S = math.radians(20.0)
-"""Only a sensor that turns faster learns a new reference (VQF's default)."""
+"""A new reference is learnt only while the sensor turns faster (VQF's default)..."""
 
 _LEARNT_AFTER_S = 10.0
-"""...and only after turning so long."""
+"""...and only after turning for this time."""
 
 _STARTING_S = 1.0
-"""The first reference is the mean field of so long."""
+"""The first reference is the mean field over this time."""
 
 _IRON_MEMORY_S = 60.0
-"""Iron once learnt is refined by what was seen over so long."""
+"""Time over which the estimate of iron, once learnt, is refined."""
 
 _PROVED_AFTER_S = 20.0
-"""A first reference that has fitted while turning so long is the room's."""
+"""A first reference that has fitted for this time of turning is confirmed as the room's."""
 
 _IRON_PRIOR = 0.01
 """Variance of the field's unevenness over that of unknown iron: 3 microtesla against 30."""
 
 _UNEVEN = 0.15
-"""What a reference may leave of the field's norm: that of a room with iron in it."""
+"""Largest residual of a reference, as a fraction of the field's norm: that of a room with iron in it."""
 
 _FIRST_AFTER_S, _FIRST_UNEVEN = 5.0, 0.5
-"""The same for a first reference that has not proved itself, which was perhaps learnt beside iron (5 s: VQF's
-default): what would be a poor reference is better than none."""
+"""The same while the first reference is not confirmed, which may have been learnt beside iron (5 s: VQF's
+default): even a poor reference is then better."""
 
 _STEEPEST = 0.05
-"""A field with less of its strength across shows no heading: a room's iron turns it any way."""
+"""A field with a smaller horizontal fraction shows no heading: iron in the room turns it to any side."""
 
 _BETTER = 2.0
-"""A new reference must leave so much less variance than the one it replaces."""
+"""Factor by which a new reference must reduce the variance left by the one it replaces."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The room's field, and what moves with the sensor.
+    """The room's field, and the field of iron that moves with the sensor.
 
     Attributes
     ----------
     horizontal_au, vertical_au : float
         The room's field; vertical is up.
     iron_au : ndarray, shape (3,)
-        Field of what moves with the sensor, in its axes.
+        Field of iron that moves with the sensor, in the sensor's axes.
     """
 
     horizontal_au: float
@@ -77,7 +79,7 @@ class Reference:
 
     @property
     def dip_rad(self) -> float:
-        """How far the room's field points below the horizon."""
+        """Angle of the room's field below the horizon."""
         return math.atan2(-self.vertical_au, self.horizontal_au)
 
     def fits(self, horizontal: float, vertical: float, settings: FusionSettings) -> bool:
@@ -99,10 +101,10 @@ class Reference:
 
 
 class _Candidate:
-    """Least squares of a room's field and iron over what was seen while turning, old readings forgotten.
+    """Least squares of a room's field and iron over readings while turning; old readings fade.
 
-    Both follow from four means in closed form: of the rotation R (world from sensor), of the field in the
-    sensor's axes m and in the world's u = R m, and of their square.
+    Both have a closed form in four means: of the rotation R (world from sensor), of the field in the sensor's
+    axes m and in the world's u = R m, and of the square of its norm.
     """
 
     def __init__(self, memory_s: float) -> None:
@@ -125,7 +127,7 @@ class _Candidate:
         self._misfit = keep * self._misfit + duration_s * misfit
 
     def solve(self) -> tuple[FloatArray, FloatArray, float]:
-        """The room's field in the world's axes, iron in the sensor's, and the mean square they leave."""
+        """The room's field in the world's axes, iron in the sensor's, and the mean square residual."""
         turn, body, world = (a / self.weight_s for a in (self._turn, self._body, self._world))
         iron = np.linalg.solve((1.0 + _IRON_PRIOR) * np.eye(3) - turn.T @ turn, body - turn.T @ world)
         room = world - turn @ iron
@@ -133,16 +135,16 @@ class _Candidate:
         return room, np.asarray(iron, dtype=np.float64), max(float(left), 0.0)
 
     def room_with(self, iron: FloatArray) -> tuple[FloatArray, float]:
-        """The room's field if the iron is as given, and the mean square that leaves."""
+        """The room's field for a given iron, and the mean square residual."""
         turn, body, world = (a / self.weight_s for a in (self._turn, self._body, self._world))
         room = world - turn @ iron
         square = self._square / self.weight_s - 2.0 * iron @ body + iron @ iron
         return room, max(float(square - room @ room), 0.0)
 
     def better_than(self, reference: Reference, proved: bool) -> tuple[FloatArray, FloatArray] | None:
-        """Room and iron if known well enough and clearly better than the reference in use.
+        """Room and iron if they are known well enough and clearly better than the reference in use.
 
-        The iron stays what it was if another room alone explains nearly as much.
+        The iron is kept if another room alone explains the readings nearly as well.
         """
         after_s, uneven = (_LEARNT_AFTER_S, _UNEVEN) if proved else (_FIRST_AFTER_S, _FIRST_UNEVEN)
         if self.weight_s < after_s:
@@ -150,7 +152,7 @@ class _Candidate:
         room, iron, left = self.solve()
         if left > (uneven * np.linalg.norm(room)) ** 2:
             return None
-        if 1.5 * self._misfit / self.weight_s < _BETTER * left:  # it is of two components of three
+        if 1.5 * self._misfit / self.weight_s < _BETTER * left:  # the misfit is of two components of three
             return None
         other, same_iron = self.room_with(reference.iron_au)
         return (other, reference.iron_au) if same_iron < _BETTER * left else (room, iron)
@@ -158,18 +160,18 @@ class _Candidate:
 
 @dataclass(frozen=True)
 class FieldReading:
-    """One reading of the field, judged.
+    """Judgement of one reading of the field.
 
     Attributes
     ----------
     world_au : ndarray, shape (3,)
-        Iron removed, in the axes given.
+        The field without iron, in the world's axes.
     disturbed : bool
     variance_rad2 : float
-        Of the heading it shows, by how far the two other components are off; without the room's own
+        Variance of its heading, estimated from the error of the two other components; without the room's own
         unevenness.
     restart_au : ndarray, shape (3,), or None
-        The room's field, when it replaced a first reference that had not proved itself: the heading may be
+        The room's field, if it has just replaced a first reference that was not confirmed: the heading may be
         far off.
     """
 
@@ -180,7 +182,7 @@ class FieldReading:
 
 
 class FieldMonitor:
-    """Judges readings of the field, one after the other."""
+    """Judge readings of the field one after the other."""
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
@@ -204,7 +206,7 @@ class FieldMonitor:
         field_au : ndarray, shape (3,)
             In that world.
         rate_rad_s : float
-            How fast the sensor turned.
+            Rate of turn of the sensor.
         duration_s : float
         """
         reference = self.reference or Reference(math.hypot(*field_au[:2]), float(field_au[2]), np.zeros(3))
@@ -238,7 +240,7 @@ class FieldMonitor:
         self._age_s += duration_s
 
     def _followed(self, reference: Reference, duration_s: float) -> Reference:
-        """The reference, a little nearer to the field of now if that fits."""
+        """The reference moved a little towards the present field, if that fits."""
         if self._age_s <= _STARTING_S:
             return reference.towards(self._horizontal, self._vertical, duration_s / self._age_s)
         if self._fitting_s < _UNDISTURBED_AFTER_S:
@@ -247,7 +249,7 @@ class FieldMonitor:
         return reference.towards(self._horizontal, self._vertical, share)
 
     def _learn(self) -> FloatArray | None:
-        """The room's field, if turning showed another reference to fit clearly better."""
+        """Replace the reference if another fits clearly better; return the room's field of the new one."""
         assert self.reference is not None
         better = self._candidate.better_than(self.reference, self.confirmed)
         if better is None:
@@ -262,8 +264,38 @@ class FieldMonitor:
         return room
 
     def _refine(self) -> None:
-        """Iron once learnt is known better the longer the sensor turns."""
+        """Refine the estimate of iron while the sensor turns."""
         if self._known is None:
             return
         room, iron, _ = self._known.solve()
         self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)
+
+
+class RestDetector:
+    """Detect rest: gyroscope and accelerometer stay near their means of the last half second for a while."""
+
+    _MEMORY_S = 0.5
+
+    def __init__(self, settings: FusionSettings) -> None:
+        self._settings = settings
+        self._rate: FloatArray | None = None
+        self._force = np.zeros(3)
+        self._still_s = 0.0
+
+    def rests(self, increment: Increment, bias_rad_s: FloatArray, bias_sd_rad_s: float) -> bool:
+        """Whether the sensor rests, given the bias and its standard deviation."""
+        force = increment.velocity_m_s / increment.duration_s
+        if self._rate is None:
+            self._rate, self._force = increment.rate_rad_s.copy(), force
+        rate_off, force_off = increment.rate_rad_s - self._rate, force - self._force
+        share = increment.duration_s / (self._MEMORY_S + increment.duration_s)
+        self._rate += share * rate_off
+        self._force = self._force + share * force_off
+        limit = self._settings.rest_bias_rad_s + 3.0 * bias_sd_rad_s
+        still = (
+            math.hypot(*rate_off) < self._settings.rest_rate_rad_s
+            and math.hypot(*force_off) < self._settings.rest_force_m_s2
+            and math.hypot(*(self._rate - bias_rad_s)) < limit
+        )
+        self._still_s = self._still_s + increment.duration_s if still else 0.0
+        return self._still_s > self._settings.rest_after_s

@@ -1,22 +1,23 @@
-"""Write the inputs of this folder that are made: ``python tests/xsens/corpus/make.py``."""
+"""Write the inputs of this folder that are made: ``python tests/xsens/logs/corpus/make.py``."""
 
 import struct
 import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parents[1]))
+sys.path.insert(0, str(HERE.parents[2]))
 
 from imu_logs import calibration, configured, items_of, legacy_messages, mt9_bin, mtdata2_messages, samples  # noqa: E402
+from imu_messages import configuration_message, items_payload  # noqa: E402
 
-from xsens.messages.catalogue import Configuration, MessageId, UnitConfiguration  # noqa: E402
+from xsens.messages.control import Configuration, MessageId, UnitConfiguration  # noqa: E402
 from xsens.messages.framing import Message, encode  # noqa: E402
 from xsens.messages.mtdata import DataLayout  # noqa: E402
-from xsens.messages.mtdata2 import Item, encode_items  # noqa: E402
+from xsens.messages.mtdata2 import Item  # noqa: E402
 
 
 def of_items(*messages):
-    return b"".join(encode(Message(MessageId.MT_DATA2, encode_items(items))) for items in messages)
+    return b"".join(encode(Message(MessageId.MT_DATA2, items_payload(items))) for items in messages)
 
 
 def inputs():
@@ -36,7 +37,10 @@ def inputs():
         "counter_without_clock",
         of_items(*([Item(0x1020, (i,)), Item(0x4020, (0.0, 0.0, 9.8))] for i in (1, 9))),
     )
-    yield "units_of_impossible_size", encode(Configuration(1, 0, 0xFFFF, several).message()) + bytes(40)
+    yield (
+        "units_of_impossible_size",
+        encode(configuration_message(Configuration(1, 0, 0xFFFF, several))) + bytes(40),
+    )
     yield "settings_not_known", configured(calibrated)[:-20] + b"\xff" * 40
     yield "calibration_of_zeros", encode(Message(0x91, bytes(168))) + mt9_bin(s, calibration())[173:]
     yield "calibration_too_long", encode(Message(0x91, bytes(1320))) + mt9_bin(s, calibration())[173:]

@@ -1,0 +1,81 @@
+"""Messages as a sensor would write them: the inverse of the package's decoders, for tests alone."""
+
+import struct
+
+import numpy as np
+
+from xsens.messages.control import MessageId
+from xsens.messages.framing import Message
+from xsens.messages.mtdata import NumberFormat
+from xsens.messages.mtdata2 import kind_of, number_format
+
+
+def bytes_from_numbers(values, form):
+    """Numbers, shape (n, k), to the nearest that `form` can hold, as rows of bytes."""
+    array = np.asarray(values, dtype=np.float64)
+    if form in (NumberFormat.FLOAT32, NumberFormat.FLOAT64):
+        with np.errstate(over="ignore", invalid="ignore"):  # to infinity, as the sensor's own would
+            return np.ascontiguousarray(array.astype(f">f{form.size}")).view(np.uint8)
+    fraction_bits = 20 if form is NumberFormat.FP12_20 else 32
+    ticks = np.round(array * 2.0**fraction_bits)
+    if form is NumberFormat.FP12_20:
+        return np.ascontiguousarray(ticks.astype(">i4")).view(np.uint8)
+    whole = np.ascontiguousarray(ticks.astype(">i8")[..., None]).view(np.uint8)
+    return np.concatenate((whole[..., 4:], whole[..., 2:4]), axis=-1).reshape(*array.shape[:-1], -1)
+
+
+def mtdata_payloads(layout, values):
+    """Payloads of a `DataLayout` as rows of bytes, from values of shape (n, count) by field name."""
+    parts = []
+    for field in layout.fields:
+        array = np.atleast_2d(np.asarray(values[field.name], dtype=float))
+        assert array.shape[1] == field.count, field.name
+        if field.kind == "real":
+            parts.append(bytes_from_numbers(array, layout.number_format))
+        else:
+            parts.append(np.ascontiguousarray(array.astype(field.kind)).view(np.uint8))
+    return np.concatenate(parts, axis=1)
+
+
+def items_payload(items):
+    """Payload of an MTData2 message that holds `items`."""
+    return b"".join(map(_item, items))
+
+
+def _item(item):
+    data = item.values if isinstance(item.values, bytes) else _packed(item)
+    return struct.pack(">HB", item.identifier, len(data)) + data
+
+
+def _packed(item):
+    kind = kind_of(item.identifier)
+    if kind.whole:
+        return struct.pack(kind.whole, *item.values)
+    return bytes_from_numbers([item.values], number_format(item.identifier)).tobytes()
+
+
+def configuration_message(c):
+    """The answer to a request for the configuration."""
+    payload = struct.pack(">IHH88xH", c.device_id, c.period, c.skip_factor, len(c.units))
+    for u in c.units:
+        payload += struct.pack(">IHHI8x", u.device_id, u.data_length, u.output_mode, u.output_settings)
+    return Message(MessageId.CONFIGURATION, payload)
+
+
+def calibration_message(unit):
+    """The calibration block of an MT9-B; what is not understood of it is zero."""
+    data = bytearray(168)
+    struct.pack_into(">I", data, 0, unit.device_id)
+    struct.pack_into(">H", data, 81, unit.period)
+    data[87:105] = np.round(unit.offsets).astype(">u2").tobytes()
+    gains = np.round(unit.gains * 256).astype(">u4").reshape(9, 1).view(np.uint8)
+    data[105:132] = gains[:, 1:].tobytes()
+    for at, matrix in zip((8, 26, 132, 150), (*unit.misalignments, unit.housing), strict=True):
+        data[at : at + 18] = np.round(matrix * 2**14).astype(">i2").tobytes()
+    return Message(MessageId.EMTS, bytes(data))
+
+
+def counts_of(unit, values):
+    """Raw counts, shape (n, 3, 3), that the calibration takes to `values`, shape (3, n, 3)."""
+    sensed = np.stack([values[i] @ unit.misalignments[i].T for i in range(3)], axis=1)
+    return np.clip(np.round(sensed * unit.gains + unit.offsets), 0, 0xFFFF).astype(np.uint16)

@@ -1,0 +1,168 @@
+"""Check readings for wrong units and contradictions, and make those of a log usable for the filter."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from xsens.fusion.increments import Samples
+from xsens.fusion.settings import BRIDGED_S
+from xsens.logs.samples import ImuLog
+
+FORCE_M_S2 = (4.0, 25.0)
+"""Limits of the median of the accelerometer's norm if it is in m/s^2."""
+
+FASTEST_RAD_S = 60.0
+"""The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement
+in deg/s exceeds 60."""
+
+UNKNOWN_HEADING_RAD = math.radians(45.0)
+"""A heading with a larger standard deviation is unknown."""
+
+_COMPARED_S = 0.1
+"""Interval over which gravity's direction is compared: a hand turns by less than a radian in it."""
+
+_TURNING_RAD_S = 0.2
+"""Smallest RMS rate across gravity that is compared: eleven degrees per second, beyond any bias."""
+
+_FOLLOWED = 0.3
+"""Smallest fraction of the gyroscope's turn that gravity must show: it shows 1 if the unit is rad/s, 1/57 if
+it is deg/s, 0 if the two do not belong together."""
+
+_NEAR_REST_M_S2 = 1.0
+_FEWEST = 20
+
+
+def require_log(log: object) -> None:
+    """Raise `InvalidInputError` if given a file path, say, instead of an `ImuLog`."""
+    if not isinstance(log, ImuLog):
+        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
+
+
+def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
+    """Prepare a log's readings for the filter.
+
+    Returns
+    -------
+    ndarray of int, shape (m,)
+        Indices of the samples with a gyroscope reading.
+    Samples
+        Those samples, accelerometer readings interpolated where missing.
+    list of str
+        Notes on what was left out, interpolated or contradictory.
+
+    Raises
+    ------
+    InsufficientDataError
+        If gyroscope or accelerometer is missing, or has fewer than two readings.
+    InvalidInputError
+        If times, accelerometer or gyroscope are in other units.
+    """
+    source = log.source or "log"
+    if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
+        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {_lacking(log)}")
+    used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
+    force = log.accelerometer_m_s2[used]
+    there = np.isfinite(force).all(axis=1)
+    if used.size < 2 or there.sum() < 2:
+        raise InsufficientDataError(
+            f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
+        )
+    time_s, notes = log.time_s[used], []
+    steps = np.diff(time_s)
+    _require_seconds(steps, source)
+    require_metres(force[there], source)
+    _require_radians(log.gyroscope_rad_s[used], source)
+    if used.size < len(log):
+        notes.append(f"{len(log) - used.size} samples without gyroscope left out")
+    if not there.all():
+        notes.append(f"{int((~there).sum())} accelerometer readings missing: interpolated")
+        force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
+    field = np.full((used.size, 3), np.nan)
+    if log.magnetometer_au is not None:
+        field, zeros = real_field(log.magnetometer_au[used])
+        if zeros:
+            notes.append(f"magnetometer reads zero in {zeros} of {used.size} samples: left out")
+    against = _contradiction(time_s, log.gyroscope_rad_s[used], force)
+    if against is not None:
+        notes.append(against)
+    step_s = np.concatenate([[np.median(steps)], steps])
+    return used, Samples(step_s, log.gyroscope_rad_s[used], force, field), notes
+
+
+def _lacking(log: ImuLog) -> str:
+    """Names of the missing sensors, and the note on columns that may have been meant for them."""
+    vectors = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
+    none = " and ".join(f"no {name}" for name, values in vectors.items() if values is None)
+    return none + "".join(f"; {note}" for note in log.notes if note.startswith("columns not understood"))
+
+
+def _require_seconds(steps_s: FloatArray, source: str) -> None:
+    """Raise `InvalidInputError` if samples are too far apart to integrate a gyroscope."""
+    median = float(np.median(steps_s))
+    if median > BRIDGED_S * (1.0 + 1e-6):
+        raise InvalidInputError(
+            f"{source}: expected samples at most {BRIDGED_S:g} s apart, got a median of {median:.4g} s: "
+            "times in milliseconds?"
+        )
+
+
+def require_metres(force_m_s2: FloatArray, source: str) -> None:
+    """Raise `InvalidInputError` if an accelerometer, shape (m, 3), is not in m/s^2."""
+    median = float(np.median(np.linalg.norm(force_m_s2, axis=1)))
+    low, high = FORCE_M_S2
+    if not low < median < high:
+        raise InvalidInputError(
+            f"{source}: expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}"
+        )
+
+
+def _require_radians(rate_rad_s: FloatArray, source: str) -> None:
+    """Raise `InvalidInputError` if a hundredth of a gyroscope's readings, shape (m, 3), exceeds any range."""
+    fast = float(np.percentile(np.linalg.norm(rate_rad_s, axis=1), 99.0))
+    if fast > FASTEST_RAD_S:
+        raise InvalidInputError(
+            f"{source}: expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
+        )
+
+
+def real_field(field_au: FloatArray) -> tuple[FloatArray, int]:
+    """The field, shape (m, 3), NaN where zero or not finite, and how many readings were exactly zero."""
+    zero = (field_au == 0.0).all(axis=1)
+    none = zero | ~np.isfinite(field_au).all(axis=1)
+    return np.where(none[:, None], np.nan, field_au), int(zero.sum())
+
+
+def _contradiction(time_s: FloatArray, rate_rad_s: FloatArray, force_m_s2: FloatArray) -> str | None:
+    """Note if gravity does not turn as the gyroscope reads; None if it does or nothing can be told.
+
+    Seen from the sensor, gravity's direction u changes at the rate u x w. The RMS of both sides is compared,
+    over short means near rest only. Movement makes the accelerometer show more turning, never less, except
+    that of a free pendulum.
+    """
+    width = max(1, round(_COMPARED_S / float(np.median(np.diff(time_s)))))
+    count = len(time_s) // width
+    if count <= _FEWEST:
+        return None
+    rate, force = (a[: count * width].reshape(count, width, 3).mean(axis=1) for a in (rate_rad_s, force_m_s2))
+    middle = time_s[: count * width].reshape(count, width).mean(axis=1)
+    norm = np.linalg.norm(force, axis=1)
+    up = force / np.maximum(norm, 1e-9)[:, None]
+    step = np.diff(middle)
+    calm = np.abs(norm - np.median(norm)) < _NEAR_REST_M_S2
+    calm = calm[1:] & calm[:-1] & (step < 2.0 * np.median(step))
+    if calm.sum() < _FEWEST:
+        return None
+    across = np.cross(up[1:] + up[:-1], rate[1:] + rate[:-1])[calm] / 4.0
+    shown = np.diff(up, axis=0)[calm] / step[calm, None]
+    square = float(np.mean((across**2).sum(axis=1)))
+    share = math.sqrt(float(np.mean((shown**2).sum(axis=1))) / max(square, 1e-12))
+    if square < _TURNING_RAD_S**2 or share > _FOLLOWED:
+        return None
+    return (
+        f"gyroscope and accelerometer contradict each other: across gravity the one turns by "
+        f"{math.sqrt(square):.2g} rad/s, the other shows {100.0 * share:.0f} % of it: gyroscope in rad/s?"
+    )

@@ -1,0 +1,301 @@
+"""Samples from the sensor's data messages: legacy MTData by its configuration, MTData2 by its own items."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
+from xsens.logs.clocks import Stamps
+from xsens.logs.parts import Hints, Orientations, Parts, from_quaternions, on_clock, only, orientations_of
+from xsens.logs.samples import ImuLog
+from xsens.messages.control import Configuration, MessageId, UnitConfiguration
+from xsens.messages.framing import Frames, Message
+from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings, Values
+from xsens.messages.mtdata2 import Column, columns, name_of, world_of
+from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
+
+_Read = TypeVar("_Read")
+
+# -- legacy MTData
+
+_RAW = OutputMode.RAW | OutputMode.MT9
+_RAW_WITH_COUNTER = 22
+_ENOUGH = 10_000
+"""Messages that show where the counter is."""
+
+
+@dataclass(frozen=True)
+class _Slice:
+    """One unit's part of every payload: its layout, the payload's size, and its bytes (None: all)."""
+
+    layout: DataLayout
+    size: int
+    columns: IntArray | None = None
+
+    def of(self, frames: Frames) -> Values:
+        payloads = frames.payloads()
+        return self.layout.decode(payloads if self.columns is None else payloads[:, self.columns])
+
+
+def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hints: Hints) -> ImuLog:
+    """Read the samples of the MTData messages at indices `which`.
+
+    Raises
+    ------
+    InvalidInputError
+        If layout, rate or calibration is neither in the log nor in the hints.
+    """
+    configuration = _last(frames, frames.mid == MessageId.CONFIGURATION, Configuration.from_message)
+    blocks = (frames.mid == MessageId.EMTS) & (frames.payload_size == BLOCK_SIZE)
+    calibration = hints.calibration or _last(frames, blocks, RawCalibration.from_message)
+    data = frames[which]
+    part = _slice(data, configuration, hints)
+    fits = data.payload_size == part.size
+    if not fits.any():
+        raise InvalidInputError(f"expected data messages of {part.size} bytes, as configured, got none")
+    if not fits.all():
+        parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
+    values = part.of(only(data, fits))
+    raw = part.layout.mode & _RAW
+    parts = _in_units(values, calibration, parts) if raw else _as_sent(values, parts, part.layout, hints)
+    counter = values["counter"][:, 0].astype(np.int64) if "counter" in values else None
+    stamps = replace(
+        stamps, counter=counter, starts=only(stamps.starts, fits), computer_s=only(stamps.computer_s, fits)
+    )
+    rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
+    rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
+    return on_clock(stamps, int(fits.sum()), parts, replace(hints, rate_hz=rate_hz))
+
+
+def _last(frames: Frames, which: BoolArray, read: Callable[[Message], _Read]) -> _Read | None:
+    """The last of some messages that can be read."""
+    for i in np.flatnonzero(which)[::-1].tolist():
+        with suppress(InvalidInputError):
+            return read(frames.message(i))
+    return None
+
+
+def _slice(data: Frames, configuration: Configuration | None, hints: Hints) -> _Slice:
+    if hints.layout is not None:
+        return _Slice(hints.layout, hints.layout.size)
+    units = configuration.units if configuration is not None else ()
+    if len(units) > 1:
+        return _of_unit(units, hints.unit)
+    if units and not units[0].output_mode & _RAW:
+        layout = DataLayout(units[0].output_mode, units[0].output_settings)
+        return _Slice(layout, layout.size)
+    return _raw(data)
+
+
+def _of_unit(units: tuple[UnitConfiguration, ...], unit: int | None) -> _Slice:
+    """Part of one unit behind a master, which sends its counter, then each unit's data."""
+    if unit is None or not 0 <= unit < len(units):
+        names = ", ".join(f"{u.device_id:08X}" for u in units)
+        raise InvalidInputError(f"expected a choice among {len(units)} units (unit 0 is first: {names})")
+    chosen, sizes = units[unit], [u.data_length for u in units]
+    settings = chosen.output_settings | OutputSettings.COUNTER
+    layout = DataLayout(chosen.output_mode, settings, counter_first=True)
+    first = 2 + sum(sizes[:unit])
+    if layout.size != 2 + sizes[unit]:
+        raise InvalidInputError(
+            f"unit {unit}: expected {layout.size - 2} bytes by its output mode, got {sizes[unit]} configured"
+        )
+    columns = np.concatenate(([0, 1], np.arange(first, first + sizes[unit])))
+    return _Slice(layout, 2 + sum(sizes), columns)
+
+
+def _raw(data: Frames) -> _Slice:
+    """Part of raw counts; the counter is first or last, whichever number rises by one."""
+    start = data.payload_start[data.payload_size == _RAW_WITH_COUNTER]
+    if 2 * start.size <= len(data):
+        raise InvalidInputError(
+            "expected a configuration before data messages that are not raw counts with a counter, got none"
+        )
+    first, last = (_share_counting(data, start[:_ENOUGH] + at) for at in (0, _RAW_WITH_COUNTER - 2))
+    layout = DataLayout(OutputMode.MT9) if first >= last else DataLayout(OutputMode.RAW)
+    return _Slice(layout, layout.size)
+
+
+def _share_counting(frames: Frames, at: IntArray) -> float:
+    """How often a 16-bit number, found at `at`, rises by one from each message to the next."""
+    steps = np.diff(256 * frames.data[at].astype(np.int64) + frames.data[at + 1])
+    return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
+
+
+def _in_units(values: Values, calibration: RawCalibration | None, parts: Parts) -> Parts:
+    if calibration is None:
+        raise InvalidInputError("expected a calibration block before raw counts, got none")
+    names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
+    acceleration, rate, field = calibration.to_units(np.stack([values[name] for name in names], axis=1))
+    return replace(
+        parts.noting(NOT_COMPENSATED),
+        accelerometer_m_s2=acceleration,
+        gyroscope_rad_s=rate,
+        magnetometer_au=field,
+    )
+
+
+def _as_sent(values: Values, parts: Parts, layout: DataLayout, hints: Hints) -> Parts:
+    acceleration = values.get("accelerometer_m_s2")
+    orientations, notes = orientations_of(
+        hints.world or layout.frame,
+        acceleration,
+        values.get("quaternion_wxyz"),
+        values.get("matrix"),
+        values.get("euler_deg"),
+    )
+    return replace(
+        parts.noting(*notes),
+        accelerometer_m_s2=acceleration,
+        gyroscope_rad_s=values.get("gyroscope_rad_s"),
+        magnetometer_au=values.get("magnetometer_au"),
+        orientations=orientations,
+    )
+
+
+# -- MTData2
+
+_NOTATIONS = {
+    "quaternion_wxyz": "quaternions",
+    "rotation_matrix_by_column": "matrices",
+    "euler_deg": "angles_deg",
+}
+"""Parameter of `orientations_of` by the name of the item."""
+
+_MEASURED = (
+    "acceleration_m_s2",
+    "rate_of_turn_rad_s",
+    "magnetic_field_au",
+    "delta_v_m_s",
+    "delta_q_wxyz",
+    *_NOTATIONS,
+)
+_STAMPS = ("packet_counter", "sample_time_fine")
+_TICK_S = 1e-4
+
+Table = dict[int, Column]
+"""Numbers by the identifier of the item."""
+
+
+def mtdata2_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hints: Hints) -> ImuLog:
+    """Read the samples of the MTData2 messages at indices `which`.
+
+    Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.
+
+    Raises
+    ------
+    InvalidInputError
+        If none holds a measurement, or none a time.
+    """
+    table, damaged = columns(frames[which], frozenset((*_MEASURED, *_STAMPS)))
+    if damaged:
+        parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
+    rows = _sample_rows(table, which.size)
+    if not rows.any():
+        raise InvalidInputError(
+            f"expected measurements with a time in {which.size} MTData2 messages, got none"
+        )
+    if not rows.all():
+        parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
+    parts = _measured(table, rows, parts, hints)
+    return _per_second(on_clock(_stamped(table, rows, stamps), int(rows.sum()), parts, hints), table)
+
+
+def _sample_rows(table: Table, size: int) -> BoolArray:
+    """Mark messages that hold a measurement and every kind of time stamp that any message holds."""
+    rows = np.zeros(size, dtype=bool)
+    for identifier, column in table.items():
+        if name_of(identifier) in _MEASURED:
+            rows[column.rows] = True
+    for stamp in _STAMPS:
+        told = _filled(table, stamp, size)
+        if told is not None:
+            rows &= np.isfinite(told[:, 0])
+    return rows
+
+
+def _named(table: Table, name: str) -> Table:
+    return {identifier: column for identifier, column in table.items() if name_of(identifier) == name}
+
+
+def _filled(table: Table, name: str, size: int) -> FloatArray | None:
+    """The item called `name` for every message, shape (size, count), NaN where it is missing."""
+    found = list(_named(table, name).values())
+    if not found:
+        return None
+    if len(found) == 1 and found[0].rows.size == size and (np.diff(found[0].rows) == 1).all():
+        return found[0].values
+    values = np.full((size, found[0].values.shape[1]), np.nan)
+    for column in found:
+        values[column.rows] = column.values
+    return values
+
+
+def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
+    counter, ticks = (_whole(_filled(table, name, rows.size), rows) for name in _STAMPS)
+    # A new start before a message that is no sample is one before the next sample.
+    at = np.flatnonzero(rows)
+    starts, computer_s = np.zeros(at.size, dtype=bool), np.full(at.size, np.nan)
+    if stamps.starts is not None and stamps.computer_s is not None:
+        for i in np.flatnonzero(stamps.starts):
+            after = int(np.searchsorted(at, i))
+            if after < at.size:
+                starts[after], computer_s[after] = True, stamps.computer_s[i]
+    others = np.cumsum(~rows, dtype=np.int64)[rows]
+    return Stamps(counter, ticks, tick_s=_TICK_S, others=others, starts=starts, computer_s=computer_s)
+
+
+def _whole(values: FloatArray | None, rows: BoolArray) -> IntArray | None:
+    return None if values is None else values[rows, 0].astype(np.int64)
+
+
+def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
+    def vectors(name: str) -> FloatArray | None:
+        found: FloatArray | None = only(_filled(table, name, rows.size), rows)
+        return found
+
+    acceleration, rate = vectors("acceleration_m_s2"), vectors("rate_of_turn_rad_s")
+    orientations, notes = _orientations(table, rows, acceleration, hints)
+    if acceleration is None and (acceleration := vectors("delta_v_m_s")) is not None:
+        notes = (*notes, "acceleration is the sensor's velocity increments over its sampling period")
+    if rate is None and (turns := vectors("delta_q_wxyz")) is not None:
+        turned = from_quaternions(turns, "NWU")
+        rate = np.where(turned.there[:, None], turned.world_from_sensor.as_rotvec(), np.nan)
+        notes = (*notes, "rate of turn is the sensor's orientation increments over its sampling period")
+    return replace(
+        parts.noting(*notes),
+        accelerometer_m_s2=acceleration,
+        gyroscope_rad_s=rate,
+        magnetometer_au=vectors("magnetic_field_au"),
+        orientations=orientations,
+    )
+
+
+def _per_second(log: ImuLog, table: Table) -> ImuLog:
+    """Divide increments by the clock's period where there are only increments."""
+    if log.accelerometer_m_s2 is not None and not _named(table, "acceleration_m_s2"):
+        log = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 * log.rate_hz)
+    if log.gyroscope_rad_s is not None and not _named(table, "rate_of_turn_rad_s"):
+        log = replace(log, gyroscope_rad_s=log.gyroscope_rad_s * log.rate_hz)
+    return log
+
+
+def _orientations(
+    table: Table, rows: BoolArray, acceleration: FloatArray | None, hints: Hints
+) -> tuple[Orientations | None, tuple[str, ...]]:
+    """Orientations in the first notation that is there, of the identifier (world) that most messages have."""
+    for name in _NOTATIONS:
+        if found := _named(table, name):
+            most = max(found, key=lambda i: found[i].rows.size)
+            values = only(_filled({most: found[most]}, name, rows.size), rows)
+            if name == "rotation_matrix_by_column":
+                values = np.swapaxes(values.reshape(-1, 3, 3), 1, 2)
+            world = hints.world or world_of(most)
+            return orientations_of(world, acceleration, **{_NOTATIONS[name]: values})
+    return None, ()
