@@ -18,7 +18,7 @@ def info(
     path: Annotated[Path, typer.Argument(help="A file the package reads.")], as_json: Json = False
 ) -> None:
     """Tell what a file holds, after checking it."""
-    from speckle3d.io.load import describe
+    from speckle3d.io.describe import describe
 
     rows = describe(path)
     if as_json:

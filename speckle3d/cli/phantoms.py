@@ -272,7 +272,7 @@ def _prepared(
 
 
 def _seconds(text: str) -> float:
-    from speckle3d.io.headers import numbers
+    from speckle3d.io.text import numbers
 
     try:
         (seconds,) = numbers(text, 1, "--time-offset")

@@ -16,8 +16,8 @@ from speckle3d.io.hdf5 import (
     read_attribute,
     read_checked,
     read_text,
-    read_vector_attribute,
 )
+from speckle3d.io.sweeps import read_signal
 
 FORMAT = "speckle3d.curves"
 KEY_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
@@ -69,15 +69,6 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
 
 def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:
     kind = read_text(file, "signal")
-    if kind == "bmode":
-        return BModeSettings(read_attribute(file, "dynamic_range_db"), read_attribute(file, "full_scale"))
-    if kind != "rf":
+    if kind not in ("rf", "bmode"):
         raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-    band = read_vector_attribute(file, "bandwidth_hz", 2)
-    if band is None:
-        raise InvalidInputError("expected attribute bandwidth_hz, got none")
-    rate, speed, centre = (
-        read_attribute(file, name)
-        for name in ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
-    )
-    return RFSettings(rate, speed, centre, (float(band[0]), float(band[1])))
+    return read_signal(file, kind)

@@ -12,6 +12,7 @@ import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
 _HEADER_LIMIT_BYTES = 2**28
@@ -109,18 +110,6 @@ def read_header(path: PathLike) -> SequenceHeader:
             raise
         raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
-
-
-def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
-    """Read finite numbers separated by blanks; `count` of them unless it is None."""
-    try:
-        values = tuple(float(word) for word in text.split())
-    except ValueError:
-        values = ()
-    if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
-        shown = text if len(text) <= 40 else f"{text[:37]}..."
-        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
-    return values
 
 
 def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
