@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, note
+from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -86,12 +85,7 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> No
                 (f"{spoken}, median norm", f"{np.nanmedian(np.linalg.norm(values, axis=1)):.4f}", unit)
             )
     rows += [("note", text, "") for text in log.notes]
-    if as_json:
-        emit(json.dumps([{"description": d, "value": v, "unit": u} for d, v, u in rows], indent=2))
-        return
-    width = max(len(d) for d, _, _ in rows)
-    for description, value, unit in rows:
-        emit(f"{description.ljust(width)}  {value} {unit}".rstrip())
+    emit_rows(rows, as_json)
 
 
 @imu.command("convert")
@@ -147,10 +141,9 @@ def imu_orient(
     tell(log)
     rows = _orientation_rows(log, rotations, found)
     if as_json:
-        emit(json.dumps({name: value for name, value, _ in rows}, indent=2))
-        return
-    for name, value, unit in rows:
-        emit(f"{name}: {value:.5g} {unit}".rstrip())
+        emit_json({name: value for name, value, _ in rows})
+    else:
+        emit_rows([(name, f"{value:.5g}", unit) for name, value, unit in rows], as_json)
 
 
 @imu.command("record")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, emit, note
+from speckle3d.cli.common import Json, emit, emit_rows, note
 from speckle3d.cli.imu import (
     Log,
     Magnetometer,
@@ -91,8 +90,7 @@ def imu_accuracy(
 
         save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
     if as_json:
-        rows = [{"description": d, "value": v, "unit": u} for d, v, u in table.values()]
-        emit(json.dumps(rows, indent=2))
+        emit_rows(table.values(), as_json)
         return
     emit(table.text())
     emit(

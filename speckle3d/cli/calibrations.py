@@ -1,26 +1,25 @@
-"""Calibrations that a command puts on a sweep's sensors."""
+"""Calibration files: written with their report beside them, and put on a sweep's sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from speckle3d.cli.common import note
+from speckle3d.cli.common import emit, emit_json, note, require_own_place
+from speckle3d.core.errors import FileError, InvalidInputError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calibration.beam import BeamBias
     from speckle3d.core.calibration import Calibration
     from speckle3d.core.sweep import ImageGrid, Sweep
 
-CalibrationFiles = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--calibration", help="Calibration to use for its sensor in place of the file's; may be repeated."
-    ),
-]
+_BESIDE = (".txt", ".png", ".csv")
+"""What lies beside a calibration file: its table, its pictures, and the dots it was made from."""
+
 
 NOTED_SIZE = 0.01
 """Relative difference of pixel sizes from which it is told: 0.4 mm over an image of 40 mm."""
@@ -29,6 +28,80 @@ NOTED_OFFSET_S = 0.001
 
 NOTED_DEG, NOTED_MM = 5.0, 10.0
 """Difference of mountings from which it is told: no calibration of the same mounting is so far off."""
+
+
+def require_free(out: Path, *inputs: Path | None) -> None:
+    """Refuse a calibration's place that is no calibration's, or whose report would take an input's.
+
+    Raises
+    ------
+    FileError
+        If the place cannot be written.
+    InvalidInputError
+        If it is taken.
+    """
+    if out.suffix in _BESIDE:
+        raise InvalidInputError(
+            f"{out}: expected a calibration file, not {', '.join(_BESIDE)}, which are written beside it"
+        )
+    require_own_place(out, "a calibration", _is_calibration, *inputs)
+    beside = {out.with_suffix(suffix).resolve() for suffix in _BESIDE}
+    for path in inputs:
+        if path is not None and path.resolve() in beside:
+            raise InvalidInputError(f"{path}: would be overwritten by the results: give -o another name")
+
+
+def _is_calibration(path: Path) -> bool:
+    from speckle3d.io.calibrations import FORMAT
+    from speckle3d.io.load import kind_of
+
+    try:
+        return kind_of(path) == FORMAT
+    except (FileError, InvalidInputError):
+        return False
+
+
+def write_with_report(
+    calibration: Calibration,
+    inputs: Sequence[Path],
+    out: Path,
+    figure: Callable[[Calibration], Figure],
+    notes: Sequence[str],
+    beam: Sequence[BeamBias] = (),
+    as_json: bool = False,
+) -> None:
+    """Write a calibration, its table and its pictures, and print the table.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        Recordings it was made from, named in the file with their hashes.
+    figure : callable
+        Draws the pictures of the calibration as it was written.
+    notes : sequence of str
+        What else the table says.
+    """
+    from importlib.metadata import version
+
+    from calibration.report import json_report, text_report
+    from speckle3d.core.calibration import Source
+    from speckle3d.io.calibrations import write_calibration
+    from speckle3d.io.hdf5 import atomic_path, sha256_of
+    from speckle3d.study.figures import save_figure
+
+    names, hashes = (" ".join(map(of, inputs)) for of in (str, sha256_of))
+    named = replace(calibration, source=Source(names, hashes, version("speckle3d")))
+    table = text_report(named, beam, notes)
+    write_calibration(out, named)
+    text, pictures = out.with_suffix(".txt"), out.with_suffix(".png")
+    with atomic_path(text) as part:
+        part.write_text(table, encoding="utf-8")
+    save_figure(figure(named), pictures)
+    if as_json:
+        emit_json(json_report(named, beam) | {"notes": list(notes)})
+    else:
+        emit(table)
+    note(f"calibration in {out}, report in {text} and {pictures}")
 
 
 def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
