@@ -15,11 +15,12 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection, correct_orientation, correct_pose
+from speckle3d.correction.drift import DriftCorrection
+from speckle3d.correction.modes import correct_mode, require_modes
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -36,12 +37,7 @@ from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.decorrelation import fit_curves
-from speckle3d.motion.direction import (
-    orientation_at,
-    orientation_sensor,
-    sensed_orientation,
-    settle_direction,
-)
+from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
 from speckle3d.motion.revisits import find_returns, tie_returns
@@ -109,7 +105,10 @@ def track(
     images: ImageSink | None = None,
     matched: BlockSource | None = None,
 ) -> Tracked:
-    """Estimate the pose of every frame from the images, and from the orientation-consistent patches if asked.
+    """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
+
+    The second set of poses, `Tracked.subset`, needs an orientation sensor calibrated to the image that has
+    readings for all frames.
 
     Parameters
     ----------
@@ -127,12 +126,24 @@ def track(
     matched : callable, optional
         Asked for each block of frames before it is matched here.
 
+    Returns
+    -------
+    Tracked
+
     Raises
     ------
     MismatchError
         If the curves belong to another probe, frequency, sampling or patch size.
     InsufficientDataError
         If too many frames have no speckle in common with others.
+
+    Examples
+    --------
+    >>> import speckle3d as s3
+    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
+    >>> len(tracked.image), tracked.direction_from, bool(tracked.flags.any())
+    (96, 'tracker', False)
     """
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
@@ -302,6 +313,14 @@ def calibrate_curves(
 ) -> DecorrelationCurves:
     """Measure decorrelation curves on phantom sweeps whose positions are known.
 
+    Parameters
+    ----------
+    sweeps : sequence of Sweep
+        Fully developed speckle in steps or by hand; with some that turn, the curves learn what tilt does.
+    config : Config, optional
+    progress : callable, optional
+        Called with frames done and frames in all.
+
     Raises
     ------
     InsufficientDataError
@@ -331,74 +350,47 @@ def _shifted(progress: Progress | None, before: int, total: int) -> Progress | N
     return None if progress is None else lambda done, _: progress(before + done, total)
 
 
-def require_modes(sweep: Sweep, modes: Sequence[str]) -> None:
-    """Check that the sweep has what every drift mode needs, before any work is done.
+def correct(
+    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
+) -> dict[str, DriftCorrection]:
+    """Correct the drift of the image-based poses in each of `modes`.
+
+    Parameters
+    ----------
+    tracked : Tracked
+    sweep : Sweep
+        From which `tracked` was made.
+    modes : sequence of str
+        Among ``"orientation"`` (three curves) and ``"pose"`` (six).
+    config : Config, optional
+
+    Returns
+    -------
+    dict of str to DriftCorrection
+        By mode; ``poses`` are ``world_from_image`` in the sensor's world.
 
     Raises
     ------
     InvalidInputError
         If a mode is unknown.
     InsufficientDataError
-        If its sensor is missing, not calibrated to the image, or covers no frame.
-    """
-    sensors = {
-        "pose": (sweep.tracker, "a tracker in /tracker", "sensor_from_image"),
-        "orientation": (
-            orientation_sensor(sweep),
-            "an orientation sensor in /orientation",
-            "sensor_from_image_wxyz" if sweep.orientation else "sensor_from_image",
-        ),
-    }
-    for mode in modes:
-        if mode not in sensors:
-            raise InvalidInputError(f"expected a drift mode among orientation, pose; got {mode!r}")
-        sensor, wanted, attribute = sensors[mode]
-        where = f"{sweep.name}: drift mode {mode}"
-        if sensor is None:
-            raise InsufficientDataError(f"{where}: expected {wanted}, got none")
-        if sensor.sensor_from_image is None:
-            raise InsufficientDataError(
-                f"{where}: the sensor is not calibrated to the image: it lacks the attribute {attribute}"
-            )
-        if not sensor.covers(sweep.frame_time_s).any():
-            raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
-
-
-def correct(
-    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
-) -> dict[str, DriftCorrection]:
-    """Correct the drift of the image-based poses in each of `modes`.
-
-    Raises
-    ------
-    InsufficientDataError
         If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
+
+    References
+    ----------
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, equations 1 to 5.
+
+    Examples
+    --------
+    >>> import speckle3d as s3
+    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
+    >>> corrected = s3.correct(tracked, sweep, ["orientation", "pose"])
+    >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
+    [96, 96]
     """
     settings = config or Config()
     require_modes(sweep, modes)
-    done: dict[str, DriftCorrection] = {}
-    # Wander that the sensed orientation shows need not be made up for by cubics.
+    # What wander the sensed orientation shows, cubics need not make up for.
     start = tracked.subset if tracked.subset is not None else tracked.image
-    for mode in modes:
-        if mode == "pose":
-            done[mode] = _correct_by_tracker(start, sweep, settings)
-        else:
-            done[mode] = _correct_by_orientation(start, sweep, settings)
-    return done
-
-
-def _correct_by_tracker(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
-    assert sweep.tracker is not None
-    covered = sweep.tracker.covers(sweep.frame_time_s)
-    measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
-    with naming(sweep.name):
-        return correct_pose(poses, measured, covered, sweep.grid.corners_mm, config.drift)
-
-
-def _correct_by_orientation(poses: RigidTransform, sweep: Sweep, config: Config) -> DriftCorrection:
-    sensor = orientation_sensor(sweep)
-    assert sensor is not None
-    covered = sensor.covers(sweep.frame_time_s)
-    rotation = orientation_at(sensor, sweep.frame_time_s[covered])
-    with naming(sweep.name):
-        return correct_orientation(poses, rotation, covered, sweep.grid.centre_mm, config.drift)
+    return {mode: correct_mode(mode, start, sweep, settings.drift) for mode in modes}

@@ -46,3 +46,27 @@ def python():
         return done.stdout
 
     return run
+
+
+@pytest.fixture(scope="session")
+def sweep(shipped):
+    """The sweep that comes with the project: 96 frames, 12 mm, with both sensors and the truth."""
+    from speckle3d.io.load import load_sweep
+
+    return load_sweep(shipped / "phantom.h5")
+
+
+@pytest.fixture(scope="session")
+def curves(shipped):
+    """The curves that come with the project."""
+    from speckle3d.io.curves import read_curves
+
+    return read_curves(shipped / "curves.h5")
+
+
+@pytest.fixture(scope="session")
+def tracked(sweep, curves):
+    """The shipped sweep, tracked as it comes."""
+    from speckle3d.pipeline import track
+
+    return track(sweep, curves)

@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import tomllib
 
 import pytest
 from imu_logs import samples
@@ -63,6 +64,14 @@ def test_the_version_is_the_distributions_and_a_misspelt_name_an_attribute_error
         _ = speckle3d.trak
 
 
+def test_the_version_stands_in_one_place(project):
+    cited = re.search(
+        r"^version: (\S+)$", (project / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    settings = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
+    assert cited[1] == settings["project"]["version"]
+
+
 def examples(project):
     readme = (project / "README.md").read_text(encoding="utf-8")
     return re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
@@ -100,6 +109,6 @@ def test_every_shipped_file_is_small_and_its_making_told(project):
 
 
 def test_links_between_the_projects_pages_lead_somewhere(project):
-    for page in (project / "README.md", project / "data" / "README.md"):
+    for page in (project / "README.md", project / "CONTRIBUTING.md", project / "data" / "README.md"):
         for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), (page.name, target)

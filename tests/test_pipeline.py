@@ -11,9 +11,7 @@ from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.sweep import OrientationSensor, Sweep
-from speckle3d.io.curves import read_curves
-from speckle3d.io.load import load_sweep
+from speckle3d.core.sweep import OrientationSensor
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_rotations
@@ -34,21 +32,6 @@ class FirstFrames:
 def head(sweep, count):
     frames, truth = FirstFrames(sweep.frames, count), sweep.truth[:count]
     return replace(sweep, frames=frames, frame_time_s=sweep.frame_time_s[:count], truth=truth)
-
-
-@pytest.fixture(scope="module")
-def sweep(shipped) -> Sweep:
-    return load_sweep(shipped / "phantom.h5")
-
-
-@pytest.fixture(scope="module")
-def curves(shipped):
-    return read_curves(shipped / "curves.h5")
-
-
-@pytest.fixture(scope="module")
-def tracked(sweep, curves):
-    return track(sweep, curves)
 
 
 @pytest.fixture(scope="module")

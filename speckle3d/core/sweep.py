@@ -205,6 +205,17 @@ class Sweep:
     def __len__(self) -> int:
         return int(self.frames.shape[0])
 
+    @property
+    def orientation_source(self) -> OrientationSensor | Tracker | None:
+        """The orientation sensor, or the tracker where there is none."""
+        return self.orientation or self.tracker
+
+
+def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.ArrayLike) -> Rotation:
+    """Orientation ``world_from_image`` at each frame time, by either kind of sensor."""
+    measured = sensor.world_from_image(frame_time_s)
+    return measured.rotation if isinstance(measured, RigidTransform) else measured
+
 
 def _require_positive(settings: object, names: tuple[str, ...]) -> None:
     for name in names:

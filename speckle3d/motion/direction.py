@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import Sweep, image_orientation
 
 
 class SensorSettings(BaseModel):
@@ -32,25 +32,16 @@ class SensorSettings(BaseModel):
     )
 
 
-def orientation_sensor(sweep: Sweep) -> OrientationSensor | Tracker | None:
-    """Return the sweep's orientation sensor, or its tracker if it has none."""
-    return sweep.orientation or sweep.tracker
-
-
-def orientation_at(sensor: OrientationSensor | Tracker, time_s: FloatArray) -> Rotation:
-    """Orientation of the image from either kind of sensor."""
-    measured = sensor.world_from_image(time_s)
-    return measured.rotation if isinstance(measured, RigidTransform) else measured
-
-
 def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | None:
     """Smoothed orientation of every frame; None if the subset is off or a frame has no reading."""
-    sensor = orientation_sensor(sweep)
+    sensor = sweep.orientation_source
     if not settings.consistent_subset or sensor is None or sensor.sensor_from_image is None:
         return None
     if not sensor.covers(sweep.frame_time_s).all():
         return None
-    return smooth_rotations(orientation_at(sensor, sweep.frame_time_s), sweep.frame_time_s, settings.smooth_s)
+    return smooth_rotations(
+        image_orientation(sensor, sweep.frame_time_s), sweep.frame_time_s, settings.smooth_s
+    )
 
 
 def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) -> Rotation:

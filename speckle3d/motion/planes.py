@@ -35,8 +35,8 @@ WELL_FITTED = 0.9
 ROUNDS = 12
 LEAST_PATCHES = 6
 NEAR_MM = 0.15
-"""Least distance at which fits start: correlation is flat at zero, and seen from there, frames that are farther
-apart look tilted."""
+"""Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
+tilt."""
 
 
 class PlaneSettings(BaseModel):

@@ -20,13 +20,14 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
+from speckle3d.correction.modes import require_modes
 from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.matching.quality import describe
 from speckle3d.motion.direction import sensed_orientation
-from speckle3d.pipeline import Progress, Tracked, correct, require_modes, track
+from speckle3d.pipeline import Progress, Tracked, correct, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, accumulated, compare_modes
 from speckle3d.study.blockfiles import BlockFiles
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure

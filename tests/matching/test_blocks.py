@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from speckle3d.config import Config
-from speckle3d.io.curves import read_curves
-from speckle3d.io.load import load_sweep
 from speckle3d.matching.blocks import Block, MatchedBlock, StageTimes, blocks_of, match_block
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
@@ -48,22 +46,7 @@ def matched(sweep, s, block, **more):
 
 
 @pytest.fixture(scope="module")
-def sweep(shipped):
-    return load_sweep(shipped / "phantom.h5")
-
-
-@pytest.fixture(scope="module")
-def curves(shipped):
-    return read_curves(shipped / "curves.h5")
-
-
-@pytest.fixture(scope="module")
-def whole(sweep, curves):
-    return track(sweep, curves)
-
-
-@pytest.fixture(scope="module")
-def tracked(sweep, curves):
+def in_blocks(sweep, curves):
     return track(sweep, curves, CONFIG)
 
 
@@ -82,20 +65,20 @@ def test_blocks_follow_each_other_and_are_nearly_equal(frames, block_frames):
     assert len(blocks) == int(np.ceil(frames / block_frames))
 
 
-def test_blocks_are_as_accurate_as_one_piece(sweep, whole, tracked):
+def test_blocks_are_as_accurate_as_one_piece(sweep, tracked, in_blocks):
     centre = sweep.grid.centre_mm
-    z, expected = (each.image.apply(centre)[:, 2] for each in (tracked, whole))
+    z, expected = (each.image.apply(centre)[:, 2] for each in (in_blocks, tracked))
     # What pairs chosen otherwise at three borders change must be little beside what 12 mm are uncertain by.
-    deviation = np.sqrt(whole.covariance[-1, 2, 2])
+    deviation = np.sqrt(tracked.covariance[-1, 2, 2])
     assert deviation < 0.15
     assert np.abs(z - expected).max() < 0.3 * deviation
     # And a border is no worse than any other step: a tenth of a step of 0.13 mm.
     assert np.abs(np.diff(z - expected)).max() < 0.013
-    assert abs(tracked.pairs - whole.pairs) < 0.05 * whole.pairs
-    assert not tracked.flags.any()
+    assert abs(in_blocks.pairs - tracked.pairs) < 0.05 * tracked.pairs
+    assert not in_blocks.flags.any()
 
 
-def test_blocks_matched_elsewhere_in_any_order_give_the_same_bits(sweep, curves, tracked):
+def test_blocks_matched_elsewhere_in_any_order_give_the_same_bits(sweep, curves, in_blocks):
     given = {}
     for block in reversed(blocks_of(len(sweep), 24)):
         times = StageTimes()
@@ -105,7 +88,7 @@ def test_blocks_matched_elsewhere_in_any_order_give_the_same_bits(sweep, curves,
     del given[Block(24, 48)]
     images = []
     found = track(sweep, curves, CONFIG, images=lambda index, _: images.append(index), matched=given.get)
-    assert bits(found) == bits(tracked)
+    assert bits(found) == bits(in_blocks)
     # What was not given was matched here.
     assert images == list(range(24, 48))
     # One stage is of blocks alone, and all four count.

@@ -94,8 +94,7 @@ BAD = {
 
 
 @pytest.fixture(scope="module")
-def phantom(shipped):
-    sweep = load_sweep(shipped / "phantom.h5")
+def phantom(sweep):
     return [sweep.frames[i] for i in range(0, 96, 12)], sweep.signal, sweep.grid
 
 

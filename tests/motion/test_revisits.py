@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from speckle3d.config import Config
-from speckle3d.io.curves import read_curves
-from speckle3d.io.load import load_sweep
 from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.motion.distances import DistanceEstimator
@@ -42,9 +40,8 @@ class Reordered:
         return (frame + noise).astype(frame.dtype)
 
 
-def there_and_back(shipped, noise=0.0):
+def there_and_back(sweep, noise=0.0):
     """Frames of the shipped sweep on the way there, and others between them on the way back."""
-    sweep = load_sweep(shipped / "phantom.h5")
     order = np.concatenate([np.arange(28, 70, 2), np.arange(69, 27, -2)])
     return replace(
         sweep,
@@ -62,13 +59,8 @@ def positions(sweep):
 
 
 @pytest.fixture(scope="module")
-def curves(shipped):
-    return read_curves(shipped / "curves.h5")
-
-
-@pytest.fixture(scope="module")
-def returning(shipped):
-    return there_and_back(shipped)
+def returning(sweep):
+    return there_and_back(sweep)
 
 
 def ties_of(sweep, curves, position):
@@ -89,10 +81,10 @@ def end_error(sweep, curves, **settings):
     return abs(tracked.image[-1].apply(sweep.grid.centre_mm)[2] - positions(sweep)[-1]), tracked
 
 
-def test_coming_back_is_seen(shipped, curves):
-    sweep = there_and_back(shipped)
-    tied, found = end_error(sweep, curves)
-    loose, alone = end_error(sweep, curves, trajectory={"revisit_mm": 0.0})
+def test_coming_back_is_seen(sweep, curves):
+    back = there_and_back(sweep)
+    tied, found = end_error(back, curves)
+    loose, alone = end_error(back, curves, trajectory={"revisit_mm": 0.0})
     assert found.pairs > alone.pairs
     # Six millimetres there and back, 1 % each way; frames that see the same speckle are right to 0.01 mm.
     assert tied < 0.03
@@ -101,18 +93,18 @@ def test_coming_back_is_seen(shipped, curves):
     assert found.covariance[-1, 2, 2] < alone.covariance[-1, 2, 2]
 
 
-def test_revisits_draw_together_ways_that_drifted_apart(shipped, curves):
+def test_revisits_draw_together_ways_that_drifted_apart(sweep, curves):
     """Noise on the way back alone: read as a phantom's, its distances come out too long."""
-    sweep, plain = there_and_back(shipped, noise=0.2), {"coherence": {"adapt": False}}
-    loose, _ = end_error(sweep, curves, **plain, trajectory={"revisit_mm": 0.0})
-    tied, _ = end_error(sweep, curves, **plain)
+    back, plain = there_and_back(sweep, noise=0.2), {"coherence": {"adapt": False}}
+    loose, _ = end_error(back, curves, **plain, trajectory={"revisit_mm": 0.0})
+    tied, _ = end_error(back, curves, **plain)
     # 0.09 mm against 0.01 with any draw of the noise: half is asked for.
     assert loose > 0.05
     assert tied < 0.5 * loose
 
 
-def test_one_way_no_frame_is_read_again(shipped, curves, monkeypatch):
-    sweep, reads = load_sweep(shipped / "phantom.h5"), []
+def test_one_way_no_frame_is_read_again(sweep, curves, monkeypatch):
+    reads = []
     plain = FrameMatcher.prepare
     monkeypatch.setattr(FrameMatcher, "prepare", lambda m, echo: reads.append(1) or plain(m, echo))
     frames = np.arange(48)
