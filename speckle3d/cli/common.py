@@ -124,15 +124,23 @@ def from_options(model: type[Model], options: Mapping[str, Any]) -> Model:
     InvalidInputError
         Naming the first option whose value is out of range.
     """
+    names = model.model_fields
+    with naming_options():
+        return model(**{name: v for name, v in options.items() if name in names and v is not None})
+
+
+@contextmanager
+def naming_options() -> Iterator[None]:
+    """Name the command-line option of the first setting that pydantic refuses in the block."""
     from pydantic import ValidationError
 
-    names = model.model_fields
     try:
-        return model(**{name: v for name, v in options.items() if name in names and v is not None})
+        yield
     except ValidationError as error:
-        first = error.errors()[0]
-        option = ".".join(str(part) for part in first["loc"]).replace("_", "-")
-        raise InvalidInputError(f"--{option}: {first['msg']}, got {first['input']!r}") from None
+        from speckle3d.config import first_fault
+
+        name, fault = first_fault(error)
+        raise InvalidInputError(f"--{name.replace('_', '-')}: {fault}") from None
 
 
 def require_own_place(out: Path, what: str, is_own: Callable[[Path], bool], *inputs: Path | None) -> None:

@@ -57,7 +57,7 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     >>> len(sweep), sweep.frames[0].shape
     (96, (48, 3818))
     >>> sweep.grid.centre_mm.round(1).tolist()
-    [7.0, 21.9, 0.0]
+    [7.0, 22.0, 0.0]
     """
     # A file of another format is refused by the sweep file's own reader.
     return _READERS.get(kind_of(path), _READERS[sweeps.FORMAT])(path, settings)
