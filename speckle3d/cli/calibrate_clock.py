@@ -1,4 +1,4 @@
-"""The delay between images and a sensor."""
+"""Calibration of a sensor's clock offset."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class By(StrEnum):
-    """What shows the delay."""
+    """Which motion in the images tells the delay."""
 
     line = "line"
     images = "images"
@@ -109,7 +109,7 @@ def _by_line(
     region: str | None,
     search_s: float,
 ) -> tuple[Delay, int]:
-    """The delay, and in how many frames a line was found."""
+    """Find the delay from a plane's line; returns it and the number of frames with a line."""
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from speckle3d.cli.recordings import open_recording, require_unsized
 
@@ -135,7 +135,7 @@ def _by_images(
     known: Calibration | None,
     search_s: float,
 ) -> tuple[Delay, int]:
-    """The delay, and how many frames there were."""
+    """Find the delay from images of a sweep forward and back; returns it and the number of frames."""
     from calibration.clock.images import delay_from_images
     from speckle3d.cli.recordings import open_tracked, require_unsized
 

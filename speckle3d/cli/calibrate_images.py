@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 
 _FAR_MM = 300.0
-"""What fits on a probe."""
+"""Largest distance of an image from a sensor on the same probe."""
 
 MOST_OFFSET_S = 1e6
-"""No clock offset is larger: not even one between seconds since switching on and since some midnight."""
+"""Largest clock offset, s: clocks that start at switching on and at midnight differ by less."""
 
 
 class ImageMethod(StrEnum):
-    """How the answer is looked for."""
+    """Optimisation method."""
 
     gauss_newton = "gauss-newton"
     nelder_mead = "nelder-mead"
@@ -41,7 +41,7 @@ class ImageMethod(StrEnum):
 
 @dataclass(frozen=True)
 class _Inputs:
-    """Both sweeps, the start, and the sweep that tells the clock."""
+    """Both sweeps, the starting mounting, and the sweep from which the clock offset is found."""
 
     sweeps: tuple[TrackedImages, TrackedImages]
     start: RigidTransform
@@ -106,7 +106,7 @@ def calibrate_images(
         sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
         given = replace(given, sweeps=(sweeps[0], sweeps[1]))
         found = _solve(given.sweeps, found.result.sensor_from_image, settings)
-    # The start said how the sweeps turn; only the answer says what they share.
+    # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
     enough = _angulation(given.sweeps, found.result.sensor_from_image)
     _finish((first, second), out, given, found, enough, delay, as_json)
 

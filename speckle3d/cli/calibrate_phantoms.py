@@ -61,14 +61,14 @@ class Stages(StrEnum):
 
 
 class Reflector(StrEnum):
-    """What shows the plane."""
+    """Object whose echo is the plane."""
 
     wall = "wall"
     bar = "bar"
 
 
 class Registration(StrEnum):
-    """What to do with the place of a wire phantom that a configuration says."""
+    """How far the phantom's pose in the configuration is trusted."""
 
     held = "held"
     turned = "turned"
@@ -76,7 +76,7 @@ class Registration(StrEnum):
 
 
 class Viewed(StrEnum):
-    """From which side a plane is seen."""
+    """Side from which the plane is seen."""
 
     above = "above"
     below = "below"
@@ -253,7 +253,7 @@ def _seconds(text: str) -> float:
 
 
 def _region(text: str | None) -> FloatArray | None:
-    """Polygon from "column,row column,row ..."."""
+    """Parse the polygon "column,row column,row ..."; shape (k, 2)."""
     import numpy as np
 
     if text is None:
@@ -270,7 +270,7 @@ def _region(text: str | None) -> FloatArray | None:
 def find_lines(
     recording: Recording, region: str | None, images: Path, settings: LineSettings | None = None
 ) -> Seen:
-    """Find the plane's line in every image, with a bar."""
+    """Find the plane's line in every image, showing progress."""
     from calibration.job import Seen
 
     corners = _region(region)
@@ -320,7 +320,7 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
 
 
 def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
-    """PLUS's 3-D error, where there are N-shapes."""
+    """Report PLUS's 3-D error, if the phantom has N-shapes."""
     from calibration.nwires import nwire_errors_mm, pixel_matrix
     from calibration.wires import Wires
 

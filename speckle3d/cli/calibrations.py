@@ -22,16 +22,16 @@ _BESIDE = (".txt", ".png", ".csv")
 
 
 NOTED_SIZE = 0.01
-"""Relative difference of pixel sizes from which it is told: 0.4 mm over an image of 40 mm."""
+"""Relative difference of pixel sizes that is reported: 0.4 mm over an image of 40 mm."""
 
 NOTED_OFFSET_S = 0.001
 
 NOTED_DEG, NOTED_MM = 5.0, 10.0
-"""Difference of mountings from which it is told: no calibration of the same mounting is so far off."""
+"""Difference of mountings that is reported: calibrations of one mounting differ by less."""
 
 
 def require_free(out: Path, *inputs: Path | None) -> None:
-    """Refuse a calibration's place that is no calibration's, or whose report would take an input's.
+    """Refuse to write a calibration over another kind of file, or its report over an input.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def write_with_report(
 
 
 def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
-    """Put calibration files on a sweep's sensors, and say on stderr where they contradict the sweep."""
+    """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
     from speckle3d.io.calibrations import apply_calibrations, read_calibration
 
     mounted, _ = apply_calibrations(sweep, paths)
@@ -115,7 +115,7 @@ def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
 
 
 def fitted_pixels(paths: Sequence[Path]) -> dict[str, float]:
-    """Pixel size of the first calibration that knows one, as import settings of B-mode; else nothing."""
+    """Return the pixel size of the first calibration that has one, as import settings of B-mode images."""
     from speckle3d.io.calibrations import read_calibration
 
     for path in paths:
@@ -126,7 +126,7 @@ def fitted_pixels(paths: Sequence[Path]) -> dict[str, float]:
 
 
 def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
-    """Put pixel sizes, by their names in the import settings, on a sweep of B-mode images."""
+    """Replace the pixel size of a sweep of B-mode images; names are those of the import settings."""
     from speckle3d.core.sweep import BModeSettings
 
     if not isinstance(sweep.signal, BModeSettings):
@@ -134,7 +134,7 @@ def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
     grid = sweep.grid
     column_mm = sizes.get("column_pitch_mm", grid.vector_pitch_mm)
     row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
-    # A calibration counts rows from the probe's face, also those above the first that is stored.
+    # Rows count from the probe's face, including those above the first stored row.
     first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
     resized = replace(
         grid, vector_pitch_mm=column_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm
@@ -160,7 +160,7 @@ def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> Non
 
 
 def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
-    """Say where a calibration puts the image quite elsewhere than the sweep does."""
+    """Report a mounting that is far from the sweep's own."""
     from speckle3d.core.calibration import mounting_difference
 
     turned_deg, moved_mm = mounting_difference(sweep, calibration)
@@ -173,7 +173,7 @@ def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
 
 
 def _image_grid(sweep: Sweep) -> ImageGrid:
-    """Grid of the images, in which a calibration counts pixels: from RF they are made with fewer samples."""
+    """Return the grid of the images, whose pixels a calibration counts; RF has more samples than they."""
     from speckle3d.matching.intensity import IntensityExtractor
 
     return IntensityExtractor.for_sweep(sweep).grid

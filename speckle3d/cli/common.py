@@ -81,7 +81,7 @@ def bar_on_stderr(what: str, *columns: Any) -> Iterator[Any]:
 
 
 def note(text: str) -> None:
-    """Say something on stderr, beside the results."""
+    """Print a remark on stderr, apart from the results."""
     sys.stderr.write(text + "\n")
 
 
@@ -117,7 +117,7 @@ def load_settings(path: Path | None) -> Config:
 
 
 def from_options(model: type[Model], options: Mapping[str, Any]) -> Model:
-    """Make settings of the options that are theirs and were given.
+    """Make settings from the options that were given; names that are no settings are ignored.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def naming_options() -> Iterator[None]:
 
 
 def require_own_place(out: Path, what: str, is_own: Callable[[Path], bool], *inputs: Path | None) -> None:
-    """Refuse an output that is an input, by whatever name, or a file that the command would not have written.
+    """Refuse to write over an input, or over another kind of file than the command writes.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs
 
 
 class Method(StrEnum):
-    """Where an orientation comes from."""
+    """Source of an orientation."""
 
     smoother = "smoother"
     filter = "filter"
@@ -184,13 +184,13 @@ def imu_record(
 
 
 def require_finite_offset(time_offset_s: float) -> None:
-    """Refuse what no clock can be off by."""
+    """Refuse a clock offset that is NaN or infinite."""
     if not math.isfinite(time_offset_s):
         raise InvalidInputError(f"--time-offset-s: expected a finite number, got {time_offset_s}")
 
 
 def _require_another(out: Path | None, log_file: Path) -> None:
-    """A log is never written over by what is made of it."""
+    """Refuse to write over the log that is read."""
     if out is not None and out.exists() and log_file.exists() and os.path.samefile(out, log_file):
         raise InvalidInputError(f"{out}: expected another file than the log that is read, got the same")
 
@@ -203,7 +203,7 @@ def read(path: Path, rate_hz: float | None) -> ImuLog:
 
 
 def tell(log: ImuLog) -> None:
-    """Say on stderr what is missing in a log, or had to be assumed."""
+    """Report on stderr what a log lacks, and what was assumed in its place."""
     for text in log.notes:
         note(text)
     if log.gaps:
@@ -215,7 +215,7 @@ def tell(log: ImuLog) -> None:
 def orientation_of(
     log: ImuLog, method: Method, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
-    """Orientation of a log by one of the methods, with the filter's own account unless it is the sensor's."""
+    """Find the orientation of a log; the second result is None for the sensor's own orientation."""
     if method is Method.sensor:
         return log.rotations(), None
     from xsens.fusion.orient import orient
@@ -228,7 +228,7 @@ def orientation_of(
 
 
 def _with(log: ImuLog, rotations: TimedRotations) -> ImuLog:
-    """The log with another orientation in place of the sensor's own."""
+    """Replace the sensor's own orientation in a log."""
     import numpy as np
     from scipy.spatial.transform import Rotation
 
@@ -273,7 +273,7 @@ def _attach(
 
 
 def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
-    """When the frames of the sweep were taken; None if its own stream, to be replaced, cannot be read."""
+    """Read the frame times of a sweep; None if the stream to be replaced cannot be read."""
     from speckle3d.io.load import load_sweep
 
     try:
@@ -290,7 +290,7 @@ def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
 
 
 def _require_cover(sweep_file: Path, sensor: OrientationSensor, frame_time_s: FloatArray | None) -> str:
-    """How many frames the stream covers, in words; refused if none."""
+    """Tell how many frames the stream covers, and refuse a stream that covers none."""
     if frame_time_s is None:
         return ""
     covered = f"covers {int(sensor.covers(frame_time_s).sum())} of {frame_time_s.size} frames"
@@ -326,7 +326,7 @@ def _orientation_rows(
 
 
 def _beside_own(log: ImuLog, rotations: TimedRotations) -> list[tuple[str, float, str]]:
-    """How far the orientation found is from the sensor's own."""
+    """Compare the orientation found with the sensor's own."""
     import numpy as np
 
     from xsens.accuracy.comparison import compare_orientations

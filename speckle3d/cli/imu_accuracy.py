@@ -1,4 +1,4 @@
-"""How well an orientation sensor measures angles, beside a mechanism or an optical tracker."""
+"""Angle errors of an orientation sensor against a mechanism or an optical tracker."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _beside_tracker(
 
 
 def _tracked(path: Path) -> TimedRotations:
-    """Orientation in a TUM file, or a log's own."""
+    """Read the orientation in a TUM file, or the one that a log carries."""
     from speckle3d.core.streams import TimedRotations
     from speckle3d.io.tum import is_tum, read_tum
 

@@ -1,4 +1,4 @@
-"""Recordings of a calibration phantom from files: images and readings, each from wherever they are."""
+"""Recordings of a calibration phantom: images, and sensor readings from the same or another file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from speckle3d.io.metaimage import ImportSettings, read_poses
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
-"""Of the images made from RF, and said of imported ones: only their grey levels matter here."""
+"""Dynamic range of images made from RF, and assumed of imported images, whose grey levels alone are used."""
 
 
 def open_recording(
@@ -51,7 +51,7 @@ def open_recording(
 def open_tracked(
     images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, time_offset_s: float | None = None
 ) -> tuple[TrackedImages, RigidTransform | None]:
-    """Open tracked images, and how the file says the image sits on the sensor, if it does.
+    """Open tracked images, with the mounting that their file holds, if any.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:
 
 
 def _advice(lacking: str) -> str:
-    """What to do about a setting that a header lacks, in terms of options that there are."""
+    """Advise which option or command supplies a setting that a header lacks."""
     if lacking in ("column_pitch_mm", "row_spacing_mm"):
         return "the header does not say how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
     option = lacking.replace("_", "-")
@@ -102,7 +102,7 @@ def _advice(lacking: str) -> str:
 
 
 def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
-    """Refuse a pixel size for images that have their own, where it would go unused.
+    """Refuse a pixel size for a sweep file, which has its own.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
 
 
 def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
-    """Grey levels as they are, or log-compressed from RF."""
+    """Return B-mode images as they are, or log-compressed images made from RF."""
     if isinstance(sweep.signal, BModeSettings):
         return sweep.frames, sweep.grid
     pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False)

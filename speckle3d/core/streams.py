@@ -20,7 +20,7 @@ in which a hand's motion is still smooth (physiological tremor is at 4-12 Hz).""
 
 @dataclass(frozen=True)
 class _Clock:
-    """Which sample interval each asked time falls in, and which times no interval may serve."""
+    """Sample times, and which other times may be interpolated between them."""
 
     time_s: FloatArray
     max_gap_s: float
@@ -48,14 +48,14 @@ class _Clock:
 
 
 class _Timed:
-    """What samples on a clock have in common, whatever they are."""
+    """Samples on a clock: validation and coverage, shared by rotations and poses."""
 
     time_s: FloatArray
     max_gap_s: float
     _clock: _Clock
 
     def _settle(self, samples: int) -> None:
-        """Validate once, when made."""
+        """Validate the times and the number of samples."""
         object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
         if self.time_s.size != samples:
             raise InvalidInputError(

@@ -24,7 +24,13 @@ KEY_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise
 
 
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
-    """Write curves, whole or not at all."""
+    """Write decorrelation curves; the file appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
     with atomic_hdf5(path, FORMAT) as file:
         for name in ("depth_mm", "distance_mm", "correlation", "cells"):
             file[name] = getattr(curves, name)
@@ -41,12 +47,22 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
 
 
 def read_curves(path: PathLike) -> DecorrelationCurves:
-    """Read curves, checked.
+    """Read decorrelation curves, and check them.
 
     Raises
     ------
-    FileError, InvalidInputError
+    FileError
+        If the file is missing, truncated or not HDF5.
+    InvalidInputError
         Naming the file and what in it is wrong.
+
+    Examples
+    --------
+    >>> curves = read_curves("data/curves.h5")
+    >>> curves.correlation.shape == (curves.depth_mm.size, curves.distance_mm.size)
+    True
+    >>> curves.key.correlation_of
+    'echo'
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         depth = read_checked(file, "depth_mm", ("r",))

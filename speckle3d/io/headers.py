@@ -193,7 +193,7 @@ def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
 
 
 def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) -> None:
-    """Refuse a truncated file before the image library does so in its own words."""
+    """Refuse a truncated file with a message that names it; the image library's does not."""
     if header.fields["ElementDataFile"].upper() != "LOCAL":
         name = header.fields["ElementDataFile"]
         data = Path(path).parent / name

@@ -37,7 +37,7 @@ _DEFAULT_TRANSFORMS = ("ProbeToTracker", "ReferenceToTracker")
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """What an image file's header lacks. A value given here goes before the header's own.
+    """Values for what an image file's header lacks; they replace the header's own.
 
     Attributes
     ----------
@@ -233,7 +233,7 @@ def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> R
 
 
 def _squared(matrices: FloatArray) -> FloatArray:
-    """Nearest rotation of every matrix that is one up to rounding; the others stay for the error to name."""
+    """Make rounded rotations exact; matrices farther off stay, for `transforms_from_matrices` to refuse."""
     r = matrices[:, :3, :3]
     rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
     rounded[rounded] = np.linalg.det(r[rounded]) > 0
@@ -286,7 +286,7 @@ def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
     import SimpleITK
 
     try:
-        # Named, because the library otherwise believes the file's suffix.
+        # The reader is named, because the library otherwise chooses it by the suffix.
         image = SimpleITK.ReadImage(header.path, imageIO=f"{header.file_format}IO")
     except RuntimeError as error:
         raise FileError(f"{header.path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error

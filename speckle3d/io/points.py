@@ -166,7 +166,7 @@ def _wire(word: str, names: Sequence[str], where: str) -> int:
 
 
 def _require_new(row: Row, seen: dict[tuple[int, int], int], number: int, where: str) -> None:
-    """A wire shows once in a frame."""
+    """Refuse a second point of the same wire in a frame."""
     frame, _, wire = row
     if (frame, wire) in seen:
         raise InvalidInputError(

@@ -1,4 +1,4 @@
-"""The sweep file, version 1: reading, frames left on disk."""
+"""Reading of the sweep file, version 1; frames stay on disk."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
     time_s = _read_clock(group)
     valid = _read_valid(group, time_s.size)
     matrices = read_checked(group, "world_from_sensor", (time_s.size, 4, 4))
-    # An invalid sample may hold anything; the identity keeps the indices of the others for messages.
+    # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
     matrix = read_vector_attribute(group, "sensor_from_image", 16)
