@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
 from speckle3d.io.load import load_sweep, sniff
-from speckle3d.io.metaimage import ImportSettings, read_poses
+from speckle3d.io.metaimage import ImportSettings, MissingSettingError, read_poses
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
@@ -83,11 +82,8 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:
         given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, column_pitch_mm=column, row_spacing_mm=row)
     try:
         return load_sweep(path, given)
-    except InvalidInputError as error:
-        lacking = re.search(r"give (\w+)(?: \(low, high\))?$", str(error))
-        if lacking is None:
-            raise
-        raise InvalidInputError(f"{path}: {_advice(lacking[1])}") from None
+    except MissingSettingError as error:
+        raise InvalidInputError(f"{path}: {_advice(error.setting)}") from None
 
 
 def _advice(lacking: str) -> str:

@@ -35,6 +35,20 @@ _RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
 _DEFAULT_TRANSFORMS = ("ProbeToTracker", "ReferenceToTracker")
 
 
+class MissingSettingError(InvalidInputError):
+    """A header lacks a value, and no setting gives it.
+
+    Attributes
+    ----------
+    setting : str
+        Name in `ImportSettings`.
+    """
+
+    def __init__(self, message: str, setting: str = "") -> None:
+        super().__init__(message)
+        self.setting = setting
+
+
 @dataclass(frozen=True)
 class ImportSettings:
     """Values for what an image file's header lacks; they replace the header's own.
@@ -141,14 +155,15 @@ def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: flo
     rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
     centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
     if settings.bandwidth_hz is None:
-        raise InvalidInputError(f"{header.path}: the header lacks the band: give bandwidth_hz (low, high)")
+        message = f"{header.path}: the header lacks the band: give bandwidth_hz (low, high)"
+        raise MissingSettingError(message, "bandwidth_hz")
     return RFSettings(rate, speed, centre, settings.bandwidth_hz)
 
 
 def _need(header: SequenceHeader, name: str, given: float | None, read: float | None) -> float:
     value = read if given is None else given
     if value is None:
-        raise InvalidInputError(f"{header.path}: the header does not say: give {name}")
+        raise MissingSettingError(f"{header.path}: the header does not say: give {name}", name)
     return float(value)
 
 
@@ -183,7 +198,8 @@ def _frame_times(header: SequenceHeader, settings: ImportSettings) -> FloatArray
             raise InvalidInputError(f"frame_rate_hz: expected above zero, got {settings.frame_rate_hz}")
         return np.arange(header.frame_count) / settings.frame_rate_hz
     if not header.frames:
-        raise InvalidInputError(f"{header.path}: the header holds no time stamps: give frame_rate_hz")
+        message = f"{header.path}: the header holds no time stamps: give frame_rate_hz"
+        raise MissingSettingError(message, "frame_rate_hz")
     return require_increasing(_timestamps(header), f"{header.path}: Timestamp")
 
 
