@@ -63,22 +63,12 @@ def calibrate_clock(
     The offset is added to the sensor's times; PLUS's LocalTimeOffsetSec, of the image device, is the same
     with the other sign.
     """
-    from speckle3d.io.calibrations import read_calibration, write_calibration
+    from speckle3d.io.calibrations import write_calibration
     from speckle3d.study.summary import plain
 
-    if out is not None and calibration is None:
-        raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
-    if by is By.line and calibration is not None and out is None:
-        raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     if out is not None:
         require_free(out, images, poses, calibration)
-    known = None if calibration is None else read_calibration(calibration)
-    if known is not None and known.sensor != sensor:
-        raise MismatchError(
-            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
-        )
-    if by is By.images and sensor != "tracker":
-        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
+    known = _known(by, sensor, calibration, out)
     if by is By.images:
         found, frames = _by_images(images, poses, pixel_mm, known, search_s)
         told = f"images of the two ways correlate by {found.followed:.2f}"
@@ -99,6 +89,24 @@ def calibrate_clock(
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)
+
+
+def _known(by: By, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
+    """Read the calibration, if one is given, after checking that the options fit each other and it."""
+    from speckle3d.io.calibrations import read_calibration
+
+    if out is not None and calibration is None:
+        raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
+    if by is By.line and calibration is not None and out is None:
+        raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
+    known = None if calibration is None else read_calibration(calibration)
+    if known is not None and known.sensor != sensor:
+        raise MismatchError(
+            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
+        )
+    if by is By.images and sensor != "tracker":
+        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
+    return known
 
 
 def _by_line(
