@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.correction.curves import Curves
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
@@ -26,7 +24,14 @@ from speckle3d.motion.planes import PlaneSettings
 
 
 class Config(BaseModel):
-    """Every setting of a reconstruction."""
+    """Every setting of a reconstruction, a group for each stage.
+
+    Examples
+    --------
+    >>> settings = Config(matching={"correlate": "intensity"})
+    >>> settings.matching.correlate, settings == config_from_toml(settings.to_toml())
+    ('intensity', True)
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,15 +49,15 @@ class Config(BaseModel):
 
     def with_choices(self, consistent_subset: bool | None, drift_curves: str | None) -> Config:
         """Return a configuration with command-line choices in place of its own; None leaves one as it is."""
-        sensors, drift = self.sensors, self.drift
+        values = self.model_dump()
         if consistent_subset is not None:
-            sensors = sensors.model_copy(update={"consistent_subset": consistent_subset})
+            values["sensors"]["consistent_subset"] = consistent_subset
         if drift_curves is not None:
-            drift = replace(drift, curves=cast("Curves", drift_curves))
-        return self.model_copy(update={"sensors": sensors, "drift": drift})
+            values["drift"]["curves"] = drift_curves
+        return _validated(values, "configuration")
 
     def to_toml(self) -> str:
-        """Render as TOML text."""
+        """Write every setting as TOML text, which `config_from_toml` reads back."""
         return tomlkit.dumps(self.model_dump(mode="json"))
 
 
@@ -65,17 +70,36 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
         Naming the setting that is unknown or out of range.
     """
     try:
-        return Config.model_validate(tomllib.loads(text))
+        values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
+    return _validated(values, where)
+
+
+def first_fault(error: ValidationError) -> tuple[str, str]:
+    """Return the name of the first setting that is wrong, and what is wrong with it."""
+    first = error.errors()[0]
+    return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {first['input']!r}"
+
+
+def _validated(values: dict[str, Any], where: str) -> Config:
+    try:
+        return Config.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise InvalidInputError(f"{where}: {name}: {first['msg']}, got {first['input']!r}") from error
+        name, fault = first_fault(error)
+        raise InvalidInputError(f"{where}: {name}: {fault}") from error
 
 
 def load_config(path: Path) -> Config:
-    """Read a configuration file."""
+    """Read a configuration from a TOML file; settings that it does not give keep their defaults.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the setting that is unknown or out of range.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:

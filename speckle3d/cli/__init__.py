@@ -11,35 +11,32 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from speckle3d.cli import (
-    clock,
+    calibrate_clock,
+    calibrate_curves,
+    calibrate_images,
+    calibrate_phantoms,
     compare,
-    crossing,
-    curves,
     files,
     imu,
     imu_accuracy,
-    phantoms,
     reconstruction,
-    repeatability,
     trajectory,
 )
-from speckle3d.cli.common import app, calibrate
+from speckle3d.cli.common import app
 from speckle3d.core.errors import Speckle3DError
 
 __all__ = [
     "app",
-    "calibrate",
-    "clock",
+    "calibrate_clock",
+    "calibrate_curves",
+    "calibrate_images",
+    "calibrate_phantoms",
     "compare",
-    "crossing",
-    "curves",
     "files",
     "imu",
     "imu_accuracy",
     "main",
-    "phantoms",
     "reconstruction",
-    "repeatability",
     "trajectory",
 ]
 

@@ -1,16 +1,24 @@
-"""What the commands share: the application, its options, progress and output."""
+"""What the commands share: the application, options, settings, progress, and output."""
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from speckle3d.core.errors import FileError
+from speckle3d.core.errors import FileError, InvalidInputError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from speckle3d.config import Config
+
+    Model = TypeVar("Model", bound=BaseModel)
 
 app = typer.Typer(
     name="speckle3d",
@@ -26,24 +34,54 @@ Json = Annotated[bool, typer.Option("--json", help="Print machine-readable resul
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML with settings to change; see `speckle3d config`.")
 ]
+CalibrationFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--calibration", help="Calibration to use for its sensor in place of the file's; may be repeated."
+    ),
+]
+Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
+CalibrationOut = Annotated[
+    Path, typer.Option("-o", "--output", help="Calibration file to write; .txt and .png beside it.")
+]
+Poses = Annotated[
+    Path | None, typer.Option("--poses", help="File with the sensor's readings, if not in IMAGES.")
+]
+PixelMm = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Distance between columns and rows, mm, if IMAGES does not say."),
+]
+Region = Annotated[
+    str | None, typer.Option(help='Polygon "column,row column,row ..." outside which nothing counts.')
+]
 
 
 @contextmanager
-def progress_bar(what: str) -> Iterator[Any]:
-    """A bar on stderr; yields a function of frames done and frames in all."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on stderr; yields a function of frames done and frames in all."""
+    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    # In a log a bar is noise, and an error must stay one line.
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with bar_on_stderr(what, MofNCompleteColumn(), TimeRemainingColumn()) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+@contextmanager
+def bar_on_stderr(what: str, *columns: Any) -> Iterator[Any]:
+    """Show rich's progress under a description on stderr, with more columns behind the bar."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    # In a log a bar is noise, and an error must stay one line.
+    hidden = not console.is_terminal
+    shown = (TextColumn(what), BarColumn(), *columns)
+    with Progress(*shown, console=console, transient=True, disable=hidden) as bar:
+        yield bar
+
+
 def note(text: str) -> None:
-    """Say something on stderr, beside the results."""
+    """Print a remark on stderr, apart from the results."""
     sys.stderr.write(text + "\n")
 
 
@@ -54,3 +92,80 @@ def emit(text: str) -> None:
         sys.stdout.flush()
     except OSError as error:
         raise FileError(f"standard output: cannot be written: {error.strerror}") from error
+
+
+def emit_json(values: Any) -> None:
+    """Print results as JSON on stdout."""
+    emit(json.dumps(values, indent=2))
+
+
+def emit_rows(rows: Sequence[tuple[str, Any, str]], as_json: bool) -> None:
+    """Print rows of description, value and unit on stdout, aligned or as JSON."""
+    from speckle3d.core.tables import text_rows
+
+    if as_json:
+        emit_json([{"description": d, "value": v, "unit": u} for d, v, u in rows])
+    else:
+        emit(text_rows(rows))
+
+
+def load_settings(path: Path | None) -> Config:
+    """Read the configuration in a file, or take the default one."""
+    from speckle3d.config import Config, load_config
+
+    return load_config(path) if path else Config()
+
+
+def from_options(model: type[Model], options: Mapping[str, Any]) -> Model:
+    """Make settings from the options that were given; names that are no settings are ignored.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first option whose value is out of range.
+    """
+    names = model.model_fields
+    with naming_options():
+        return model(**{name: v for name, v in options.items() if name in names and v is not None})
+
+
+@contextmanager
+def naming_options() -> Iterator[None]:
+    """Name the command-line option of the first setting that pydantic refuses in the block."""
+    from pydantic import ValidationError
+
+    try:
+        yield
+    except ValidationError as error:
+        from speckle3d.config import first_fault
+
+        name, fault = first_fault(error)
+        raise InvalidInputError(f"--{name.replace('_', '-')}: {fault}") from None
+
+
+def require_own_place(out: Path, what: str, is_own: Callable[[Path], bool], *inputs: Path | None) -> None:
+    """Refuse to write over an input, or over another kind of file than the command writes.
+
+    Parameters
+    ----------
+    what : str
+        What the command writes, in words.
+    is_own : callable
+        Whether an existing file is of that kind; one without content is always free.
+
+    Raises
+    ------
+    FileError
+        If the place cannot be written.
+    InvalidInputError
+        If it is taken.
+    """
+    from speckle3d.io.hdf5 import require_target
+
+    target = require_target(out)
+    if not target.exists():
+        return
+    if any(path is not None and path.exists() and path.samefile(target) for path in inputs):
+        raise InvalidInputError(f"{out}: is an input and would be overwritten: give -o another name")
+    if target.stat().st_size and not is_own(target):
+        raise InvalidInputError(f"{out}: expected a new name or {what} to replace, got another kind of file")

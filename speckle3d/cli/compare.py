@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import ConfigFile, Json, app, emit, note
-from speckle3d.cli.mounting import CalibrationFiles
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    ConfigFile,
+    Json,
+    app,
+    bar_on_stderr,
+    emit,
+    load_settings,
+    note,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -51,14 +59,13 @@ def compare(
 
     A sweep that fails is a row that says why; the exit code is 2 only if all do.
     """
-    from speckle3d.config import Config, load_config
     from speckle3d.report.page import write_report
     from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study
     from speckle3d.study.results import copy_lines
     from speckle3d.study.schedulers import scheduler_for
 
-    settings = load_config(config_file) if config_file else Config()
+    settings = load_settings(config_file)
     if paper:
         _require_alone(
             sweeps=sweeps, drift=drift, reference=reference, calibration=calibration, config=config_file
@@ -104,12 +111,9 @@ def _count_simulated(done: int, total: int) -> None:
 @contextmanager
 def _shown() -> Iterator[Callable[[StudyProgress], None]]:
     """Sweeps done and the time that is left, on stderr; nothing in a log."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.progress import TextColumn
 
-    columns = (TextColumn("comparing"), BarColumn(), TextColumn("{task.description}"))
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with bar_on_stderr("comparing", TextColumn("{task.description}")) as bar:
         task = bar.add_task("", total=None)
 
         def show(at: StudyProgress) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, progress_bar
-from speckle3d.cli.mounting import CalibrationFiles, fitted_pixels, mount, resize
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.cli.calibrations import fitted_pixels, mount, resize
+from speckle3d.cli.common import CalibrationFiles, Json, app, emit, emit_rows, from_options, progress_bar
 
 
 @app.command()
@@ -18,15 +16,9 @@ def info(
     path: Annotated[Path, typer.Argument(help="A file the package reads.")], as_json: Json = False
 ) -> None:
     """Tell what a file holds, after checking it."""
-    from speckle3d.io.load import describe
+    from speckle3d.io.describe import describe
 
-    rows = describe(path)
-    if as_json:
-        emit(json.dumps([{"description": d, "value": v, "unit": u} for d, v, u in rows], indent=2))
-        return
-    width = max(len(d) for d, _, _ in rows)
-    for description, value, unit in rows:
-        emit(f"{description.ljust(width)}  {value} {unit}".rstrip())
+    emit_rows(describe(path), as_json)
 
 
 @app.command()
@@ -77,21 +69,11 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
-    from pydantic import ValidationError
-
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings
     from speckle3d.simulation.presets import simulate as prepare
 
-    given = {k: v for k, v in locals().items() if k in SimulationSettings.model_fields and v is not None}
-    try:
-        settings = SimulationSettings(**given)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise InvalidInputError(
-            f"--{name.replace('_', '-')}: {first['msg']}, got {first['input']!r}"
-        ) from None
+    settings = from_options(SimulationSettings, locals())
     for number, simulated in enumerate(prepare(settings)):
         path = out if number == 0 else out.with_name(f"{out.stem}-crossing{out.suffix}")
         with progress_bar(f"simulating {path.name}") as progress:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, note
+from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs
 
 
 class Method(StrEnum):
-    """Where an orientation comes from."""
+    """Source of an orientation."""
 
     smoother = "smoother"
     filter = "filter"
@@ -86,12 +85,7 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> No
                 (f"{spoken}, median norm", f"{np.nanmedian(np.linalg.norm(values, axis=1)):.4f}", unit)
             )
     rows += [("note", text, "") for text in log.notes]
-    if as_json:
-        emit(json.dumps([{"description": d, "value": v, "unit": u} for d, v, u in rows], indent=2))
-        return
-    width = max(len(d) for d, _, _ in rows)
-    for description, value, unit in rows:
-        emit(f"{description.ljust(width)}  {value} {unit}".rstrip())
+    emit_rows(rows, as_json)
 
 
 @imu.command("convert")
@@ -147,10 +141,9 @@ def imu_orient(
     tell(log)
     rows = _orientation_rows(log, rotations, found)
     if as_json:
-        emit(json.dumps({name: value for name, value, _ in rows}, indent=2))
-        return
-    for name, value, unit in rows:
-        emit(f"{name}: {value:.5g} {unit}".rstrip())
+        emit_json({name: value for name, value, _ in rows})
+    else:
+        emit_rows([(name, f"{value:.5g}", unit) for name, value, unit in rows], as_json)
 
 
 @imu.command("record")
@@ -191,13 +184,13 @@ def imu_record(
 
 
 def require_finite_offset(time_offset_s: float) -> None:
-    """Refuse what no clock can be off by."""
+    """Refuse a clock offset that is NaN or infinite."""
     if not math.isfinite(time_offset_s):
         raise InvalidInputError(f"--time-offset-s: expected a finite number, got {time_offset_s}")
 
 
 def _require_another(out: Path | None, log_file: Path) -> None:
-    """A log is never written over by what is made of it."""
+    """Refuse to write over the log that is read."""
     if out is not None and out.exists() and log_file.exists() and os.path.samefile(out, log_file):
         raise InvalidInputError(f"{out}: expected another file than the log that is read, got the same")
 
@@ -211,7 +204,7 @@ def read(path: Path, rate_hz: float | None) -> ImuLog:
 
 
 def tell(log: ImuLog) -> None:
-    """Say on stderr what is missing in a log, or had to be assumed."""
+    """Report on stderr what a log lacks, and what was assumed in its place."""
     for text in log.notes:
         note(text)
     if log.gaps:
@@ -223,7 +216,7 @@ def tell(log: ImuLog) -> None:
 def orientation_of(
     log: ImuLog, method: Method, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
-    """Orientation of a log by one of the methods, with the filter's own account unless it is the sensor's."""
+    """Find the orientation of a log; the second result is None for the sensor's own orientation."""
     if method is Method.sensor:
         return log.rotations(), None
     from xsens.fusion.orient import orient
@@ -236,7 +229,7 @@ def orientation_of(
 
 
 def _with(log: ImuLog, rotations: TimedRotations) -> ImuLog:
-    """The log with another orientation in place of the sensor's own."""
+    """Replace the sensor's own orientation in a log."""
     import numpy as np
     from scipy.spatial.transform import Rotation
 
@@ -281,7 +274,7 @@ def _attach(
 
 
 def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
-    """When the frames of the sweep were taken; None if its own stream, to be replaced, cannot be read."""
+    """Read the frame times of a sweep; None if the stream to be replaced cannot be read."""
     from speckle3d.io.load import load_sweep
 
     try:
@@ -298,7 +291,7 @@ def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
 
 
 def _require_cover(sweep_file: Path, sensor: OrientationSensor, frame_time_s: FloatArray | None) -> str:
-    """How many frames the stream covers, in words; refused if none."""
+    """Tell how many frames the stream covers, and refuse a stream that covers none."""
     if frame_time_s is None:
         return ""
     covered = f"covers {int(sensor.covers(frame_time_s).sum())} of {frame_time_s.size} frames"
@@ -334,7 +327,7 @@ def _orientation_rows(
 
 
 def _beside_own(log: ImuLog, rotations: TimedRotations) -> list[tuple[str, float, str]]:
-    """How far the orientation found is from the sensor's own."""
+    """Compare the orientation found with the sensor's own."""
     import numpy as np
 
     from xsens.accuracy.comparison import compare_orientations

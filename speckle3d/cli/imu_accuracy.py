@@ -1,14 +1,13 @@
-"""How well an orientation sensor measures angles, beside a mechanism or an optical tracker."""
+"""Angle errors of an orientation sensor against a mechanism or an optical tracker."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, emit, note
+from speckle3d.cli.common import Json, emit, emit_rows, note
 from speckle3d.cli.imu import (
     Log,
     Magnetometer,
@@ -91,8 +90,7 @@ def imu_accuracy(
 
         save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
     if as_json:
-        rows = [{"description": d, "value": v, "unit": u} for d, v, u in table.values()]
-        emit(json.dumps(rows, indent=2))
+        emit_rows(table.values(), as_json)
         return
     emit(table.text())
     emit(
@@ -134,7 +132,7 @@ def _beside_tracker(
 
 
 def _tracked(path: Path) -> TimedRotations:
-    """Orientation in a TUM file, or a log's own."""
+    """Read the orientation in a TUM file, or the one that a log carries."""
     from speckle3d.core.streams import TimedRotations
     from speckle3d.io.tum import is_tum, read_tum
 

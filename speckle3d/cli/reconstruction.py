@@ -7,8 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import ConfigFile, Json, app, emit, note, progress_bar
-from speckle3d.cli.mounting import CalibrationFiles, mount
+from speckle3d.cli.calibrations import mount
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    ConfigFile,
+    Json,
+    app,
+    emit,
+    load_settings,
+    note,
+    progress_bar,
+)
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -35,13 +44,13 @@ def reconstruct(
     as_json: Json = False,
 ) -> None:
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
-    from speckle3d.config import Config, load_config
     from speckle3d.io.curves import read_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.study.job import run_job
 
-    settings = load_config(config_file) if config_file else Config()
-    settings = settings.with_choices(consistent_subset=consistent_subset, drift_curves=drift_curves)
+    settings = load_settings(config_file).with_choices(
+        consistent_subset=consistent_subset, drift_curves=drift_curves
+    )
     modes = list(dict.fromkeys(drift or ()))
     sweep = load_sweep(sweep_file)
     curves = read_curves(_find_curves(curves_file, sweep_file))

@@ -1,8 +1,7 @@
-"""Recordings of a calibration phantom from files: images and readings, each from wherever they are."""
+"""Recordings of a calibration phantom: images, and sensor readings from the same or another file."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,11 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
 from speckle3d.io.load import load_sweep, sniff
-from speckle3d.io.metaimage import ImportSettings, read_poses
+from speckle3d.io.metaimage import ImportSettings, MissingSettingError, read_poses
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
-"""Of the images made from RF, and said of imported ones: only their grey levels matter here."""
+"""Dynamic range of images made from RF, and assumed of imported images, whose grey levels alone are used."""
 
 
 def open_recording(
@@ -51,7 +50,7 @@ def open_recording(
 def open_tracked(
     images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, time_offset_s: float | None = None
 ) -> tuple[TrackedImages, RigidTransform | None]:
-    """Open tracked images, and how the file says the image sits on the sensor, if it does.
+    """Open tracked images, with the mounting that their file holds, if any.
 
     Parameters
     ----------
@@ -83,15 +82,12 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:
         given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, column_pitch_mm=column, row_spacing_mm=row)
     try:
         return load_sweep(path, given)
-    except InvalidInputError as error:
-        lacking = re.search(r"give (\w+)(?: \(low, high\))?$", str(error))
-        if lacking is None:
-            raise
-        raise InvalidInputError(f"{path}: {_advice(lacking[1])}") from None
+    except MissingSettingError as error:
+        raise InvalidInputError(f"{path}: {_advice(error.setting)}") from None
 
 
 def _advice(lacking: str) -> str:
-    """What to do about a setting that a header lacks, in terms of options that there are."""
+    """Advise which option or command supplies a setting that a header lacks."""
     if lacking in ("column_pitch_mm", "row_spacing_mm"):
         return "the header does not say how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
     option = lacking.replace("_", "-")
@@ -102,7 +98,7 @@ def _advice(lacking: str) -> str:
 
 
 def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
-    """Refuse a pixel size for images that have their own, where it would go unused.
+    """Refuse a pixel size for a sweep file, which has its own.
 
     Raises
     ------
@@ -113,7 +109,7 @@ def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
 
 
 def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
-    """Grey levels as they are, or log-compressed from RF."""
+    """Return B-mode images as they are, or log-compressed images made from RF."""
     if isinstance(sweep.signal, BModeSettings):
         return sweep.frames, sweep.grid
     pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False)

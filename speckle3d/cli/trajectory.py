@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, note
-from speckle3d.cli.outputs import require_own_place
+from speckle3d.cli.common import Json, app, emit, note, require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ SENSORS = ("tracker", "orientation")
 
 
 def readable(value: float, unit: str) -> tuple[str, str]:
-    """A number and its unit for people: angles in degrees, pixel sizes to a hundredth of a micrometre."""
+    """Format a number and its unit for people: angles in degrees, pixel sizes to 10 nm."""
     if unit == "rad":
         return f"{np.rad2deg(value):.3f}", "deg"
     return f"{value:.{5 if unit == 'mm/pixel' else 3}f}", unit
@@ -39,7 +39,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class FramesUsed:
-    """Which frames a calibration stands on, and why the others do not count.
+    """Frames that a calibration uses, and why the others were dropped.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class FramesUsed:
     dropped: dict[int, str] = field(default_factory=dict)
 
     def reasons(self) -> dict[str, int]:
-        """How many frames were dropped for each reason, most frequent first.
+        """Count the frames dropped for each reason, most frequent first.
 
         A reason counts without its details, after a colon or "by", which differ from frame to frame.
         """
@@ -166,6 +166,18 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
         If the sweep has no such sensor.
     InsufficientDataError
         If it is for a tracker and knows no translation.
+
+    Examples
+    --------
+    >>> import speckle3d
+    >>> sweep = speckle3d.load_sweep("data/phantom.h5")
+    >>> held = sweep.orientation
+    >>> calibration = Calibration(
+    ...     "orientation", "orientation", held.sensor_from_image, None, None, 1e-6 * np.eye(3),
+    ...     (), 0.01, "rad", 12.0, FramesUsed(2, (0, 1)), time_offset_s=0.02,
+    ... )
+    >>> speckle3d.calibrated(sweep, calibration).orientation.time_offset_s
+    0.02
     """
     if calibration.sensor == "tracker":
         return replace(sweep, tracker=_tracker(sweep, calibration))
@@ -173,7 +185,7 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
 
 
 def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
-    """How far a calibration's pixels are from a grid's: the larger relative difference; zero if unknown."""
+    """Return the larger relative difference of a calibration's pixel sizes from a grid's; zero if unknown."""
     if calibration.pixel_mm is None:
         return 0.0
     size_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
@@ -181,7 +193,7 @@ def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
 
 
 def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:
-    """How far a calibration's mounting is from the sweep's own: degrees, and mm; zero if one is unknown."""
+    """Return how far a calibration's mounting is from the sweep's own, in degrees and mm; zero if unknown."""
     if calibration.sensor == "orientation":
         turn = None if sweep.orientation is None else sweep.orientation.sensor_from_image
         return (0.0 if turn is None else _apart_deg(turn, calibration.rotation)), 0.0

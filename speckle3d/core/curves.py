@@ -1,4 +1,4 @@
-"""Decorrelation curves and what they belong to."""
+"""Decorrelation curves, and the signal and patches they were measured with."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from speckle3d.core.sweep import BModeSettings, RFSettings
 
 @dataclass(frozen=True)
 class CurveKey:
-    """What curves belong to; reading a sweep with curves of another key is an error."""
+    """Signal and patches that curves were measured with; a sweep with another key needs other curves."""
 
     signal: RFSettings | BModeSettings
     vector_pitch_mm: float
@@ -37,7 +37,7 @@ class CurveKey:
 
 @dataclass(frozen=True)
 class TiltResponse:
-    """What turning the probe about the image's lateral axis does to the correlation, by depth.
+    """Effect of tilt, by depth, on the correlation.
 
     Speckle that is tilted by theta while its patch moves by z decorrelates as if it had moved by d, with
     d^2 = (z - pivot theta)^2 + (spread theta)^2: a curved wavefront is moved least by turning about its

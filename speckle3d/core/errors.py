@@ -1,4 +1,4 @@
-"""What the package raises on purpose. Each error is one line: what was expected, what came, and where."""
+"""Errors raised on purpose. A message is one line: what was expected, what came, and where."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reconstruction is: poses of every frame by mode, and the frame pairs they were made from."""
+"""A reconstruction: poses of every frame by mode, and the frame pairs they were made from."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class CalibrationFile:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a reconstruction came from."""
+    """Input file and package version that a reconstruction was made with."""
 
     input_path: str
     input_sha256: str
@@ -71,7 +71,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Trust:
-    """How far the poses of mode `image` may be trusted.
+    """Uncertainty and flags of the poses of mode `image`.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Trust:
         Of (x, y, z, tilt, yaw, roll) of every frame's pose about the image's centre, along the first frame's
         axes, mm and rad.
     flags : ndarray of int, shape (n,)
-        Zero for a frame that is as it should be; else bits of `speckle3d.matching.quality.FrameFlag`.
+        Zero for a good frame; else bits of `speckle3d.matching.quality.FrameFlag`.
     """
 
     covariance: FloatArray
@@ -97,7 +97,15 @@ class Reconstruction:
     config_toml : str
         The effective configuration.
     trust : Trust or None
-        None in files that were written before there was any.
+        None in older files, which hold none.
+
+    Examples
+    --------
+    >>> still = RigidTransform.identity(3)
+    >>> grid = ImageGrid(vectors=8, samples=40, vector_pitch_mm=0.3, sample_spacing_mm=0.1)
+    >>> made = Reconstruction(np.arange(3) / 25, grid, {"image": still}, Provenance("sweep.h5", "", ""))
+    >>> made.poses["image"].translation.shape
+    (3, 3)
     """
 
     frame_time_s: FloatArray

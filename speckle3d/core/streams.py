@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from abc import abstractmethod
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,24 +19,49 @@ DEFAULT_MAX_GAP_S = 0.2
 """Longest pause between two samples that interpolation bridges: five frames at 25 frames/s, about the time
 in which a hand's motion is still smooth (physiological tremor is at 4-12 Hz)."""
 
+Samples = TypeVar("Samples", Rotation, RigidTransform)
+
 
 @dataclass(frozen=True)
-class _Clock:
-    """Which sample interval each asked time falls in, and which times no interval may serve."""
+class _TimedSamples(Generic[Samples]):
+    """Samples on a clock: validation, coverage and lookup, whatever the samples are."""
 
     time_s: FloatArray
-    max_gap_s: float
+    world_from_sensor: Samples
+    max_gap_s: float = DEFAULT_MAX_GAP_S
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
+        samples = len(self.world_from_sensor)
+        if self.time_s.size != samples:
+            raise InvalidInputError(
+                f"expected as many samples as times, got {samples} and {self.time_s.size}"
+            )
+        if samples == 0:
+            raise InvalidInputError("expected at least one sensor sample, got none")
+
+    def __len__(self) -> int:
+        return int(self.time_s.size)
 
     def covers(self, times_s: npt.ArrayLike) -> BoolArray:
+        """Whether each of `times_s` lies on a sample or between two that are close enough."""
         t = np.asarray(times_s, dtype=float)
-        right = np.clip(np.searchsorted(self.time_s, t), 1, max(self.time_s.size - 1, 1))
-        if self.time_s.size < 2:
-            return np.isin(t, self.time_s)
+        on_sample = np.isin(t, self.time_s)
+        if len(self) < 2:
+            return on_sample
+        right = np.clip(np.searchsorted(self.time_s, t), 1, len(self) - 1)
         before, after = self.time_s[right - 1], self.time_s[right]
         inside = (t >= before) & (t <= after) & (after - before <= self.max_gap_s)
-        return np.asarray(inside | np.isin(t, self.time_s))
+        return np.asarray(inside | on_sample)
 
-    def require(self, times_s: npt.ArrayLike) -> FloatArray:
+    def at(self, times_s: npt.ArrayLike) -> Samples:
+        """Sample at each of `times_s`: slerp of the rotation, linear interpolation of the translation.
+
+        Raises
+        ------
+        InsufficientDataError
+            If a time is outside the samples or in a gap longer than `max_gap_s`.
+        """
         t = np.asarray(times_s, dtype=float)
         missing = np.flatnonzero(~np.atleast_1d(self.covers(t)))
         if missing.size:
@@ -44,37 +71,17 @@ class _Clock:
                 f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s, "
                 f"gaps over {self.max_gap_s:g} s are not bridged"
             )
-        return t
+        if len(self) == 1:
+            return self.world_from_sensor[np.zeros(t.shape, dtype=int)]
+        return self._between(t)
 
-
-class _Timed:
-    """What samples on a clock have in common, whatever they are."""
-
-    time_s: FloatArray
-    max_gap_s: float
-    _clock: _Clock
-
-    def _settle(self, samples: int) -> None:
-        """Validate once, when made."""
-        object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
-        if self.time_s.size != samples:
-            raise InvalidInputError(
-                f"expected as many samples as times, got {samples} and {self.time_s.size}"
-            )
-        if samples == 0:
-            raise InvalidInputError("expected at least one sensor sample, got none")
-        object.__setattr__(self, "_clock", _Clock(self.time_s, self.max_gap_s))
-
-    def __len__(self) -> int:
-        return int(self.time_s.size)
-
-    def covers(self, times_s: npt.ArrayLike) -> BoolArray:
-        """Whether each of `times_s` lies on a sample or between two that are close enough."""
-        return self._clock.covers(times_s)
+    @abstractmethod
+    def _between(self, times_s: FloatArray) -> Samples:
+        """Interpolate between two samples or more, at times that they cover."""
 
 
 @dataclass(frozen=True)
-class TimedRotations(_Timed):
+class TimedRotations(_TimedSamples[Rotation]):
     """Orientation samples of one sensor.
 
     Parameters
@@ -84,28 +91,16 @@ class TimedRotations(_Timed):
     world_from_sensor : Rotation, length m
     max_gap_s : float
         The longest pause that `at` interpolates across.
+
+    Examples
+    --------
+    >>> readings = TimedRotations(np.array([0.0, 0.1]), Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.2]]))
+    >>> readings.at(0.05).as_rotvec().round(3).tolist()
+    [0.0, 0.0, 0.1]
     """
 
-    time_s: FloatArray
-    world_from_sensor: Rotation
-    max_gap_s: float = DEFAULT_MAX_GAP_S
-    _clock: _Clock = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self._settle(len(self.world_from_sensor))
-
-    def at(self, times_s: npt.ArrayLike) -> Rotation:
-        """Orientation at `times_s` by spherical linear interpolation.
-
-        Raises
-        ------
-        InsufficientDataError
-            If a time is outside the samples or in a gap longer than `max_gap_s`.
-        """
-        t = self._clock.require(times_s)
-        if len(self) == 1:
-            return self.world_from_sensor[np.zeros(t.shape, dtype=int)]
-        return self._slerp(t)
+    def _between(self, times_s: FloatArray) -> Rotation:
+        return self._slerp(times_s)
 
     @cached_property
     def _slerp(self) -> Slerp:
@@ -113,7 +108,7 @@ class TimedRotations(_Timed):
 
 
 @dataclass(frozen=True)
-class TimedPoses(_Timed):
+class TimedPoses(_TimedSamples[RigidTransform]):
     """Position and orientation samples of one sensor.
 
     Parameters
@@ -126,28 +121,10 @@ class TimedPoses(_Timed):
         The longest pause that `at` interpolates across.
     """
 
-    time_s: FloatArray
-    world_from_sensor: RigidTransform
-    max_gap_s: float = DEFAULT_MAX_GAP_S
-    _clock: _Clock = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self._settle(len(self.world_from_sensor))
-
-    def at(self, times_s: npt.ArrayLike) -> RigidTransform:
-        """Pose at `times_s`: slerp of the rotation, linear interpolation of the translation.
-
-        Raises
-        ------
-        InsufficientDataError
-            If a time is outside the samples or in a gap longer than `max_gap_s`.
-        """
-        t = self._clock.require(times_s)
-        if len(self) == 1:
-            return self.world_from_sensor[np.zeros(t.shape, dtype=int)]
+    def _between(self, times_s: FloatArray) -> RigidTransform:
         translation, slerp = self._paths
-        moved = np.stack([np.interp(t, self.time_s, column) for column in translation.T], axis=-1)
-        return RigidTransform.from_components(moved, slerp(t))
+        moved = np.stack([np.interp(times_s, self.time_s, column) for column in translation.T], axis=-1)
+        return RigidTransform.from_components(moved, slerp(times_s))
 
     @cached_property
     def _paths(self) -> tuple[FloatArray, Slerp]:

@@ -177,6 +177,14 @@ class Sweep:
         The image clock, strictly increasing.
     truth : RigidTransform, length n, optional
         ``world_from_image`` of every frame; simulations only.
+
+    Examples
+    --------
+    >>> frames = np.zeros((3, 8, 40), dtype=np.uint8)
+    >>> grid = ImageGrid(vectors=8, samples=40, vector_pitch_mm=0.3, sample_spacing_mm=0.1)
+    >>> sweep = Sweep(frames, grid, BModeSettings(dynamic_range_db=60.0), np.arange(3) / 25)
+    >>> len(sweep), round(sweep.grid.depth_mm, 3)
+    (3, 3.9)
     """
 
     frames: Frames

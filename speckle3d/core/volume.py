@@ -24,6 +24,12 @@ class Volume:
         Distance between neighbouring voxel centres along i, j and k.
     world_from_grid : RigidTransform
         Pose of the grid, mm; its origin is the centre of voxel ``[0, 0, 0]``.
+
+    Examples
+    --------
+    >>> volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
+    >>> (volume.world_from_index @ [3, 2, 1, 1]).tolist()
+    [1.5, 1.0, 1.0, 1.0]
     """
 
     voxels: npt.NDArray[Any]

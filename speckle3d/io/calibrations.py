@@ -40,7 +40,13 @@ FORMAT = "speckle3d.calibration"
 
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
-    """Write a calibration, whole or not at all."""
+    """Write a calibration; the file appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
     with atomic_hdf5(path, FORMAT) as file:
         for name in ("method", "sensor", "rms", "rms_unit", "condition_number", "verdict"):
             file.attrs[name] = getattr(calibration, name)
@@ -61,12 +67,28 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
 
 
 def read_calibration(path: PathLike) -> Calibration:
-    """Read a calibration, checked.
+    """Read a calibration, and check it.
 
     Raises
     ------
-    FileError, InvalidInputError
+    FileError
+        If the file is missing, truncated or not HDF5.
+    InvalidInputError
         Naming the file and what in it is wrong.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> made = Calibration(
+    ...     "orientation", "orientation", Rotation.from_rotvec([0, 0, 0.1]), None, None, 1e-6 * np.eye(3),
+    ...     (), 0.01, "rad", 12.0, FramesUsed(2, (0, 1)),
+    ... )
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_calibration(f"{folder}/imu.h5", made)
+    ...     read_calibration(f"{folder}/imu.h5").rotation.as_rotvec().round(6).tolist()
+    [0.0, 0.0, 0.1]
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         rotation, translation = _read_pose(file)
@@ -167,14 +189,14 @@ def _read_covariance(file: h5py.File, size: int) -> FloatArray:
 
 
 def _require_spread(values: FloatArray, where: str) -> None:
-    """What motion does not determine has an infinite spread; none has a negative one."""
+    """Refuse negative or NaN standard errors; an infinite one marks what the motion did not determine."""
     bad = np.flatnonzero(~(values >= 0))
     if bad.size:
         raise InvalidInputError(f"{where}[{bad[0]}]: expected zero or a value above it, got {values[bad[0]]}")
 
 
 def _read_condition(file: h5py.File) -> float:
-    """Infinite if the motion leaves something open, so not read as other numbers are."""
+    """Read the condition number, which may be infinite, unlike other attributes."""
     raw = np.asarray(file.attrs.get("condition_number", np.nan))
     if raw.dtype.kind not in "fiu" or raw.size != 1 or np.isnan(raw).any():
         raise InvalidInputError("attribute condition_number: expected a number, got none")

@@ -27,12 +27,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, locate, one_line, open_hdf5, read_checked, reading, require_dataset
+from speckle3d.io.hdf5 import PathLike, locate, open_hdf5, read_checked, reading, require_dataset
 from speckle3d.io.sweeps import HDF5Frames
+from speckle3d.io.text import numbers, text_lines
 
 FORMAT = "TUS-REC scan"
 FRAME_RATE_HZ = 20.0
@@ -208,20 +209,12 @@ def _landmark_file(scan: Path) -> Path | None:
 
 
 def _calibration_rows(path: PathLike) -> FloatArray:
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"{path}: cannot be read as text: {one_line(error)}") from error
-    rows = [_numbers(line) for line in lines if line.strip() and not line.strip()[0].isalpha()]
-    found = [row for row in rows if row is not None]
-    if len(found) != len(rows) or len(found) != 8:
-        raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(found)}")
-    return np.array(found)
-
-
-def _numbers(line: str) -> list[float] | None:
-    try:
-        values = [float(word) for word in line.split(",")]
-    except ValueError:
-        return None
-    return values if len(values) == 4 and np.isfinite(values).all() else None
+    """Read the eight rows of four numbers, shape (8, 4); lines that begin with a letter are headings."""
+    rows = [
+        numbers(text.replace(",", " "), 4, f"{path}: line {number}")
+        for number, text in text_lines(path)
+        if not text[0].isalpha()
+    ]
+    if len(rows) != 8:
+        raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
+    return np.array(rows)

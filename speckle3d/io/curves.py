@@ -16,15 +16,21 @@ from speckle3d.io.hdf5 import (
     read_attribute,
     read_checked,
     read_text,
-    read_vector_attribute,
 )
+from speckle3d.io.sweeps import read_signal
 
 FORMAT = "speckle3d.curves"
 KEY_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
 
 
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
-    """Write curves, whole or not at all."""
+    """Write decorrelation curves; the file appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
     with atomic_hdf5(path, FORMAT) as file:
         for name in ("depth_mm", "distance_mm", "correlation", "cells"):
             file[name] = getattr(curves, name)
@@ -41,12 +47,22 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
 
 
 def read_curves(path: PathLike) -> DecorrelationCurves:
-    """Read curves, checked.
+    """Read decorrelation curves, and check them.
 
     Raises
     ------
-    FileError, InvalidInputError
+    FileError
+        If the file is missing, truncated or not HDF5.
+    InvalidInputError
         Naming the file and what in it is wrong.
+
+    Examples
+    --------
+    >>> curves = read_curves("data/curves.h5")
+    >>> curves.correlation.shape == (curves.depth_mm.size, curves.distance_mm.size)
+    True
+    >>> curves.key.correlation_of
+    'echo'
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         depth = read_checked(file, "depth_mm", ("r",))
@@ -69,18 +85,9 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
 
 def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:
     kind = read_text(file, "signal")
-    if kind == "bmode":
-        return BModeSettings(read_attribute(file, "dynamic_range_db"), read_attribute(file, "full_scale"))
-    if kind != "rf":
+    if kind not in ("rf", "bmode"):
         raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-    band = read_vector_attribute(file, "bandwidth_hz", 2)
-    if band is None:
-        raise InvalidInputError("expected attribute bandwidth_hz, got none")
-    rate, speed, centre = (
-        read_attribute(file, name)
-        for name in ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
-    )
-    return RFSettings(rate, speed, centre, (float(band[0]), float(band[1])))
+    return read_signal(file, kind)
 
 
 load_curves = read_curves

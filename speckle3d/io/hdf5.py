@@ -1,4 +1,4 @@
-"""What every file of the family shares: whole-or-not-at-all writing, and reading that names what is wrong."""
+"""HDF5 files of this package: written whole or not at all, read with errors that name the place."""
 
 from __future__ import annotations
 

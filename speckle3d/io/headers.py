@@ -12,6 +12,7 @@ import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
 _HEADER_LIMIT_BYTES = 2**28
@@ -111,18 +112,6 @@ def read_header(path: PathLike) -> SequenceHeader:
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
 
 
-def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
-    """Read finite numbers separated by blanks; `count` of them unless it is None."""
-    try:
-        values = tuple(float(word) for word in text.split())
-    except ValueError:
-        values = ()
-    if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
-        shown = text if len(text) <= 40 else f"{text[:37]}..."
-        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
-    return values
-
-
 def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
     for line in _lines(stream):
         name, equals, value = line.partition("=")
@@ -204,7 +193,7 @@ def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
 
 
 def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) -> None:
-    """Refuse a truncated file before the image library does so in its own words."""
+    """Refuse a truncated file with a message that names it; the image library's does not."""
     if header.fields["ElementDataFile"].upper() != "LOCAL":
         name = header.fields["ElementDataFile"]
         data = Path(path).parent / name

@@ -1,6 +1,6 @@
 """Image sequences in MetaImage and NRRD files, as PLUS, ITK and ultrasound machines write them.
 
-PLUS's names stay in this module, `headers` and `pixels`: ``ImageToProbe`` in pixels, ``ProbeToTracker``,
+PLUS's names stay in this module and `headers`: ``ImageToProbe`` in pixels, ``ProbeToTracker``,
 orientations such as ``MF`` (x towards the marked side, y far from the probe).
 """
 
@@ -15,13 +15,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.headers import SequenceHeader, numbers, read_header
-from speckle3d.io.pixels import RF_TYPES, image_orientation, image_type, read_pixels, to_samples
+from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
 """How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
@@ -31,12 +31,27 @@ ROUNDING_TOLERANCE = 2e-3
 """How far R^T R of a pose in a header may be from the identity before it is made rigid. An electromagnetic
 tracker that rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
 
+_RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
 _DEFAULT_TRANSFORMS = ("ProbeToTracker", "ReferenceToTracker")
+
+
+class MissingSettingError(InvalidInputError):
+    """A header lacks a value, and no setting gives it.
+
+    Attributes
+    ----------
+    setting : str
+        Name in `ImportSettings`.
+    """
+
+    def __init__(self, message: str, setting: str = "") -> None:
+        super().__init__(message)
+        self.setting = setting
 
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """What an image file's header lacks. A value given here goes before the header's own.
+    """Values for what an image file's header lacks; they replace the header's own.
 
     Attributes
     ----------
@@ -85,7 +100,7 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
     if 0 in header.size:
         raise InvalidInputError(f"{path}: expected pixels, got an image of size {header.size}")
     kept = _frames_kept(header)
-    frames = to_samples(header, read_pixels(header)[kept])
+    frames = _to_samples(header, _read_pixels(header)[kept])
     grid, signal = _geometry(header, settings, frames)
     return Sweep(
         frames=cast(Frames, frames),
@@ -121,7 +136,7 @@ def _geometry(
     _, vectors, samples = frames.shape
     lateral_mm, axial_mm = _header_spacing(header)
     with naming(header.path):
-        if image_type(header) in RF_TYPES:
+        if image_type(header) in _RF_TYPES:
             rf = _rf_settings(header, settings, axial_mm)
             pitch = _need(header, "vector_pitch_mm", settings.vector_pitch_mm, lateral_mm)
             spacing = rf.sample_spacing_mm
@@ -140,14 +155,15 @@ def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: flo
     rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
     centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
     if settings.bandwidth_hz is None:
-        raise InvalidInputError(f"{header.path}: the header lacks the band: give bandwidth_hz (low, high)")
+        message = f"{header.path}: the header lacks the band: give bandwidth_hz (low, high)"
+        raise MissingSettingError(message, "bandwidth_hz")
     return RFSettings(rate, speed, centre, settings.bandwidth_hz)
 
 
 def _need(header: SequenceHeader, name: str, given: float | None, read: float | None) -> float:
     value = read if given is None else given
     if value is None:
-        raise InvalidInputError(f"{header.path}: the header does not say: give {name}")
+        raise MissingSettingError(f"{header.path}: the header does not say: give {name}", name)
     return float(value)
 
 
@@ -182,7 +198,8 @@ def _frame_times(header: SequenceHeader, settings: ImportSettings) -> FloatArray
             raise InvalidInputError(f"frame_rate_hz: expected above zero, got {settings.frame_rate_hz}")
         return np.arange(header.frame_count) / settings.frame_rate_hz
     if not header.frames:
-        raise InvalidInputError(f"{header.path}: the header holds no time stamps: give frame_rate_hz")
+        message = f"{header.path}: the header holds no time stamps: give frame_rate_hz"
+        raise MissingSettingError(message, "frame_rate_hz")
     return require_increasing(_timestamps(header), f"{header.path}: Timestamp")
 
 
@@ -232,7 +249,7 @@ def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> R
 
 
 def _squared(matrices: FloatArray) -> FloatArray:
-    """Nearest rotation of every matrix that is one up to rounding; the others stay for the error to name."""
+    """Make rounded rotations exact; matrices farther off stay, for `transforms_from_matrices` to refuse."""
     r = matrices[:, :3, :3]
     rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
     rounded[rounded] = np.linalg.det(r[rounded]) > 0
@@ -263,3 +280,108 @@ def _calibration(header: SequenceHeader, settings: ImportSettings) -> FloatArray
     if not (np.linalg.norm(matrix[:3, :2], axis=0) > 0).all():
         raise InvalidInputError("image_to_probe: expected axes of some length, got zero")
     return matrix
+
+
+def image_type(header: SequenceHeader) -> str:
+    """PLUS's image type, told from the pixels where the header does not say."""
+    named = header.fields.get("UltrasoundImageType")
+    if named is not None:
+        return named
+    pixel = header.fields.get("ElementType") or header.fields.get("type", "")
+    return "BRIGHTNESS" if pixel in ("MET_UCHAR", "uint8", "unsigned char", "uchar") else "RF_REAL"
+
+
+def image_orientation(header: SequenceHeader) -> str:
+    """PLUS's image orientation, its defaults where the header does not say: MF for B-mode, FM for RF."""
+    default = "FM" if image_type(header) in _RF_TYPES else "MF"
+    return header.fields.get("UltrasoundImageOrientation", default).upper()
+
+
+def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
+    """Pixels as (frame, second axis, first axis)."""
+    import SimpleITK
+
+    try:
+        # The reader is named, because the library otherwise chooses it by the suffix.
+        image = SimpleITK.ReadImage(header.path, imageIO=f"{header.file_format}IO")
+    except RuntimeError as error:
+        raise FileError(f"{header.path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error
+    pixels = SimpleITK.GetArrayFromImage(image)
+    expected = (header.frame_count, header.size[1], header.size[0])
+    if "list" in header.fields.get("kinds", "") and pixels.shape == (*expected[1:], expected[0]):
+        pixels = np.moveaxis(pixels, -1, 0)  # an NRRD list of frames arrives as one image of many components
+    if pixels.shape not in (expected, expected[1:]):
+        raise InvalidInputError(f"{header.path}: expected grey pixels {expected}, got {pixels.shape}")
+    return pixels.reshape(expected)
+
+
+def _to_samples(header: SequenceHeader, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Turn pixels into frames (frame, vector, sample): marked side last, far side last.
+
+    Returns
+    -------
+    ndarray
+        uint8 for B-mode, int16 or float32 for RF, complex64 for I and Q.
+    """
+    kind = image_type(header)
+    orientation = image_orientation(header)
+    if kind not in (*_RF_TYPES, "BRIGHTNESS"):
+        raise InvalidInputError(f"{header.path}: expected a grey B-mode or RF image, got type {kind}")
+    if kind == "BRIGHTNESS":
+        if pixels.dtype != np.uint8:
+            raise InvalidInputError(f"{header.path}: expected B-mode of type uint8, got {pixels.dtype}")
+        return _oriented(header.path, pixels, orientation)
+    if kind == "RF_REAL":
+        return _oriented(header.path, _narrowed(pixels), orientation)
+    frames = _oriented(header.path, _analytic(header.path, pixels, orientation, kind), orientation)
+    return _positive_carrier(frames)
+
+
+def _oriented(path: str, pixels: npt.NDArray[Any], orientation: str) -> npt.NDArray[Any]:
+    """Turn (frame, y, x) into (frame, vector, sample), marked side last, far side last."""
+    x, y = (*orientation, "", "")[:2]
+    if not ((x in "MU" and y in "FN") or (x in "FN" and y in "MU")) or not (x and y):
+        raise InvalidInputError(
+            f"{path}: UltrasoundImageOrientation: expected as MF or FM, got {orientation}"
+        )
+    if x in "MU":
+        pixels, x, y = pixels.transpose(0, 2, 1), y, x
+    if x == "N":
+        pixels = pixels[:, :, ::-1]
+    if y == "U":
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def _narrowed(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """RF as int16 where that loses nothing, else as float32."""
+    limits = np.iinfo(np.int16)
+    if pixels.dtype.kind in "iu" and pixels.min() >= limits.min and pixels.max() <= limits.max:
+        return pixels.astype(np.int16, copy=False)
+    return pixels.astype(np.float32)
+
+
+def _analytic(path: str, pixels: npt.NDArray[Any], orientation: str, kind: str) -> npt.NDArray[np.complex64]:
+    axis = 2 if orientation.startswith(("F", "N")) else 1
+    if kind == "RF_I_LINE_Q_LINE":
+        axis = 3 - axis
+    if pixels.shape[axis] % 2:
+        raise InvalidInputError(f"{path}: expected I and Q in pairs, got {pixels.shape[axis]}")
+    in_phase, quadrature = np.moveaxis(pixels, axis, 0)[0::2], np.moveaxis(pixels, axis, 0)[1::2]
+    analytic = (in_phase + 1j * quadrature).astype(np.complex64)
+    return np.moveaxis(analytic, 0, axis)
+
+
+def _positive_carrier(frames: npt.NDArray[np.complex64]) -> npt.NDArray[np.complex64]:
+    """Conjugate where the carrier turns backwards, as it does in a reversed line or with the other sign of Q.
+
+    The phase between neighbouring samples is the carrier's mean turn, the first moment of the spectrum [1]_.
+
+    References
+    ----------
+    .. [1] C. Kasai et al., "Real-time two-dimensional blood flow imaging using an autocorrelation
+       technique", IEEE Trans. Sonics Ultrason. 32, 1985.
+    """
+    first = frames[0]
+    turn = np.angle(np.vdot(first[:, :-1], first[:, 1:]))
+    return np.conj(frames) if turn < 0 else frames

@@ -24,7 +24,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
 from speckle3d.io.hdf5 import PathLike, one_line
-from speckle3d.io.headers import numbers
+from speckle3d.io.text import numbers
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 """How many wires a pattern of each type has."""

@@ -14,16 +14,16 @@ missing. A wire goes by its name or by its number in the phantom, from 0.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite
-from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
-from speckle3d.io.headers import numbers
+from speckle3d.io.hdf5 import PathLike, atomic_path
+from speckle3d.io.text import numbers, text_lines
 
 Row = tuple[int, tuple[float, float], int]
 """Frame, column and row, wire."""
@@ -95,7 +95,8 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
     InvalidInputError
         Naming the line.
     """
-    lines = _lines(path)
+    bare = ((number, line.partition("#")[0].strip()) for number, line in text_lines(path))
+    lines = ((number, text) for number, text in bare if text)
     number, heading = next(lines, (1, ""))
     columns = _columns(heading, f"{path}: line {number}")
     rows: list[Row] = []
@@ -132,20 +133,6 @@ def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str]
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _lines(path: PathLike) -> Iterator[tuple[int, str]]:
-    """Numbers and texts of the lines that hold something, from 1."""
-    try:
-        with open(path, encoding="utf-8-sig") as stream:
-            for number, line in enumerate(stream, start=1):
-                text = line.partition("#")[0].strip()
-                if text:
-                    yield number, text
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
-    except UnicodeDecodeError as error:
-        raise InvalidInputError(f"{path}: expected text in UTF-8, got other bytes") from error
-
-
 def _columns(heading: str, where: str) -> list[str]:
     columns = [word.strip().lower() for word in heading.split(",")]
     known = (*_COLUMNS, _WIRE)
@@ -179,7 +166,7 @@ def _wire(word: str, names: Sequence[str], where: str) -> int:
 
 
 def _require_new(row: Row, seen: dict[tuple[int, int], int], number: int, where: str) -> None:
-    """A wire shows once in a frame."""
+    """Refuse a second point of the same wire in a frame."""
     frame, _, wire = row
     if (frame, wire) in seen:
         raise InvalidInputError(

@@ -1,4 +1,4 @@
-"""The reconstruction file, version 1: written while the work goes on, read whole."""
+"""The reconstruction file, version 1: frame pairs are written as they come, and the file is read whole."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class ReconstructionWriter:
         """Write the poses by mode, where they came from, the configuration and how far to trust them."""
         group = self._file.create_group("poses")
         with naming(str(self._path)):
-            # The container's own rules, checked here so that no file breaks them.
+            # Checked by the container before anything is written.
             Reconstruction(self._times, self._grid, dict(poses), provenance, config_toml, None, trust)
         for mode, world_from_image in poses.items():
             group[mode] = world_from_image.as_matrix()
@@ -216,7 +216,7 @@ def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
 
 def _read_provenance(file: h5py.File) -> Provenance:
     held = find_group(file, "calibrations")
-    # Files from before calibrations could be given have no such group.
+    # Older files have no such group.
     groups = {} if held is None else {sensor: find_group(held, sensor) for sensor in held}
     calibrations = tuple(
         CalibrationFile(sensor, read_text(group, "path"), read_text(group, "sha256"))

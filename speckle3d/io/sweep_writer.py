@@ -1,4 +1,4 @@
-"""The sweep file, version 1: writing, frame by frame."""
+"""Writing of the sweep file, version 1, frame by frame."""
 
 from __future__ import annotations
 
@@ -190,6 +190,18 @@ def write_sweep(
     ------
     InvalidInputError
         If the samples are of a type the format does not hold, as analytic (complex) ones.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import speckle3d
+    >>> grid = ImageGrid(vectors=8, samples=40, vector_pitch_mm=0.3, sample_spacing_mm=0.1)
+    >>> frames = np.zeros((3, 8, 40), dtype=np.uint8)
+    >>> sweep = Sweep(frames, grid, BModeSettings(dynamic_range_db=60.0), np.arange(3) / 25)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_sweep(f"{folder}/sweep.h5", sweep)
+    ...     len(speckle3d.load_sweep(f"{folder}/sweep.h5"))
+    3
     """
     with SweepWriter(path, sweep.grid, sweep.signal, sweep.frames.dtype, compression) as writer:
         for i, time_s in enumerate(sweep.frame_time_s):

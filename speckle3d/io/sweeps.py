@@ -1,4 +1,4 @@
-"""The sweep file, version 1: reading, frames left on disk."""
+"""Reading of the sweep file, version 1; frames stay on disk."""
 
 from __future__ import annotations
 
@@ -174,34 +174,34 @@ def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BM
         raise InvalidInputError(f"{where}: expected shape (frame, vector, sample), got {node.shape}")
     frames = HDF5Frames(file.filename, name, node.shape, node.dtype.newbyteorder("="))
     with naming(where):
-        grid, signal = (_rf_settings if name == "rf" else _bmode_settings)(node)
-    return frames, grid, signal
+        signal = read_signal(node, name)
+        return frames, _read_grid(node, signal), signal
 
 
-def _rf_settings(node: h5py.Dataset) -> tuple[ImageGrid, RFSettings]:
+def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BModeSettings:
+    """Read how the samples were made from attributes; `kind` is ``"rf"`` or ``"bmode"``."""
+    if kind == "bmode":
+        return BModeSettings(
+            dynamic_range_db=read_attribute(node, "dynamic_range_db"),
+            full_scale=read_attribute(node, "full_scale", default=255.0),
+        )
     band = read_vector_attribute(node, "bandwidth_hz", 2)
     if band is None:
         raise InvalidInputError("expected attribute bandwidth_hz, got none")
-    signal = RFSettings(
+    return RFSettings(
         sampling_rate_hz=read_attribute(node, "sampling_rate_hz"),
         speed_of_sound_m_s=read_attribute(node, "speed_of_sound_m_s"),
         centre_frequency_hz=read_attribute(node, "centre_frequency_hz"),
         bandwidth_hz=(float(band[0]), float(band[1])),
     )
-    return _grid(node, read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm), signal
 
 
-def _bmode_settings(node: h5py.Dataset) -> tuple[ImageGrid, BModeSettings]:
-    signal = BModeSettings(
-        dynamic_range_db=read_attribute(node, "dynamic_range_db"),
-        full_scale=read_attribute(node, "full_scale", default=255.0),
-    )
-    pitch, spacing = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
-    return _grid(node, pitch, spacing), signal
-
-
-def _grid(node: h5py.Dataset, pitch_mm: float, spacing_mm: float) -> ImageGrid:
+def _read_grid(node: h5py.Dataset, signal: RFSettings | BModeSettings) -> ImageGrid:
     _, vectors, samples = node.shape
+    if isinstance(signal, RFSettings):
+        pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
+    else:
+        pitch_mm, spacing_mm = (read_attribute(node, name) for name in ("column_pitch_mm", "row_spacing_mm"))
     return ImageGrid(vectors, samples, pitch_mm, spacing_mm, read_attribute(node, "first_sample_depth_mm"))
 
 
@@ -230,7 +230,7 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
     time_s = _read_clock(group)
     valid = _read_valid(group, time_s.size)
     matrices = read_checked(group, "world_from_sensor", (time_s.size, 4, 4))
-    # An invalid sample may hold anything; the identity keeps the indices of the others for messages.
+    # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
     matrix = read_vector_attribute(group, "sensor_from_image", 16)

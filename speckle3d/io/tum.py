@@ -6,25 +6,22 @@ otherwise; poses in memory are in mm.
 
 from __future__ import annotations
 
-from pathlib import Path
+from itertools import takewhile
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, naming
 from speckle3d.core.streams import TimedPoses
-from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
-from speckle3d.io.headers import numbers
+from speckle3d.io.hdf5 import PathLike, atomic_path
+from speckle3d.io.text import numbers, text_lines
 
 LengthUnit = Literal["m", "mm"]
 
-_MM_PER_UNIT: dict[str, float] = {"m": 1000.0, "mm": 1.0}
+_MM_PER_UNIT: dict[LengthUnit, float] = {"m": 1000.0, "mm": 1.0}
 _COLUMNS = 8
-_ENCODING = "utf-8-sig"
-"""Editors on Windows begin a text with a byte order mark."""
 _UNIT_TOLERANCE = 1e-2
 """Of a quaternion's norm: files in the wild round to four digits."""
 
@@ -69,8 +66,15 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         If a line is not eight finite numbers, a quaternion is not of unit length, or times do not increase;
         or the file says another unit.
     """
-    rows = _read_rows(path)
-    said = _unit_said(path)
+    lines = list(text_lines(path))
+    # Line by line, so that an error names the line: 17 us each, where `np.loadtxt` takes 4.
+    rows = np.array(
+        [numbers(text, _COLUMNS, f"{path}: line {n}") for n, text in lines if not _is_comment(text)]
+    )
+    if not rows.size:
+        raise InvalidInputError(f"{path}: expected lines of eight numbers, got none")
+    heading = [text for _, text in takewhile(lambda line: _is_comment(line[1]), lines)]
+    said = _unit_of(heading)
     if length_unit is not None and said is not None and said != length_unit:
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
     mm_per_unit = _mm_per(length_unit or said or "m")
@@ -83,45 +87,28 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         return TimedPoses(rows[:, 0].copy(), poses)
 
 
-def _unit_said(path: PathLike) -> LengthUnit | None:
-    """The unit that a comment like the one of `write_tum` gives."""
-    for line in Path(path).read_text(encoding=_ENCODING).splitlines():
-        if line.strip() and not line.lstrip().startswith("#"):
-            return None
-        words = line.split()
-        for unit in _MM_PER_UNIT:
-            if f"x_{unit}" in words:
-                return "mm" if unit == "mm" else "m"
-    return None
-
-
 def is_tum(path: PathLike) -> bool:
     """Whether a file's first line that is no comment is eight numbers."""
     try:
-        with Path(path).open(encoding=_ENCODING) as file:
-            first = next(line for line in file if line.strip() and not line.lstrip().startswith("#"))
-        numbers(first, _COLUMNS, str(path))
-    except (OSError, UnicodeDecodeError, StopIteration, InvalidInputError):
+        number, first = next(each for each in text_lines(path) if not _is_comment(each[1]))
+        numbers(first, _COLUMNS, f"{path}: line {number}")
+    except (FileError, InvalidInputError, StopIteration):
         return False
     return True
 
 
-def _read_rows(path: PathLike) -> FloatArray:
-    try:
-        lines = Path(path).read_text(encoding=_ENCODING).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"{path}: cannot be read as text: {one_line(error)}") from error
-    rows = [
-        numbers(line, _COLUMNS, f"{path}: line {n}")
-        for n, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not rows:
-        raise InvalidInputError(f"{path}: expected lines of eight numbers, got none")
-    return np.array(rows)
+def _is_comment(line: str) -> bool:
+    return line.startswith("#")
+
+
+def _unit_of(heading: list[str]) -> LengthUnit | None:
+    """Return the length unit that comments like the one of `write_tum` name."""
+    words = {word for line in heading for word in line.split()}
+    return next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in words), None)
 
 
 def _mm_per(length_unit: str) -> float:
-    if length_unit not in _MM_PER_UNIT:
-        raise InvalidInputError(f"length unit: expected m or mm, got {length_unit!r}")
-    return _MM_PER_UNIT[length_unit]
+    for unit, mm in _MM_PER_UNIT.items():
+        if unit == length_unit:
+            return mm
+    raise InvalidInputError(f"length unit: expected m or mm, got {length_unit!r}")

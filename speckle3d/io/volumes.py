@@ -34,6 +34,15 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         If the suffix is not one of `SUFFIXES`.
     FileError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_volume(f"{folder}/v.nrrd", volume)
+    ...     read_volume(f"{folder}/v.nrrd").shape
+    (4, 3, 2)
     """
     if not Path(path).name.lower().endswith(SUFFIXES):
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
@@ -105,7 +114,7 @@ def _read_image(path: PathLike) -> Any:
 
 
 def _require_whole(path: PathLike) -> None:
-    """Refuse what ITK would fill with zeros or complain about in its own words."""
+    """Refuse damaged files, which ITK fills with zeros or reports without naming them."""
     try:
         with open(path, "rb") as stream:
             start = stream.read(512)

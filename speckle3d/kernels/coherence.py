@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.kernels.statistics import correlation_variance
+from speckle3d.kernels.statistics import PatchCurves, correlation_variance
 
 _variance = njit(correlation_variance)
 
@@ -61,10 +61,7 @@ def fit_echo_models(
     scales: FloatArray,
     stretches: FloatArray,
     lengths_mm: FloatArray,
-    amplitude: FloatArray,
-    step_mm: float,
-    cells: FloatArray,
-    of_echo: bool,
+    curves: PatchCurves,
     redundancy: float,
     gain_precision: float,
     cost: FloatArray,
@@ -83,9 +80,7 @@ def fit_echo_models(
     stretches : float64, shape (k,)
     lengths_mm : float64, shape (l,)
         Of coherent structure; 0 for models without any, where c = 0; `NO_GAIN` for those with gain one, too.
-    amplitude : float64, shape (p, m)
-        sqrt(rho_F) on a grid of `step_mm`.
-    cells : float64, shape (p,)
+    curves : PatchCurves
     redundancy : float
         How many of the pairs, which share frames, carry one independent piece of information.
     gain_precision : float
@@ -95,6 +90,7 @@ def fit_echo_models(
     found : float64, shape (s, p, k, l, 2)
         Share and gain.
     """
+    amplitude, step_mm, cells, of_echo = curves
     count = bins.shape[1]
     last = amplitude.shape[1] - 1
     g, h = np.empty(count), np.empty(count)

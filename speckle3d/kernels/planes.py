@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
+from speckle3d.kernels.statistics import INTERPOLATION, PatchCurves, correlation_variance
 
 _variance = njit(correlation_variance)
 
 _LEAST_MM = 0.05
 """Distance below which correlation is flat: sensitivities are not taken to be less than here."""
+
+
+class PlaneFit(NamedTuple):
+    """Start and result of `fit_correlation_plane`, filled by it.
+
+    Attributes
+    ----------
+    plane : float64, shape (3,)
+        Offset and slopes: the start, overwritten with the result.
+    information : float64, shape (3, 3)
+    standard, sensitivity : float64, shape (p,)
+        Each patch's residual over its standard deviation, NaN where it takes no part, and the change of that
+        with distance, per mm.
+    """
+
+    plane: FloatArray
+    information: FloatArray
+    standard: FloatArray
+    sensitivity: FloatArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -54,21 +75,14 @@ def fit_correlation_plane(
     rho: FloatArray,
     design: FloatArray,
     spread_mm: FloatArray,
-    amplitude: FloatArray,
-    step_mm: float,
     echo: FloatArray,
-    cells: FloatArray,
-    of_echo: bool,
+    curves: PatchCurves,
     prior: FloatArray,
-    precision: FloatArray,
     huber: float,
     rounds: int,
-    plane: FloatArray,
-    normal: FloatArray,
-    standard: FloatArray,
-    sensitivity: FloatArray,
+    fit: PlaneFit,
 ) -> float:
-    """Levenberg-Marquardt on the correlations; returns the robust cost.
+    """Fit by Levenberg-Marquardt to the correlations; returns the robust cost.
 
     Parameters
     ----------
@@ -79,20 +93,17 @@ def fit_correlation_plane(
     spread_mm : float64, shape (p,)
         Times the last coefficient, the tilt, and in quadrature with the distance: what turning alone
         decorrelates.
-    amplitude : float64, shape (p, m)
     echo : float64, shape (p, 6)
         As for `predict_correlation`.
-    cells : float64, shape (p,)
-    prior, precision : float64, shape (3,)
+    curves : PatchCurves
+    prior : float64, shape (2, 3)
         What the coefficients are expected to be, and one over the variance about it.
-    plane : float64, shape (3,)
-        Start, overwritten with the result.
-    normal : float64, shape (3, 3)
-        Receives the information matrix.
-    standard, sensitivity : float64, shape (p,)
-        Receive each patch's residual over its standard deviation, NaN where it takes no part, and the change
-        of that with distance, per mm.
+    fit : PlaneFit
+        Holds the start, and receives the result.
     """
+    amplitude, step_mm, cells, of_echo = curves
+    plane, normal, standard, sensitivity = fit
+    expected, precision = prior
     patches = rho.size
     damping, last = 1e-3, np.inf
     trial = plane.copy()
@@ -107,7 +118,7 @@ def fit_correlation_plane(
         new_hessian = np.zeros((3, 3))
         information = np.zeros((3, 3))
         for i in range(3):
-            off = trial[i] - prior[i]
+            off = trial[i] - expected[i]
             total += precision[i] * off * off
             new_gradient[i] -= precision[i] * off
             new_hessian[i, i] += precision[i]

@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
+
+from speckle3d.core.arrays import FloatArray
 
 INTERPOLATION = 0.003
 """Standard deviation that interpolation between samples leaves in a correlation."""
+
+
+class PatchCurves(NamedTuple):
+    """Fully developed curve at every patch, as kernels take it.
+
+    Attributes
+    ----------
+    amplitude : float64, shape (p, m)
+        sqrt(rho_F) on a grid of `step_mm`.
+    step_mm : float
+    cells : float64, shape (p,)
+        Independent speckle cells in a patch.
+    of_echo : bool
+        Whether the correlation is the complex echo's.
+    """
+
+    amplitude: FloatArray
+    step_mm: float
+    cells: FloatArray
+    of_echo: bool
 
 
 def correlation_variance(rho: Any, cells: Any, of_echo: bool) -> Any:

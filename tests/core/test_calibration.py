@@ -50,9 +50,7 @@ def test_an_unknown_clock_offset_leaves_the_sweeps_own(sensor):
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])
 def test_a_sweep_without_the_sensor_is_refused(sensor):
     sweep = replace(sweep_examples.rf_sweep(), **{sensor: None})
-    with pytest.raises(
-        MismatchError, match=f"example: expected the calibration's sensor, .*{sensor}, got no"
-    ):
+    with pytest.raises(MismatchError, match=f"example.*{sensor}"):
         calibrated(sweep, made(sensor))
 
 
@@ -97,11 +95,11 @@ def test_reasons_are_counted_without_their_details_most_frequent_first():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sensor": "camera"}, "sensor: expected one of tracker, orientation, got 'camera'"),
-        ({"covariance": np.eye(3)}, r"covariance: expected shape \(6, 6\), got \(3, 3\)"),
-        ({"translation_mm": None}, r"covariance: expected shape \(3, 3\), got \(6, 6\)"),
-        ({"pixel_mm": np.array([0.1, -0.1])}, "pixel_mm: expected values above zero"),
-        ({"pixel_mm": np.array([np.nan, 0.1])}, "pixel_mm: expected values above zero"),
+        ({"sensor": "camera"}, "sensor.*'camera'"),
+        ({"covariance": np.eye(3)}, r"covariance.*\(6, 6\).*\(3, 3\)"),
+        ({"translation_mm": None}, r"covariance.*\(3, 3\).*\(6, 6\)"),
+        ({"pixel_mm": np.array([0.1, -0.1])}, "pixel_mm"),
+        ({"pixel_mm": np.array([np.nan, 0.1])}, "pixel_mm"),
     ],
 )
 def test_what_cannot_be_a_calibration_is_refused(changes, message):

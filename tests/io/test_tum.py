@@ -46,7 +46,7 @@ def test_missing_files_units_and_times_that_do_not_fit(tmp_path):
     with pytest.raises(FileError, match=r"none\.tum"):
         read_tum(tmp_path / "none.tum")
     poses = hand_sweep(np.random.default_rng(3), 5)
-    with pytest.raises(MismatchError, match="expected 5 times"):
+    with pytest.raises(MismatchError, match="times"):
         write_tum(tmp_path / "a.tum", np.arange(4), poses)
     with pytest.raises(InvalidInputError, match="m or mm"):
         write_tum(tmp_path / "a.tum", np.arange(5), poses, "cm")
@@ -57,7 +57,7 @@ def test_a_file_says_its_own_unit_and_is_not_overruled(tmp_path):
     write_tum(tmp_path / "mm.tum", [0.0, 1.0], poses, "mm")
     back = read_tum(tmp_path / "mm.tum").world_from_sensor
     np.testing.assert_array_equal(back.translation, poses.translation)
-    with pytest.raises(InvalidInputError, match="expected lengths in m, got a file that says mm"):
+    with pytest.raises(InvalidInputError, match=r"lengths in m.*mm"):
         read_tum(tmp_path / "mm.tum", "m")
 
 

@@ -47,7 +47,7 @@ def test_another_reader_finds_a_voxel_where_we_say_it_is(tmp_path):
 
 
 def test_an_unknown_suffix_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"v\.png: expected a name ending in \.nrrd"):
+    with pytest.raises(InvalidInputError, match=r"v\.png"):
         write_volume(tmp_path / "v.png", example())
 
 
@@ -77,19 +77,19 @@ def test_a_truncated_volume_is_refused(tmp_path, suffix, kept, capfd):
 
 
 def test_a_missing_volume_and_a_plane_image_are_refused(tmp_path):
-    with pytest.raises(FileError, match="cannot be read: No such file"):
+    with pytest.raises(FileError, match=r"none\.nrrd"):
         read_volume(tmp_path / "none.nrrd")
     SimpleITK.WriteImage(SimpleITK.Image(4, 5, SimpleITK.sitkUInt8), str(tmp_path / "p.nrrd"))
-    with pytest.raises(InvalidInputError, match="expected a grey image of three axes, got 2 axes"):
+    with pytest.raises(InvalidInputError, match="2 axes"):
         read_volume(tmp_path / "p.nrrd")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"voxels": np.zeros((2, 2), np.uint8)}, "expected shape"),
-        ({"voxels": np.zeros((2, 2, 2))}, "expected uint8 or float32, got float64"),
-        ({"spacing_mm": (1.0, 0.0, 1.0)}, "expected three values above zero"),
+        ({"voxels": np.zeros((2, 2), np.uint8)}, "voxels"),
+        ({"voxels": np.zeros((2, 2, 2))}, "float64"),
+        ({"spacing_mm": (1.0, 0.0, 1.0)}, "spacing_mm"),
     ],
 )
 def test_a_volume_checks_itself(change, message):

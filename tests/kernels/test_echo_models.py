@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
+from speckle3d.kernels.statistics import PatchCurves
 
 EDGES_MM = np.r_[0.0, 0.1, 0.25, 0.6, 1.0]
 STEP_MM, WIDTH_MM = 0.01, 0.5
@@ -42,10 +43,8 @@ def fit(bins, scales=(1.0,), stretches=STRETCHES, lengths=LENGTHS_MM, of_echo=Tr
     shape = (scales.size, len(bins), stretches.size, lengths.size)
     cost, found = np.empty(shape), np.empty((*shape, 2))
     table = np.tile(amplitude(GRID_MM), (len(bins), 1))
-    cells = np.full(len(bins), CELLS)
-    fit_echo_models(
-        bins, scales, stretches, lengths, table, STEP_MM, cells, of_echo, 20.0, gain_precision, cost, found
-    )
+    curves = PatchCurves(table, STEP_MM, np.full(len(bins), CELLS), of_echo)
+    fit_echo_models(bins, scales, stretches, lengths, curves, 20.0, gain_precision, cost, found)
     return cost, found
 
 

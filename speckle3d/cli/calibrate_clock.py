@@ -1,8 +1,7 @@
-"""The delay between images and a sensor."""
+"""Calibration of a sensor's clock offset."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -10,9 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.outputs import require_free
-from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
+from speckle3d.cli.calibrate_phantoms import find_lines
+from speckle3d.cli.calibrations import require_free
+from speckle3d.cli.common import (
+    Images,
+    Json,
+    PixelMm,
+    Poses,
+    Region,
+    calibrate,
+    emit,
+    emit_json,
+    note,
+    progress_bar,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
@@ -21,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class By(StrEnum):
-    """What shows the delay."""
+    """Which motion in the images tells the delay."""
 
     line = "line"
     images = "images"
@@ -53,22 +63,12 @@ def calibrate_clock(
     The offset is added to the sensor's times; PLUS's LocalTimeOffsetSec, of the image device, is the same
     with the other sign.
     """
-    from speckle3d.io.calibrations import read_calibration, write_calibration
+    from speckle3d.io.calibrations import write_calibration
     from speckle3d.study.summary import plain
 
-    if out is not None and calibration is None:
-        raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
-    if by is By.line and calibration is not None and out is None:
-        raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     if out is not None:
         require_free(out, images, poses, calibration)
-    known = None if calibration is None else read_calibration(calibration)
-    if known is not None and known.sensor != sensor:
-        raise MismatchError(
-            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
-        )
-    if by is By.images and sensor != "tracker":
-        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
+    known = _known(by, sensor, calibration, out)
     if by is By.images:
         found, frames = _by_images(images, poses, pixel_mm, known, search_s)
         told = f"images of the two ways correlate by {found.followed:.2f}"
@@ -85,10 +85,28 @@ def calibrate_clock(
             "followed": found.followed,
             "frames": frames,
         }
-        emit(json.dumps(plain(table), indent=2, allow_nan=False))
+        emit_json(plain(table))
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)
+
+
+def _known(by: By, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
+    """Read the calibration, if one is given, after checking that the options fit each other and it."""
+    from speckle3d.io.calibrations import read_calibration
+
+    if out is not None and calibration is None:
+        raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
+    if by is By.line and calibration is not None and out is None:
+        raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
+    known = None if calibration is None else read_calibration(calibration)
+    if known is not None and known.sensor != sensor:
+        raise MismatchError(
+            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
+        )
+    if by is By.images and sensor != "tracker":
+        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
+    return known
 
 
 def _by_line(
@@ -99,7 +117,7 @@ def _by_line(
     region: str | None,
     search_s: float,
 ) -> tuple[Delay, int]:
-    """The delay, and in how many frames a line was found."""
+    """Find the delay from a plane's line; returns it and the number of frames with a line."""
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from speckle3d.cli.recordings import open_recording, require_unsized
 
@@ -125,7 +143,7 @@ def _by_images(
     known: Calibration | None,
     search_s: float,
 ) -> tuple[Delay, int]:
-    """The delay, and how many frames there were."""
+    """Find the delay from images of a sweep forward and back; returns it and the number of frames."""
     from calibration.clock.images import delay_from_images
     from speckle3d.cli.recordings import open_tracked, require_unsized
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -11,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.outputs import require_free
-from speckle3d.cli.phantoms import Out, PixelMm
+from speckle3d.cli.calibrations import require_free, write_with_report
+from speckle3d.cli.common import CalibrationOut, Json, PixelMm, calibrate, note, progress_bar
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -28,14 +26,14 @@ if TYPE_CHECKING:
 
 
 _FAR_MM = 300.0
-"""What fits on a probe."""
+"""Largest distance of an image from a sensor on the same probe."""
 
 MOST_OFFSET_S = 1e6
-"""No clock offset is larger: not even one between seconds since switching on and since some midnight."""
+"""Largest clock offset, s: clocks that start at switching on and at midnight differ by less."""
 
 
 class ImageMethod(StrEnum):
-    """How the answer is looked for."""
+    """Optimisation method."""
 
     gauss_newton = "gauss-newton"
     nelder_mead = "nelder-mead"
@@ -43,7 +41,7 @@ class ImageMethod(StrEnum):
 
 @dataclass(frozen=True)
 class _Inputs:
-    """Both sweeps, the start, and the sweep that tells the clock."""
+    """Both sweeps, the starting mounting, and the sweep from which the clock offset is found."""
 
     sweeps: tuple[TrackedImages, TrackedImages]
     start: RigidTransform
@@ -54,7 +52,7 @@ class _Inputs:
 def calibrate_images(
     first: Annotated[Path, typer.Argument(metavar="A", help="Tracked sweep: sweep file, MetaImage, NRRD.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="Another of the same place, turned by 90 deg.")],
-    out: Out,
+    out: CalibrationOut,
     start: Annotated[
         Path | None, typer.Option(help="Calibration to start from; by default A's own, if it has one.")
     ] = None,
@@ -108,7 +106,7 @@ def calibrate_images(
         sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
         given = replace(given, sweeps=(sweeps[0], sweeps[1]))
         found = _solve(given.sweeps, found.result.sensor_from_image, settings)
-    # The start said how the sweeps turn; only the answer says what they share.
+    # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
     enough = _angulation(given.sweeps, found.result.sensor_from_image)
     _finish((first, second), out, given, found, enough, delay, as_json)
 
@@ -213,27 +211,17 @@ def _finish(
     delay: Delay | None,
     as_json: bool,
 ) -> None:
-    """Write the calibration, its table and its pictures, and print the table."""
-    from importlib.metadata import version
-
+    """Write the calibration with its report."""
     from calibration.images.results import as_calibration, figure_of, notes_of
-    from calibration.report import json_report, text_report
-    from speckle3d.core.calibration import Source
-    from speckle3d.io.calibrations import write_calibration
-    from speckle3d.io.hdf5 import atomic_path, sha256_of
-    from speckle3d.study.figures import save_figure
 
-    names, hashes = (" ".join(map(of, paths)) for of in (str, sha256_of))
-    result = replace(
-        as_calibration(found, enough, given.sweeps), source=Source(names, hashes, version("speckle3d"))
-    )
     told = notes_of(found, enough)
     if delay is not None:
         told.append(f"clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s, from images")
-    table = text_report(result, (), told)
-    write_calibration(out, result)
-    with atomic_path(out.with_suffix(".txt")) as part:
-        part.write_text(table, encoding="utf-8")
-    save_figure(figure_of(found, enough, given.sweeps), out.with_suffix(".png"))
-    emit(json.dumps(json_report(result) | {"notes": told}, indent=2) if as_json else table)
-    note(f"calibration in {out}, report in {out.with_suffix('.txt')} and {out.with_suffix('.png')}")
+    write_with_report(
+        as_calibration(found, enough, given.sweeps),
+        paths,
+        out,
+        lambda _: figure_of(found, enough, given.sweeps),
+        told,
+        as_json=as_json,
+    )

@@ -1,8 +1,8 @@
-"""Calibration of a sensor to the image with a phantom: a plane, or wires."""
+"""Calibration of a sensor to the image with a phantom, a plane or wires, and how calibrations repeat."""
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -10,8 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
-from speckle3d.cli.outputs import require_free
+from speckle3d.cli.calibrations import require_free, write_with_report
+from speckle3d.cli.common import (
+    CalibrationOut,
+    Images,
+    Json,
+    PixelMm,
+    Poses,
+    Region,
+    calibrate,
+    emit,
+    emit_json,
+    from_options,
+    note,
+    progress_bar,
+)
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -20,20 +33,6 @@ if TYPE_CHECKING:
     from calibration.job import Job, Outcome, Recording, Seen
     from speckle3d.core.arrays import FloatArray
 
-Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
-Out = Annotated[
-    Path, typer.Option("-o", "--output", help="Calibration file to write; .txt and .png beside it.")
-]
-Poses = Annotated[
-    Path | None, typer.Option("--poses", help="File with the sensor's readings, if not in IMAGES.")
-]
-PixelMm = Annotated[
-    tuple[float, float] | None,
-    typer.Option(help="Distance between columns and rows, mm, if IMAGES does not say."),
-]
-Region = Annotated[
-    str | None, typer.Option(help='Polygon "column,row column,row ..." outside which nothing counts.')
-]
 TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
 FixedPixels = Annotated[
     bool, typer.Option("--fixed-pixels", help="Keep the pixel size instead of estimating it.")
@@ -62,14 +61,14 @@ class Stages(StrEnum):
 
 
 class Reflector(StrEnum):
-    """What shows the plane."""
+    """Object whose echo is the plane."""
 
     wall = "wall"
     bar = "bar"
 
 
 class Registration(StrEnum):
-    """What to do with the place of a wire phantom that a configuration says."""
+    """How far the phantom's pose in the configuration is trusted."""
 
     held = "held"
     turned = "turned"
@@ -77,7 +76,7 @@ class Registration(StrEnum):
 
 
 class Viewed(StrEnum):
-    """From which side a plane is seen."""
+    """Side from which the plane is seen."""
 
     above = "above"
     below = "below"
@@ -86,7 +85,7 @@ class Viewed(StrEnum):
 @calibrate.command("plane")
 def calibrate_plane(
     images: Images,
-    out: Out,
+    out: CalibrationOut,
     poses: Poses = None,
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
@@ -110,10 +109,11 @@ def calibrate_plane(
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
+    from calibration.detection.lines import LineSettings
     from calibration.job import plane_job
 
     require_free(out, images, poses, validation)
-    lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
+    lines = from_options(LineSettings, locals())
     recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
     seen = find_lines(recording, region, images, lines)
     widths = () if reflector is Reflector.bar else tuple(beam_mm or (1.0, 2.0, 3.0))
@@ -129,7 +129,7 @@ def calibrate_plane(
 @calibrate.command("orientation")
 def calibrate_orientation(
     images: Images,
-    out: Out,
+    out: CalibrationOut,
     poses: Poses = None,
     pixel_mm: PixelMm = None,
     level: Annotated[
@@ -154,10 +154,11 @@ def calibrate_orientation(
     as_json: Json = False,
 ) -> None:
     """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
+    from calibration.detection.lines import LineSettings
     from calibration.job import orientation_job
 
     require_free(out, images, poses, validation)
-    lines = _line_settings(columns, smoothing_mm, threshold, tolerance_mm, consensus, place)
+    lines = from_options(LineSettings, locals())
     recording, job = _prepared(images, poses, pixel_mm, sensor, time_offset, outlier_sigma)
     seen = find_lines(recording, region, images, lines)
     with naming(str(images)):
@@ -172,7 +173,7 @@ def calibrate_orientation(
 @calibrate.command("wires")
 def calibrate_wires(
     images: Images,
-    out: Out,
+    out: CalibrationOut,
     phantom: Annotated[str, typer.Option(help="cross, three, or a PLUS configuration of N-wires.")],
     points: Annotated[
         Path | None, typer.Option(help="CSV of points picked by hand: frame,column_px,row_px[,wire].")
@@ -195,6 +196,7 @@ def calibrate_wires(
 ) -> None:
     """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
     from calibration.job import crossing_job, wires_job
+    from speckle3d.core.wires import three_wires
     from speckle3d.io.plus_config import WireConfig, read_wire_phantom
 
     if validation is None and validation_points is not None:
@@ -211,7 +213,7 @@ def calibrate_wires(
         if phantom == "cross":
             outcome = crossing_job(recording, seen, job, not fixed_pixels)
         else:
-            geometry = _three_wires() if config is None else config.phantom
+            geometry = three_wires() if config is None else config.phantom
             outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, registration.value)
     notes = _nwire_notes(outcome, outcome.solution.points)
     if validation is not None:
@@ -219,37 +221,6 @@ def calibrate_wires(
         other_seen = _seen_wires(other, phantom, config, validation_points, region, validation)
         notes += _validated(outcome, other, other_seen, validation)
     _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
-
-
-def _three_wires() -> Any:
-    from speckle3d.core.wires import three_wires
-
-    return three_wires()
-
-
-def _line_settings(
-    columns: int | None,
-    smoothing_mm: float | None,
-    threshold: float | None,
-    tolerance_mm: float | None,
-    consensus: float | None,
-    place: str | None,
-) -> LineSettings:
-    from pydantic import ValidationError
-
-    from calibration.detection.lines import LineSettings
-
-    given = {
-        name: value
-        for name, value in locals().items()
-        if name in LineSettings.model_fields and value is not None
-    }
-    try:
-        return LineSettings(**given)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = str(first["loc"][0]).replace("_", "-")
-        raise InvalidInputError(f"--{name}: {first['msg']}, got {first['input']!r}") from None
 
 
 def _prepared(
@@ -272,7 +243,7 @@ def _prepared(
 
 
 def _seconds(text: str) -> float:
-    from speckle3d.io.headers import numbers
+    from speckle3d.io.text import numbers
 
     try:
         (seconds,) = numbers(text, 1, "--time-offset")
@@ -282,7 +253,7 @@ def _seconds(text: str) -> float:
 
 
 def _region(text: str | None) -> FloatArray | None:
-    """Polygon from "column,row column,row ..."."""
+    """Parse the polygon "column,row column,row ..."; shape (k, 2)."""
     import numpy as np
 
     if text is None:
@@ -299,7 +270,7 @@ def _region(text: str | None) -> FloatArray | None:
 def find_lines(
     recording: Recording, region: str | None, images: Path, settings: LineSettings | None = None
 ) -> Seen:
-    """Find the plane's line in every image, with a bar."""
+    """Find the plane's line in every image, showing progress."""
     from calibration.job import Seen
 
     corners = _region(region)
@@ -349,7 +320,7 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
 
 
 def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
-    """PLUS's 3-D error, where there are N-shapes."""
+    """Report PLUS's 3-D error, if the phantom has N-shapes."""
     from calibration.nwires import nwire_errors_mm, pixel_matrix
     from calibration.wires import Wires
 
@@ -367,31 +338,62 @@ def _finish(
     outcome: Outcome,
     seen: Seen,
     as_json: bool,
-    notes: list[str] | None = None,
+    notes: Sequence[str] = (),
     wire_names: tuple[str, ...] = (),
 ) -> None:
-    """Write the calibration, its table and its pictures, and print the table."""
-    from importlib.metadata import version
-
-    from calibration.report import figure_report, json_report, text_report
-    from speckle3d.core.calibration import Source
-    from speckle3d.io.calibrations import write_calibration
-    from speckle3d.io.hdf5 import atomic_path, sha256_of
+    """Write the calibration with its report, and the dots beside it."""
+    from calibration.report import figure_report
     from speckle3d.io.points import PickedPoints, write_points
-    from speckle3d.study.figures import save_figure
 
-    source = Source(str(images), sha256_of(images), version("speckle3d"))
-    result = replace(outcome.calibration, source=source)
-    told = list(notes or [])
+    told = list(notes)
     if outcome.offset is not None:
         found = outcome.offset
         told.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
-    table = text_report(result, outcome.beam, told)
-    write_calibration(out, result)
-    with atomic_path(out.with_suffix(".txt")) as part:
-        part.write_text(table, encoding="utf-8")
-    save_figure(figure_report(outcome.solution, result, outcome.shots), out.with_suffix(".png"))
     if not seen.are_lines:
         write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.marks_px, seen.wire), wire_names)
-    emit(json.dumps(json_report(result, outcome.beam) | {"notes": told}, indent=2) if as_json else table)
-    note(f"calibration in {out}, report in {out.with_suffix('.txt')} and {out.with_suffix('.png')}")
+    write_with_report(
+        outcome.calibration,
+        [images],
+        out,
+        lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
+        told,
+        outcome.beam,
+        as_json,
+    )
+
+
+@calibrate.command("repeatability")
+def calibrate_repeatability(
+    calibrations: Annotated[list[Path], typer.Argument(help="Calibration files of one mounting.")],
+    size_px: Annotated[
+        tuple[int, int] | None, typer.Option(help="Columns and rows of the image, for centre and corners.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare repeated calibrations: scatter of roll, yaw and tilt, and of the image's centre and corners."""
+    import numpy as np
+
+    from calibration.repeatability import repeatability
+    from speckle3d.io.calibrations import read_calibration
+
+    found = repeatability([read_calibration(path) for path in calibrations], size_px)
+    roll, yaw, tilt = (float(angle) for angle in np.rad2deg(found.roll_yaw_tilt_sd_rad))
+    if as_json:
+        table = {
+            "trials": found.trials,
+            "roll_yaw_tilt_sd_deg": [roll, yaw, tilt],
+            "centre_sd_mm": found.centre_sd_mm,
+            "corner_sd_mm": found.corner_sd_mm,
+            "centre_shift_mm": None if found.centre_shift_mm is None else found.centre_shift_mm.tolist(),
+        }
+        emit_json(table)
+        return
+    emit(f"standard deviation over {found.trials} calibrations")
+    emit(f"  roll {roll:.3f}, yaw {yaw:.3f}, tilt {tilt:.3f} deg")
+    if found.centre_shift_mm is None:
+        if size_px is None:
+            note("with --size-px COLUMNS ROWS also the scatter of the image's centre and corners")
+        return
+    emit(f"  centre {found.centre_sd_mm:.3f} mm, corners {found.corner_sd_mm:.3f} mm")
+    shifts = ", ".join(f"{shift:.2f}" for shift in found.centre_shift_mm)
+    emit(f"centre against the first calibration: {shifts} mm")

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import ConfigFile, Json, calibrate, emit, note, progress_bar
+from speckle3d.cli.common import (
+    ConfigFile,
+    Json,
+    calibrate,
+    emit,
+    emit_json,
+    load_settings,
+    note,
+    progress_bar,
+)
 
 
 @calibrate.command("curves")
@@ -19,21 +27,19 @@ def calibrate_curves(
     as_json: Json = False,
 ) -> None:
     """Measure decorrelation curves on phantom sweeps with known positions (/truth, or else /tracker)."""
-    from speckle3d.config import Config, load_config
     from speckle3d.io.curves import write_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.pipeline import calibrate_curves as measure
 
-    settings = load_config(config_file) if config_file else Config()
     with progress_bar("correlating phantom frames") as progress:
-        curves = measure([load_sweep(path) for path in phantoms], settings, progress)
+        curves = measure([load_sweep(path) for path in phantoms], load_settings(config_file), progress)
     write_curves(out, curves)
     half = [_half_distance(curves.distance_mm, row) for row in curves.correlation]
     if as_json:
         table = {"depth_mm": curves.depth_mm.tolist(), "half_mm": half, "cells": curves.cells.tolist()}
         if curves.tilt is not None:
             table |= {name: values.tolist() for name, values in vars(curves.tilt).items()}
-        emit(json.dumps(table | {"pairs": curves.pairs_used}, indent=2))
+        emit_json(table | {"pairs": curves.pairs_used})
         return
     emit(f"{curves.pairs_used} frame pairs; correlation falls to one half at")
     for depth, distance, cells in zip(curves.depth_mm, half, curves.cells, strict=True):

@@ -1,0 +1,179 @@
+"""Calibration files: written with their report beside them, and put on a sweep's sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from speckle3d.cli.common import emit, emit_json, note, require_own_place
+from speckle3d.core.errors import FileError, InvalidInputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calibration.beam import BeamBias
+    from speckle3d.core.calibration import Calibration
+    from speckle3d.core.sweep import ImageGrid, Sweep
+
+_BESIDE = (".txt", ".png", ".csv")
+"""What lies beside a calibration file: its table, its pictures, and the dots it was made from."""
+
+
+NOTED_SIZE = 0.01
+"""Relative difference of pixel sizes that is reported: 0.4 mm over an image of 40 mm."""
+
+NOTED_OFFSET_S = 0.001
+
+NOTED_DEG, NOTED_MM = 5.0, 10.0
+"""Difference of mountings that is reported: calibrations of one mounting differ by less."""
+
+
+def require_free(out: Path, *inputs: Path | None) -> None:
+    """Refuse to write a calibration over another kind of file, or its report over an input.
+
+    Raises
+    ------
+    FileError
+        If the place cannot be written.
+    InvalidInputError
+        If it is taken.
+    """
+    if out.suffix in _BESIDE:
+        raise InvalidInputError(
+            f"{out}: expected a calibration file, not {', '.join(_BESIDE)}, which are written beside it"
+        )
+    require_own_place(out, "a calibration", _is_calibration, *inputs)
+    beside = {out.with_suffix(suffix).resolve() for suffix in _BESIDE}
+    for path in inputs:
+        if path is not None and path.resolve() in beside:
+            raise InvalidInputError(f"{path}: would be overwritten by the results: give -o another name")
+
+
+def _is_calibration(path: Path) -> bool:
+    from speckle3d.io.calibrations import FORMAT
+    from speckle3d.io.load import kind_of
+
+    try:
+        return kind_of(path) == FORMAT
+    except (FileError, InvalidInputError):
+        return False
+
+
+def write_with_report(
+    calibration: Calibration,
+    inputs: Sequence[Path],
+    out: Path,
+    figure: Callable[[Calibration], Figure],
+    notes: Sequence[str],
+    beam: Sequence[BeamBias] = (),
+    as_json: bool = False,
+) -> None:
+    """Write a calibration, its table and its pictures, and print the table.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        Recordings it was made from, named in the file with their hashes.
+    figure : callable
+        Draws the pictures of the calibration as it was written.
+    notes : sequence of str
+        What else the table says.
+    """
+    from importlib.metadata import version
+
+    from calibration.report import json_report, text_report
+    from speckle3d.core.calibration import Source
+    from speckle3d.io.calibrations import write_calibration
+    from speckle3d.io.hdf5 import atomic_path, sha256_of
+    from speckle3d.study.figures import save_figure
+
+    names, hashes = (" ".join(map(of, inputs)) for of in (str, sha256_of))
+    named = replace(calibration, source=Source(names, hashes, version("speckle3d")))
+    table = text_report(named, beam, notes)
+    write_calibration(out, named)
+    text, pictures = out.with_suffix(".txt"), out.with_suffix(".png")
+    with atomic_path(text) as part:
+        part.write_text(table, encoding="utf-8")
+    save_figure(figure(named), pictures)
+    if as_json:
+        emit_json(json_report(named, beam) | {"notes": list(notes)})
+    else:
+        emit(table)
+    note(f"calibration in {out}, report in {text} and {pictures}")
+
+
+def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
+    """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
+    from speckle3d.io.calibrations import apply_calibrations, read_calibration
+
+    mounted, _ = apply_calibrations(sweep, paths)
+    for path in paths:
+        _note_differences(sweep, path, read_calibration(path))
+    return mounted
+
+
+def fitted_pixels(paths: Sequence[Path]) -> dict[str, float]:
+    """Return the pixel size of the first calibration that has one, as import settings of B-mode images."""
+    from speckle3d.io.calibrations import read_calibration
+
+    for path in paths:
+        pixel_mm = read_calibration(path).pixel_mm
+        if pixel_mm is not None:
+            return {"column_pitch_mm": float(pixel_mm[0]), "row_spacing_mm": float(pixel_mm[1])}
+    return {}
+
+
+def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
+    """Replace the pixel size of a sweep of B-mode images; names are those of the import settings."""
+    from speckle3d.core.sweep import BModeSettings
+
+    if not isinstance(sweep.signal, BModeSettings):
+        return sweep
+    grid = sweep.grid
+    column_mm = sizes.get("column_pitch_mm", grid.vector_pitch_mm)
+    row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
+    # Rows count from the probe's face, including those above the first stored row.
+    first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
+    resized = replace(
+        grid, vector_pitch_mm=column_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm
+    )
+    return replace(sweep, grid=resized)
+
+
+def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> None:
+    from speckle3d.core.calibration import pixel_difference
+
+    grid, pixel_mm = _image_grid(sweep), calibration.pixel_mm
+    if pixel_mm is not None and pixel_difference(grid, calibration) > NOTED_SIZE:
+        note(
+            f"{path}: found pixels of {pixel_mm[0]:.4g} x {pixel_mm[1]:.4g} mm, "
+            f"those of the sweep's images are {grid.vector_pitch_mm:.4g} x {grid.sample_spacing_mm:.4g} mm"
+            " and stay so"
+        )
+    sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
+    held_s, found_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
+    if held_s and found_s is not None and abs(found_s - held_s) > NOTED_OFFSET_S:
+        note(f"{path}: time offset {found_s:+.4f} s is used, not the sweep's {held_s:+.4f} s")
+    _note_mounting(sweep, path, calibration)
+
+
+def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
+    """Report a mounting that is far from the sweep's own."""
+    from speckle3d.core.calibration import mounting_difference
+
+    turned_deg, moved_mm = mounting_difference(sweep, calibration)
+    if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
+        moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""
+        note(
+            f"{path}: puts the image {turned_deg:.0f} degrees{moved} from where the sweep has it on the "
+            f"{calibration.sensor} sensor, and is used: is it of this mounting?"
+        )
+
+
+def _image_grid(sweep: Sweep) -> ImageGrid:
+    """Return the grid of the images, whose pixels a calibration counts; RF has more samples than they."""
+    from speckle3d.matching.intensity import IntensityExtractor
+
+    return IntensityExtractor.for_sweep(sweep).grid

@@ -1,0 +1,259 @@
+"""What a file holds, told in rows of description, value and unit.
+
+To add a kind of file, give `_DESCRIBERS` a function that tells its rows.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import h5py
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.calibration import Calibration, Parameter, readable
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
+from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
+from speckle3d.io.calibrations import read_calibration
+from speckle3d.io.hdf5 import PathLike, open_hdf5, reading
+from speckle3d.io.headers import read_header
+from speckle3d.io.load import IMAGE, kind_of
+from speckle3d.io.metaimage import image_orientation, image_type
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.sweeps import open_sweep
+
+Row = tuple[str, str, str]
+"""Description, value, unit."""
+
+_UNITS = ("mm", "s", "hz", "db", "rad", "m_s2", "m_s", "rad_s", "au")
+_UNIT_NAMES = {"hz": "Hz", "db": "dB", "m_s": "m/s", "m_s2": "m/s^2", "rad_s": "rad/s", "au": "a.u."}
+
+
+def describe(path: PathLike) -> list[Row]:
+    """Tell what a file holds as rows of description, value and unit.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is of no known kind, or what it holds is not valid.
+    """
+    kind = kind_of(path)
+    if kind not in _DESCRIBERS:
+        known = ", ".join(sorted(_DESCRIBERS))
+        raise InvalidInputError(f"{path}: expected a format among {known}, got {kind!r}")
+    rows = _DESCRIBERS[kind](path)
+    return rows if kind == IMAGE else [("format", kind, ""), *rows]
+
+
+def _describe_scan(path: PathLike) -> list[Row]:
+    marks = challenge.read_landmarks(path)
+    return [
+        *_sweep_rows(challenge.read_challenge_scan(path)),
+        ("landmarks", str(0 if marks is None else len(marks)), ""),
+    ]
+
+
+def _describe_sweep(path: PathLike) -> list[Row]:
+    with open_sweep(path) as sweep:
+        return _sweep_rows(sweep)
+
+
+def _sweep_rows(sweep: Sweep) -> list[Row]:
+    return [*_clock_rows(sweep), *_image_rows(sweep), *_signal_rows(sweep), *_sensor_rows(sweep)]
+
+
+def _clock_rows(sweep: Sweep) -> list[Row]:
+    return [("frames", str(len(sweep)), ""), *_rate_rows("", sweep.frame_time_s, "frames/s")]
+
+
+def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
+    span = float(times[-1] - times[0])
+    rows = [(f"{name} duration".strip(), f"{span:.3f}", "s")]
+    if times.size > 1:
+        rows.append((f"{name} rate".strip(), f"{(times.size - 1) / span:.2f}", unit))
+    return rows
+
+
+def _image_rows(sweep: Sweep) -> list[Row]:
+    grid = sweep.grid
+    return [
+        ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
+        ("sample type", str(sweep.frames.dtype), ""),
+        ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
+        ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
+        ("width", f"{grid.width_mm:.2f}", "mm"),
+        ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
+    ]
+
+
+def _signal_rows(sweep: Sweep) -> list[Row]:
+    signal = sweep.signal
+    if not isinstance(signal, RFSettings):
+        return [("signal", "B-mode", ""), ("dynamic range", f"{signal.dynamic_range_db:g}", "dB")]
+    low, high = (f"{edge / 1e6:g}" for edge in signal.bandwidth_hz)
+    return [
+        ("signal", "RF", ""),
+        ("sampling rate", f"{signal.sampling_rate_hz / 1e6:g}", "MHz"),
+        ("centre frequency", f"{signal.centre_frequency_hz / 1e6:g}", "MHz"),
+        ("band", f"{low} to {high}", "MHz"),
+        ("speed of sound", f"{signal.speed_of_sound_m_s:g}", "m/s"),
+    ]
+
+
+def _sensor_rows(sweep: Sweep) -> list[Row]:
+    rows: list[Row] = []
+    for name, sensor in (("orientation sensor", sweep.orientation), ("tracker", sweep.tracker)):
+        if sensor is None:
+            rows.append((name, "none", ""))
+            continue
+        covered = int(np.count_nonzero(sensor.covers(sweep.frame_time_s)))
+        rows += [
+            (name, str(len(sensor.readings)), "samples"),
+            *_rate_rows(name, sensor.readings.time_s, "samples/s"),
+            (f"{name} covers", str(covered), "frames"),
+            (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
+            (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
+        ]
+    return [*rows, ("truth", "no" if sweep.truth is None else "yes", "")]
+
+
+def _describe_reconstruction(path: PathLike) -> list[Row]:
+    result = read_reconstruction(path)
+    rows = [("frames", str(result.frame_time_s.size), "")]
+    rows += _rate_rows("", result.frame_time_s, "frames/s") if result.frame_time_s.size else []
+    rows += [(f"length, mode {mode}", f"{_length_mm(result, mode):.2f}", "mm") for mode in result.poses]
+    pairs = result.pairs
+    return [
+        *rows,
+        ("frame pairs", str(len(pairs) if pairs is not None else 0), ""),
+        ("patches", str(len(pairs.patch_centre_mm) if pairs is not None else 0), ""),
+        ("input", result.provenance.input_path, ""),
+        ("input SHA-256", result.provenance.input_sha256, ""),
+        ("package version", result.provenance.package_version, ""),
+        *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
+    ]
+
+
+def _length_mm(result: Reconstruction, mode: str) -> float:
+    """Elevational travel of the image's centre, summed from frame to frame."""
+    if result.frame_time_s.size < 2:
+        return 0.0
+    centre = result.grid.centre_mm
+    return float(abs((relative_poses(result.poses[mode]).apply(centre) - centre)[:, 2].sum()))
+
+
+def _describe_calibration(path: PathLike) -> list[Row]:
+    held = read_calibration(path)
+    offset = "unknown" if held.time_offset_s is None else f"{held.time_offset_s:+.4f}"
+    return [
+        ("method", held.method, ""),
+        ("sensor", held.sensor, ""),
+        *_mounting_rows(held),
+        *(_parameter_row(one) for one in held.parameters),
+        ("RMS residual", *readable(held.rms, held.rms_unit)),
+        ("condition number", f"{held.condition_number:.1f}", ""),
+        ("time offset", offset, "" if held.time_offset_s is None else "s"),
+        ("frames used", f"{len(held.frames.used)} of {held.frames.given}", ""),
+        *((f"dropped: {reason}", str(n), "frames") for reason, n in held.frames.reasons().items()),
+        ("verdict", held.verdict, ""),
+        ("input", held.source.input_path, ""),
+        ("input SHA-256", held.source.input_sha256, ""),
+        ("package version", held.source.package_version, ""),
+    ]
+
+
+def _mounting_rows(held: Calibration) -> list[Row]:
+    """Where the image is, angles in degrees, and how well that is known about and along the image's axes."""
+    angles = zip(("roll", "yaw", "tilt"), np.rad2deg(roll_yaw_tilt(held.rotation)), strict=True)
+    spread = np.sqrt(np.diag(held.covariance))
+    rows: list[Row] = [(f"sensor_from_image {name}", f"{angle:.3f}", "deg") for name, angle in angles]
+    if held.translation_mm is not None:
+        rows.append(("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
+    rows.append(("standard error, tilt, yaw, roll", _listed(np.rad2deg(spread[:3])), "deg"))
+    if held.translation_mm is not None:
+        rows.append(("standard error along the image's x, y, z", _listed(spread[3:]), "mm"))
+    if held.pixel_mm is not None:
+        rows.append(("pixel", " x ".join(f"{size:.5f}" for size in held.pixel_mm), "mm"))
+    return rows
+
+
+def _parameter_row(one: Parameter) -> Row:
+    name, value, unit = one.row()
+    return (f"parameter {name}", value, unit)
+
+
+def _listed(values: FloatArray) -> str:
+    return ", ".join(f"{value:.3f}" for value in values)
+
+
+def _describe_members(path: PathLike) -> list[Row]:
+    """Attributes and data sets as they are, for the smaller files of the family."""
+    rows: list[Row] = []
+
+    def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
+        rows.extend(_attribute_rows(name, node))
+        if isinstance(node, h5py.Dataset):
+            rows.append(_dataset_row(name, node))
+
+    with reading(path), open_hdf5(path) as file:
+        rows += [row for row in _attribute_rows("", file) if row[0] != "format"]
+        file.visititems(visit)
+    return rows
+
+
+def _attribute_rows(name: str, node: h5py.Group | h5py.Dataset) -> list[Row]:
+    return [_row(f"{name} {key}".strip(), value) for key, value in node.attrs.items()]
+
+
+def _dataset_row(name: str, node: h5py.Dataset) -> Row:
+    if node.shape == () and h5py.check_string_dtype(node.dtype) is None:
+        return _row(name, node[()])
+    shape = " x ".join(str(n) for n in node.shape or ()) or "text"
+    return (_spoken(name), shape, "values" if node.shape else "")
+
+
+def _row(name: str, value: object) -> Row:
+    text = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    return (_spoken(name), " ".join(text.split()), _unit(name))
+
+
+def _spoken(name: str) -> str:
+    return re.sub(rf"_({'|'.join(_UNITS)})$", "", name).replace("_", " ").replace("/", ", ")
+
+
+def _unit(name: str) -> str:
+    match = re.search(rf"_({'|'.join(_UNITS)})$", name)
+    return "" if match is None else _UNIT_NAMES.get(match[1], match[1])
+
+
+def _describe_header(path: PathLike) -> list[Row]:
+    header = read_header(path)
+    held = header.transforms
+    spacing = "unknown" if header.spacing_mm is None else " x ".join(f"{s:g}" for s in header.spacing_mm)
+    return [
+        ("format", header.file_format, ""),
+        ("size", " x ".join(str(n) for n in header.size), ""),
+        ("frames", str(header.frame_count), ""),
+        ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
+        ("image type", image_type(header), ""),
+        ("image orientation", image_orientation(header), ""),
+        ("sample type", header.fields.get("ElementType") or header.fields.get("type", ""), ""),
+        ("transforms", ", ".join(held) or "none", ""),
+        ("time stamps", "yes" if any("Timestamp" in f for f in header.frames) else "no", ""),
+    ]
+
+
+_DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
+    sweeps.FORMAT: _describe_sweep,
+    reconstructions.FORMAT: _describe_reconstruction,
+    curves.FORMAT: _describe_members,
+    calibrations.FORMAT: _describe_calibration,
+    challenge.FORMAT: _describe_scan,
+    IMAGE: _describe_header,
+}

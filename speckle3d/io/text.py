@@ -1,0 +1,43 @@
+"""Text files of numbers, read line by line so that an error names the file and the line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.hdf5 import PathLike, one_line
+
+
+def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
+    """Yield number, from 1, and text of every line of a file that holds more than blanks.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If its bytes are not UTF-8; a byte order mark, with which editors on Windows begin, is left out.
+    """
+    try:
+        with open(path, encoding="utf-8-sig") as stream:
+            for number, line in enumerate(stream, start=1):
+                if text := line.strip():
+                    yield number, text
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"{path}: expected text in UTF-8, got other bytes") from error
+
+
+def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
+    """Read finite numbers separated by blanks; `count` of them unless it is None."""
+    try:
+        values = tuple(float(word) for word in text.split())
+    except ValueError:
+        values = ()
+    if not values or (count is not None and len(values) != count) or not np.isfinite(values).all():
+        shown = text if len(text) <= 40 else f"{text[:37]}..."
+        raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
+    return values
