@@ -7,7 +7,7 @@ from scipy import ndimage
 def reslice_nearest(
     images, pitch_mm, spacing_mm, first_depth_mm, world_from_image, points_mm, max_distance_mm
 ):
-    """Twin of `speckle3d.kernels.reslicing.keep_nearest` and the blend: every image at every point at once.
+    """Twin of `speckle3d.kernels.slicing.keep_nearest` and the blend: every image at every point at once.
 
     points_mm: (..., 3) in the world; images facing one way. Returns (...,) with NaN where unsupported.
     """

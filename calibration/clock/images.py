@@ -22,16 +22,15 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock.line import SEARCH_S, Delay
-from calibration.clock.pairing import covered
+from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around
 from calibration.clock.peak import SIGMAS, STEP_S, clear_peak, curves_at, doubts, half_width, mean_of, placed
-from calibration.images.stacks import TrackedImages
+from calibration.images.stacks import TrackedImages, block_means
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import ChosenImages, GreyArray, Images
-from speckle3d.imaging.reslice import image_plane, reslice_frames
+from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.3
 """Of the compared images: finer than the beam, so that speckle tells too, which the way back shows again."""
@@ -63,7 +62,7 @@ def delay_from_images(
     search_s: float = SEARCH_S,
     queries: int = FINE,
     progress: Callable[[int, int], None] | None = None,
-) -> Delay:
+) -> ClockOffset:
     """Find the delay at which images of the way there look like reslices of the way back.
 
     Parameters
@@ -97,8 +96,7 @@ def delay_from_images(
         ways = tuple(_way(there, each, number) for each in part)
         return _Likeness(pooled, frame_time_s, steady, sensor_from_image, ways)
 
-    steps = np.arange(-round(search_s / STEP_S), round(search_s / STEP_S) + 1)
-    tried = np.asarray(around_s + steps * STEP_S, dtype=np.float64)
+    tried = delays_around(around_s, search_s, STEP_S)
     tried, curves = curves_at(likeness(min(COARSE, queries)), tried, progress)
     misfit = np.array([1.0 - mean_of(each) for each in curves])
     best = clear_peak(tried, curves, misfit, search_s)
@@ -124,7 +122,7 @@ def delay_from_images(
             f"expected readings that tell the delay, got {seconds:+.3f} s +- {error:.3g} s from their jitter "
             f"alone, no better than the {search_s:g} s searched: move the probe faster"
         )
-    return Delay(seconds, error, 1.0 - float(near.fun), tried, misfit)
+    return ClockOffset(seconds, error, 1.0 - float(near.fun))
 
 
 class _Pooled:
@@ -147,9 +145,7 @@ class _Pooled:
     def __getitem__(self, index: int) -> GreyArray:
         if index not in self._kept:
             image = self._images(index) if callable(self._images) else self._images[index]
-            (across, down), grid = self._by, self.grid
-            part = np.asarray(image, dtype=np.float32)[: grid.vectors * across, : grid.samples * down]
-            self._kept[index] = part.reshape(grid.vectors, across, grid.samples, down).mean(axis=(1, 3))
+            self._kept[index] = block_means(np.asarray(image, dtype=np.float32), self._by)
         return self._kept[index]
 
 
@@ -166,13 +162,9 @@ class _Likeness:
     ) -> None:
         self._images, self._times, self._readings = images, frame_time_s, readings
         self._mounting, self._ways = sensor_from_image, ways
-        plane = image_plane(RigidTransform.identity(), images.grid, PIXEL_MM)
-        alone = RigidTransform.identity(1)
         # An image in its own plane is the same whatever the delay.
         self._own = {
-            int(k): reslice_frames(ChosenImages(images, np.array([k])), images.grid, alone, plane, 1.0)
-            for way in ways
-            for k in way.queries
+            int(k): resample_image(images, int(k), images.grid, PIXEL_MM) for way in ways for k in way.queries
         }
 
     def __call__(self, delay_s: float) -> FloatArray:

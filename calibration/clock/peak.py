@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calibration.clock.line import require_peak
+from calibration.clock.offset import require_peak
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 

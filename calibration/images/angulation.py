@@ -199,6 +199,11 @@ def angulation(
     )
 
 
+def point_motion(local_mm: FloatArray) -> FloatArray:
+    """How points of the image move with its turns and shifts, in its frame, shape (p, 3) to (p, 3, 6)."""
+    return np.concatenate([-skew(local_mm), np.broadcast_to(np.eye(3), (len(local_mm), 3, 3))], axis=2)
+
+
 def _grid(corners_mm: FloatArray) -> FloatArray:
     low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
     # The middles of cells, so that each point stands for the same area.
@@ -240,7 +245,7 @@ def _disagreements(
         local = seen[nearest, np.arange(len(points))]
         there = other.as_matrix()[nearest][:, :3, :3]
         here = one[frame].rotation.as_matrix()
-        block = there @ _moves(local - centre) - here @ _moves(points - centre)
+        block = there @ point_motion(local - centre) - here @ point_motion(points - centre)
         block[~passes] = np.nan
         blocks.append(block)
         inside.append(passes & (np.abs(local - centre)[:, :2] <= half[:2] + 1e-9).all(axis=1))
@@ -252,11 +257,6 @@ def _passing(distance_mm: FloatArray) -> tuple[npt.NDArray[np.int64], BoolArray]
     nearest = np.abs(distance_mm).argmin(axis=0)
     passes = (distance_mm.min(axis=0) <= 0.0) & (distance_mm.max(axis=0) >= 0.0)
     return nearest, np.asarray(passes)
-
-
-def _moves(local_mm: FloatArray) -> FloatArray:
-    """d(point)/d(turns, shifts) in the image's frame, shape (p, 3, 6)."""
-    return np.concatenate([-skew(local_mm), np.broadcast_to(np.eye(3), (len(local_mm), 3, 3))], axis=2)
 
 
 def _with_others_free(information: FloatArray) -> FloatArray:

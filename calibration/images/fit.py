@@ -1,20 +1,28 @@
-"""Gauss-Newton on the correlation of patches, robust against those that differ from view to view.
+"""Gauss-Newton on the correlation of patches, Newton's last steps, and the covariance of the answer.
 
 The patch and its cut, both without their mean and of unit length, differ by a vector whose squared length is
 2 (1 - correlation); its derivative gives Gauss-Newton its matrix, and the exact derivative of the correlation
-its gradient. A patch that stays unlike counts less and less (Geman and McClure), one without structure too.
+its gradient. A patch that stays unlike, or has little structure, counts less (Geman and McClure).
+
+Gauss-Newton's matrix is made of the images' squared slopes, in which the slopes of speckle count in full
+although the similarity does not fall off by them: where speckle is strong it is several times too stiff, its
+steps too short, and errors made from it too small. Differences of the exact slopes are free of that, so they
+give the last steps and the covariance.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.images.angulation import PARAMETERS, point_motion
 from calibration.images.similarity import Comparison, Likeness
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
 ROBUST = 0.5
@@ -27,6 +35,31 @@ LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
 
 SETTLED = 2e-3
 """Step of the image's edge, mm, at which to stop: a hundredth of what speckle lets be known."""
+
+APART_MM = 0.3
+"""How far the image's edge is moved to either side for a difference: less than the blur of speckle."""
+
+LEAST_CURVATURE = 0.02
+"""Of Gauss-Newton's, what a direction keeps in which the similarity hardly falls, or rises; in scenes that
+tell it is 0.1 to 0.7. Errors along it are then so large that it is seen to be open."""
+
+_MOST_STEPS, _LONGEST_MM = 8, 1.0
+"""Steps, and how far one may move the image's edge: beyond the blur of speckle the curvature is another."""
+
+BLOCK_MM = 16.0
+"""Side of the blocks of tissue that err together, in units of the images' size: some patches wide, as
+neighbours see the same reflections."""
+
+STRETCH = 3
+"""Images compared that err together: a tracker's error lasts from one to the next."""
+
+SHARED_RAD = np.deg2rad(0.1)
+SHARED_MM = (0.03, 0.1, 0.04)
+"""Standard deviations, turns and displacements of the image's centre across, along the beam and out of plane,
+of what all of the tissue shares and no part of it can show: root mean squares of what was left over six
+simulated pairs of sweeps, whatever the start. A thick beam shows what is beside it deeper than it is."""
+
+NAMES = (*PARAMETERS, "lateral pixel size", "axial pixel size")
 
 
 @dataclass(frozen=True)
@@ -163,3 +196,145 @@ def better(here: Likeness, there: Likeness, weight: FloatArray) -> bool:
     # The weight of structure alone: how unlike a patch is, is in the loss.
     base = weight[both] * ((ROBUST + 1.0 - here.alike[both]) / ROBUST) ** 2
     return bool(base @ loss[1] < base @ loss[0])
+
+
+@dataclass(frozen=True)
+class Settled:
+    """An answer, and how fast the similarity falls about it.
+
+    Attributes
+    ----------
+    curvature : ndarray, shape (f, f)
+        Of the weighted similarity, by the free parameters at the pivot; positive definite.
+    """
+
+    refined: Refined
+    curvature: FloatArray
+
+
+def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
+    """Newton's steps from where Gauss-Newton stopped, all with the curvature found there."""
+    bend = curvature(refined, pool)
+    now, converged = refined, False
+    for _ in range(_MOST_STEPS):
+        step = np.zeros(len(LEVERS_MM))
+        step[list(now.free)] = np.linalg.solve(bend, now.system[1])
+        size = float(np.abs(step * LEVERS_MM).max())
+        converged = size < SETTLED
+        if converged:
+            break
+        moved = _stepped(now, step * min(1.0, _LONGEST_MM / size), pool)
+        if not better(now.likeness, moved.likeness, now.weight):
+            converged = size < 10.0 * SETTLED  # no better within rounding
+            break
+        now = moved
+    return Settled(replace(now, converged=converged), bend)
+
+
+def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> FloatArray:
+    """Differences of the similarity's slope to either side of an answer, shape (f, f)."""
+    chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
+    found = np.empty((len(chosen), len(chosen)))
+    for column, parameter in enumerate(chosen):
+        slopes = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(len(LEVERS_MM))
+            step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
+            there = refined.estimate.stepped(step, refined.pivot_mm)
+            seen = refined.comparison.at(there.sensor_from_image, there.scales, True, pool)
+            weight = np.where(seen.valid, refined.weight, 0.0)
+            slopes.append((base.T @ (weight @ seen.gradient))[chosen])
+        found[:, column] = (slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM)
+    return _positive(found, refined.system[0])
+
+
+def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None) -> Refined:
+    estimate = refined.estimate.stepped(step, refined.pivot_mm)
+    seen = refined.comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
+    count = refined.evaluations + 1
+    return replace(refined, estimate=estimate, likeness=seen, weight=weights(seen), evaluations=count)
+
+
+def _positive(found: FloatArray, normal: FloatArray) -> FloatArray:
+    """Symmetric, and in no direction less than a small part of Gauss-Newton's matrix."""
+    firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
+    part, axes = eigh((found + found.T) / 2.0, firm)
+    back = firm @ axes
+    return np.asarray((back * np.maximum(part, LEAST_CURVATURE)) @ back.T)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Covariance of turns, displacements and relative pixel sizes at the image's origin, shape (8, 8)."""
+
+    covariance: FloatArray
+    condition_number: float
+    weakest: str
+
+
+def covariance_at_origin(settled: Settled, unit: float) -> Spread:
+    """Sandwich of the curvature and of how slopes differ between blocks of tissue and stretches of sweeps.
+
+    What differs from block to block of tissue (speckle, reflections) and from image to image (poses) adds up.
+    Poses count twice: those of the images compared, and those of the images cut, of which there are as many.
+    What all of the tissue shares is added (`SHARED_MM`).
+
+    Parameters
+    ----------
+    unit : float
+        Size of the images relative to the usual.
+
+    References
+    ----------
+    .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 5th
+       Berkeley Symposium on Mathematical Statistics and Probability, 1967.
+    """
+    refined = settled.refined
+    chosen = np.array(refined.free)
+    base = about_pivot(refined.pivot_mm)[:, chosen]
+    slopes = (refined.weight[:, None] * refined.likeness.gradient) @ base
+    norms = np.sqrt(np.diag(settled.curvature))
+    values, vectors = np.linalg.eigh(settled.curvature / np.outer(norms, norms))
+    condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
+    tissue = _scatter(slopes, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
+    poses = _scatter(slopes, _numbered(np.column_stack(_stretches(refined))))
+    moved = base @ np.linalg.inv(settled.curvature)
+    covariance = moved @ (tissue + 2.0 * poses) @ moved.T + _shared(refined.pivot_mm, unit)
+    return Spread(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]])
+
+
+def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
+    """Covariance at the origin of what no part of the tissue can show; pixel sizes have none."""
+    variance = np.concatenate([np.full(3, SHARED_RAD), unit * np.array(SHARED_MM), np.zeros(2)]) ** 2
+    base = about_pivot(pivot_mm)
+    return np.asarray(base @ np.diag(variance) @ base.T)
+
+
+def _scatter(slopes: FloatArray, cluster: IntArray) -> FloatArray:
+    """Covariance of the sum of patches' slopes, if those of one cluster err together."""
+    count = int(cluster.max()) + 1
+    if count < 2:
+        raise InsufficientDataError(
+            "expected sweeps that share more tissue, got too little to compare its parts"
+        )
+    sums = np.zeros((count, slopes.shape[1]))
+    np.add.at(sums, cluster, slopes)
+    sums -= sums.mean(axis=0)
+    return np.asarray(count / (count - 1.0) * sums.T @ sums)
+
+
+def _numbered(cells: FloatArray) -> IntArray:
+    """Number of each patch's cell, from zero."""
+    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
+
+
+def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
+    """Sweep, and stretch of it, that each patch's image belongs to."""
+    sweep, image = refined.comparison.images.T
+    return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
+
+
+def point_covariance(covariance: FloatArray, point_mm: FloatArray) -> FloatArray:
+    """Covariance of a point of the image from that of its pose at the image's origin, shape (3, 3)."""
+    moved = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
+    return np.asarray(moved @ covariance @ moved.T)

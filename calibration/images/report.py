@@ -1,8 +1,15 @@
-"""A calibration from two crossing sweeps in pictures: images beside reslices, before and after; curves."""
+"""A calibration from two crossing sweeps in pictures: images beside reslices, similarity about the answer.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging 6920, 2008.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +19,109 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.angulation import PARAMETERS, Angulation, displacement_mm
-from calibration.images.curves import AXES, SimilarityCurves, SimilarityMap
+from calibration.images.fit import Estimate
+from calibration.images.search import incremented
+from calibration.images.similarity import CrossingSweeps
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.images import ChosenImages, GreyArray
-from speckle3d.imaging.reslice import image_plane, reslice_frames
+from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.15
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _REACH_MM = 1.5
+
+IMAGES, SIGMA_MM = 10, 1.0
+"""Images of each sweep, and their blur, in the similarity curves."""
+
+
+@dataclass(frozen=True)
+class SimilarityCurves:
+    """Mean correlation of images with cuts of the other sweep, one parameter moved at a time.
+
+    Attributes
+    ----------
+    offset : ndarray, shape (k,)
+        Degrees for the first three axes, mm for the others.
+    similarity : ndarray, shape (6, k)
+        By `PARAMETERS`; NaN where no image overlaps the other sweep by three tenths.
+    """
+
+    offset: FloatArray
+    similarity: FloatArray
+
+
+@dataclass(frozen=True)
+class SimilarityMap:
+    """Mean correlation with two parameters moved at once, shape (k, k), the first along the first axis."""
+
+    axes: tuple[str, str]
+    offset: FloatArray
+    similarity: FloatArray
+
+
+def similarity_curves(
+    crossing: CrossingSweeps,
+    sensor_from_image: RigidTransform,
+    span: float = 10.0,
+    points: int = 21,
+    scales: FloatArray | None = None,
+    threads: int = 2,
+) -> SimilarityCurves:
+    """Similarity from -`span` to `span` mm or degrees about a calibration, along each of `PARAMETERS`.
+
+    Parameters move the image at its origin, not about its centre.
+    """
+    offset = _offsets(span, points)
+    steps = (step * np.eye(6)[axis] for axis in range(6) for step in offset)
+    found = _similarities(crossing, _estimate(sensor_from_image, scales), steps, threads)
+    return SimilarityCurves(offset, found.reshape(6, points))
+
+
+def similarity_map(
+    crossing: CrossingSweeps,
+    sensor_from_image: RigidTransform,
+    axes: tuple[str, str],
+    span: float = 10.0,
+    points: int = 21,
+    scales: FloatArray | None = None,
+    threads: int = 2,
+) -> SimilarityMap:
+    """Similarity over two parameters, named as in `PARAMETERS`."""
+    for name in axes:
+        if name not in PARAMETERS:
+            raise InvalidInputError(f"axes: expected two of {', '.join(PARAMETERS)}, got {name!r}")
+    offset = _offsets(span, points)
+    one, other = (np.eye(6)[PARAMETERS.index(name)] for name in axes)
+    steps = (a * one + b * other for a in offset for b in offset)
+    found = _similarities(crossing, _estimate(sensor_from_image, scales), steps, threads)
+    return SimilarityMap(axes, offset, found.reshape(points, points))
+
+
+def _similarities(
+    crossing: CrossingSweeps, about: Estimate, steps: Iterator[FloatArray], threads: int
+) -> FloatArray:
+    comparison = crossing.whole(SIGMA_MM, IMAGES, about.sensor_from_image)
+
+    def at(step: FloatArray) -> float:
+        moved = incremented(about, step)
+        return comparison.at(moved.sensor_from_image, moved.scales).mean
+
+    with ThreadPoolExecutor(threads) as pool:
+        return np.array(list(pool.map(at, steps)))
+
+
+def _offsets(span: float, points: int) -> FloatArray:
+    if not (np.isfinite(span) and span > 0 and points >= 2):
+        raise InvalidInputError(
+            f"expected a span above zero and at least two points, got {span:g} and {points}"
+        )
+    return np.linspace(-span, span, points)
+
+
+def _estimate(sensor_from_image: RigidTransform, scales: FloatArray | None) -> Estimate:
+    return Estimate(sensor_from_image, np.ones(2) if scales is None else scales)
 
 
 @dataclass(frozen=True)
@@ -55,8 +156,7 @@ def pictures(
         plane = image_plane(sensor * mounting, grid, PIXEL_MM)
         source = ChosenImages(other.images, frames)
         cuts.append(reslice_frames(source, other.grid, poses, plane, _reach_mm(poses)))
-    alone, flat = RigidTransform.identity(1), image_plane(RigidTransform.identity(), grid, PIXEL_MM)
-    own = reslice_frames(ChosenImages(shown.images, np.array([frame])), grid, alone, flat, 1.0)
+    own = resample_image(shown.images, frame, grid, PIXEL_MM)
     height = grid.depth_mm - grid.first_sample_depth_mm
     return Pictures(own, cuts[0], cuts[1], grid.width_mm, height, f"{shown.name}, frame {frame}")
 
@@ -90,7 +190,7 @@ def figure_images(
             _draw_image(axes, image, each, what)
     for axes, first, unit in ((panels[rows, 0], 3, "mm"), (panels[rows, 1], 0, "degrees")):
         for k, colour in zip(range(first, first + 3), _COLOURS, strict=True):
-            axes.plot(curves.offset, curves.similarity[k], color=colour, label=AXES[k])
+            axes.plot(curves.offset, curves.similarity[k], color=colour, label=PARAMETERS[k])
         _label(axes, f"off the answer / {unit}", "mean correlation")
         axes.legend(fontsize=8)
     _draw_strength(panels[rows, 2], angulation)

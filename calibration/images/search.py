@@ -1,4 +1,13 @@
-"""From a start far off into the reach of Gauss-Newton: many cheap looks, the best followed up."""
+"""Two ways from a rough start to a calibration: a search of a whole box, and the published Nelder-Mead.
+
+The search looks at many places at a coarse resolution, and follows the best of them up with Gauss-Newton at
+finer and finer ones.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging, 2008, section 2.2 (Nelder-Mead).
+"""
 
 from __future__ import annotations
 
@@ -6,11 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
-from calibration.images.crossing import Crossing, Level, Progress
 from calibration.images.fit import Estimate, Refined, refine
+from calibration.images.similarity import CrossingSweeps, Level, Progress
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -35,23 +45,33 @@ _STEPS = 12
 
 _SAME_MM = 1.5
 
+PUBLISHED_IMAGES = 8
+"""Of each sweep; published: 5 to 10."""
+
+MAX_EVALUATIONS = 1500
+"""Of Nelder-Mead."""
+
+_SIMPLEX_EDGE = 10.0
+"""Edges of the first simplex, mm and degrees: half of the displacements it is to recover from."""
+
 
 @dataclass(frozen=True)
-class Found:
-    """Where the search ended, and in how many comparisons."""
+class Located:
+    """Where the search or the simplex ended, and after how many comparisons."""
 
     estimate: Estimate
     evaluations: int
+    converged: bool = True
 
 
 def search(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     start: Estimate,
     capture_mm: float,
     capture_rad: float,
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
-) -> Found:
+) -> Located:
     """Look all over a box of six parameters about the start.
 
     Raises
@@ -88,11 +108,50 @@ def search(
     decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
-    return Found(decided[0].estimate, looks)
+    return Located(decided[0].estimate, looks)
+
+
+def climb(
+    crossing: CrossingSweeps,
+    start: Estimate,
+    scales: bool,
+    pool: ThreadPoolExecutor,
+    progress: Progress | None = None,
+) -> Located:
+    """Maximise over an increment of Euler angles and translation that starts at zero and multiplies right."""
+    comparison = crossing.published(PUBLISHED_IMAGES)
+    count = 0
+
+    def unlike(increment: FloatArray) -> float:
+        nonlocal count
+        count += 1
+        if progress:
+            progress("simplex", count, MAX_EVALUATIONS)
+        at = incremented(start, increment)
+        mean = comparison.at(at.sensor_from_image, at.scales, pool=pool).mean
+        return 1.0 - mean if np.isfinite(mean) else 2.0
+
+    size = 8 if scales else 6
+    corners = np.vstack([np.zeros(size), np.diag([_SIMPLEX_EDGE] * 6 + [2.0] * (size - 6))])
+    found = minimize(
+        unlike,
+        np.zeros(size),
+        method="Nelder-Mead",
+        options={"initial_simplex": corners, "xatol": 0.02, "fatol": 1e-5, "maxfev": MAX_EVALUATIONS},
+    )
+    return Located(incremented(start, found.x), int(found.nfev), bool(found.success))
+
+
+def incremented(start: Estimate, increment: FloatArray) -> Estimate:
+    """Right-multiply an increment: Euler angles about x, y, z in degrees, mm; then scales in per cent."""
+    turn = Rotation.from_euler("xyz", increment[:3], degrees=True)
+    moved = start.sensor_from_image * RigidTransform.from_components(increment[3:6], turn)
+    scales = start.scales * (1.0 + 0.01 * increment[6:8]) if len(increment) > 6 else start.scales
+    return Estimate(moved, scales)
 
 
 def _glanced(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     start: Estimate,
     count: int,
     capture_mm: float,
@@ -112,7 +171,7 @@ def _glanced(
 
 
 def _beside(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     about: list[Refined],
     capture_mm: float,
     capture_rad: float,
@@ -144,7 +203,7 @@ def _spread(first: RigidTransform, capture_mm: float, capture_rad: float, count:
 
 
 def _refined(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     level: Level,
     starts: list[Estimate],
     pool: ThreadPoolExecutor,
@@ -168,7 +227,7 @@ def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_r
     return bool(length <= far * capture_mm + 1.0 and angle <= far * capture_rad + 0.02)
 
 
-def _distinct(found: list[Refined], crossing: Crossing) -> list[Estimate]:
+def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:
     """Estimates, less those that came to the same place as a better one."""
     kept: list[Estimate] = []
     for one in found:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -200,7 +199,7 @@ def read_stack(
         )
     images = np.empty(shape, np.float32)
     for n, frame in enumerate(frames):
-        images[n] = _binned(source.read(int(frame)), bins, shape[1:])
+        images[n] = block_means(source.read(int(frame)), (int(bins[0]), int(bins[1])))
         if progress:
             progress(n + 1, len(frames))
     still = ~(np.ptp(images, axis=0) > 0)
@@ -224,11 +223,13 @@ def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
     return RigidTransform.identity(len(tracked.frame_time_s))
 
 
-def _binned(image: GreyArray, bins: npt.NDArray[np.int_], shape: tuple[int, int]) -> GreyArray:
-    """Means over blocks of pixels; NaN where any of them is."""
-    whole = image[: shape[0] * bins[0], : shape[1] * bins[1]]
-    blocks = whole.reshape(shape[0], bins[0], shape[1], bins[1])
-    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
+def block_means(image: GreyArray, by: tuple[int, int]) -> GreyArray:
+    """Means over whole blocks of `by` pixels, those left over at the far edges dropped; NaN where any is."""
+    from skimage.transform import downscale_local_mean
+
+    across, down = by
+    whole = image[: image.shape[0] // across * across, : image.shape[1] // down * down]
+    return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)  # type: ignore[no-untyped-call]
 
 
 def _weighted(images: GreyArray, weight: FloatArray) -> GreyArray:

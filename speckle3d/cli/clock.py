@@ -16,7 +16,7 @@ from speckle3d.cli.phantoms import Images, PixelMm, Poses, Region, find_lines
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
-    from calibration.clock.line import Delay
+    from calibration.clock.offset import ClockOffset
     from speckle3d.core.calibration import Calibration
 
 
@@ -98,7 +98,7 @@ def _by_line(
     sensor: str,
     region: str | None,
     search_s: float,
-) -> tuple[Delay, int]:
+) -> tuple[ClockOffset, int]:
     """The delay, and in how many frames a line was found."""
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from speckle3d.cli.recordings import open_recording, require_unsized
@@ -124,7 +124,7 @@ def _by_images(
     pixel_mm: tuple[float, float] | None,
     known: Calibration | None,
     search_s: float,
-) -> tuple[Delay, int]:
+) -> tuple[ClockOffset, int]:
     """The delay, and how many frames there were."""
     from calibration.clock.images import delay_from_images
     from speckle3d.cli.recordings import open_tracked, require_unsized

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from speckle3d.core.errors import FileError
+from speckle3d.core.errors import FileError, InvalidInputError
 
 app = typer.Typer(
     name="speckle3d",
@@ -40,6 +40,19 @@ def progress_bar(what: str) -> Iterator[Any]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def naming_options() -> Iterator[None]:
+    """Say of settings that pydantic refuses which command-line option they came from."""
+    from pydantic import ValidationError
+
+    try:
+        yield
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"]).replace("_", "-")
+        raise InvalidInputError(f"--{name}: {first['msg']}, got {first['input']!r}") from None
 
 
 def note(text: str) -> None:

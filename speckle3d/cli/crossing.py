@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, calibrate, emit, note, progress_bar
+from speckle3d.cli.common import Json, calibrate, emit, naming_options, note, progress_bar
 from speckle3d.cli.outputs import require_free
 from speckle3d.cli.phantoms import Out, PixelMm
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
@@ -19,10 +19,9 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, nami
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
-    from calibration.clock.line import Delay
+    from calibration.clock.offset import ClockOffset
     from calibration.images.angulation import Angulation
-    from calibration.images.results import Found
-    from calibration.images.solver import ImageSettings
+    from calibration.images.solver import ImageCalibration, ImageSettings
     from calibration.images.stacks import TrackedImages
     from speckle3d.core.calibration import Calibration
 
@@ -94,7 +93,10 @@ def calibrate_images(
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
-    settings = ImageSettings(method.value, scales, capture_mm, capture_deg)
+    with naming_options():
+        settings = ImageSettings(
+            method=method.value, scales=scales, capture_mm=capture_mm, capture_deg=capture_deg
+        )
     given = _open(first, second, readings, pixel_mm, time_offset_s, clock, start, start_mm, start_deg)
     if (far := math.hypot(*given.start.translation)) > _FAR_MM:
         note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")
@@ -103,13 +105,13 @@ def calibrate_images(
     found = _solve(given.sweeps, given.start, settings)
     delay = None
     if given.clock is not None:
-        delay = _clock(clock, given.clock, found.result.sensor_from_image)
+        delay = _clock(clock, given.clock, found.sensor_from_image)
         note(f"sensor clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s; solving again")
         sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
         given = replace(given, sweeps=(sweeps[0], sweeps[1]))
-        found = _solve(given.sweeps, found.result.sensor_from_image, settings)
+        found = _solve(given.sweeps, found.sensor_from_image, settings)
     # The start said how the sweeps turn; only the answer says what they share.
-    enough = _angulation(given.sweeps, found.result.sensor_from_image)
+    enough = _angulation(given.sweeps, found.sensor_from_image)
     _finish((first, second), out, given, found, enough, delay, as_json)
 
 
@@ -188,16 +190,14 @@ def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransfo
 
 def _solve(
     sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageSettings
-) -> Found:
-    from calibration.images.results import solve
+) -> ImageCalibration:
+    from calibration.images.solver import calibrate_images as solve
 
     with progress_bar("comparing sweeps") as bar:
-        return solve(
-            *sweeps, start, settings, None if bar is None else lambda _stage, done, of: bar(done, of)
-        )
+        return solve(*sweeps, start, settings, lambda _stage, done, of: bar(done, of))
 
 
-def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> Delay:
+def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> ClockOffset:
     from calibration.clock.images import delay_from_images
 
     with progress_bar("trying delays") as progress, naming(str(path)):
@@ -208,15 +208,15 @@ def _finish(
     paths: tuple[Path, Path],
     out: Path,
     given: _Inputs,
-    found: Found,
+    found: ImageCalibration,
     enough: Angulation,
-    delay: Delay | None,
+    delay: ClockOffset | None,
     as_json: bool,
 ) -> None:
     """Write the calibration, its table and its pictures, and print the table."""
     from importlib.metadata import version
 
-    from calibration.images.results import as_calibration, figure_of, notes_of
+    from calibration.images.results import calibration_from_images, figure_of, notes_of
     from calibration.report import json_report, text_report
     from speckle3d.core.calibration import Source
     from speckle3d.io.calibrations import write_calibration
@@ -225,7 +225,8 @@ def _finish(
 
     names, hashes = (" ".join(map(of, paths)) for of in (str, sha256_of))
     result = replace(
-        as_calibration(found, enough, given.sweeps), source=Source(names, hashes, version("speckle3d"))
+        calibration_from_images(found, enough, given.sweeps),
+        source=Source(names, hashes, version("speckle3d")),
     )
     told = notes_of(found, enough)
     if delay is not None:

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, progress_bar
+from speckle3d.cli.common import Json, app, emit, naming_options, progress_bar
 from speckle3d.cli.mounting import CalibrationFiles, fitted_pixels, mount, resize
-from speckle3d.core.errors import InvalidInputError
 
 
 @app.command()
@@ -77,21 +76,13 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
-    from pydantic import ValidationError
-
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings
     from speckle3d.simulation.presets import simulate as prepare
 
     given = {k: v for k, v in locals().items() if k in SimulationSettings.model_fields and v is not None}
-    try:
+    with naming_options():
         settings = SimulationSettings(**given)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise InvalidInputError(
-            f"--{name.replace('_', '-')}: {first['msg']}, got {first['input']!r}"
-        ) from None
     for number, simulated in enumerate(prepare(settings)):
         path = out if number == 0 else out.with_name(f"{out.stem}-crossing{out.suffix}")
         with progress_bar(f"simulating {path.name}") as progress:

@@ -18,7 +18,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses
+from speckle3d.imaging.images import ChosenImages, GreyArray, Images, PosedImages, require_poses
 
 MAX_PIXELS = 100_000_000
 """Largest reslice made: above it a unit is wrong somewhere (at 0.01 mm this is 100 mm x 100 mm)."""
@@ -128,7 +128,7 @@ def reslice_frames(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    from speckle3d.kernels.reslicing import keep_nearest
+    from speckle3d.kernels.slicing import keep_nearest
 
     if not (np.isfinite(max_distance_mm) and max_distance_mm > 0):
         raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {max_distance_mm}")
@@ -150,6 +150,18 @@ def reslice_frames(
             images_read = [source.read(int(index)) for index in batch]
             list(pool.map(fill, bands))
     return np.concatenate([_blend(band.distance_mm, band.grey) for band in bands])
+
+
+def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> GreyArray:
+    """One image on square pixels, as a reslice through its own plane shows it.
+
+    Returns
+    -------
+    ndarray of float32, shape (rows, columns)
+    """
+    plane = image_plane(RigidTransform.identity(), grid, pixel_mm)
+    alone = ChosenImages(images, np.array([frame]))
+    return reslice_frames(alone, grid, RigidTransform.identity(1), plane, 1.0)
 
 
 def reslice_volume(volume: Volume, plane: ReslicePlane) -> GreyArray:

@@ -147,9 +147,9 @@ def test_help_says_how_the_sign_relates_to_that_of_plus(run):
 
 def test_what_is_printed_for_machines_is_json_even_if_numbers_are_not(run, back, monkeypatch):
     from calibration.clock import images as clock_images
-    from calibration.clock.line import Delay
+    from calibration.clock.offset import ClockOffset
 
-    odd = Delay(0.0, float("inf"), 1.0, np.zeros(1), np.zeros(1))
+    odd = ClockOffset(0.0, float("inf"), 1.0)
     monkeypatch.setattr(clock_images, "delay_from_images", lambda *_args, **_named: odd)
     code, text, err = run("calibrate", "clock", back, *IMAGES, "--json")
     assert code == 0, err

@@ -94,7 +94,7 @@ def test_a_motion_that_does_not_return_is_called_that():
 def test_an_error_that_is_no_better_than_the_range_is_refused(monkeypatch):
     signal, frames, poses, _ = recorded(0)
     for error in (float("inf"), float("nan"), 0.6):
-        monkeypatch.setattr(clock, "_standard_error", lambda *_, error=error: error)
+        monkeypatch.setattr(clock, "curvature_error", lambda *_, error=error: error)
         with pytest.raises(InsufficientDataError, match="no better than the"):
             delay_from_lines(signal, frames, poses)
 

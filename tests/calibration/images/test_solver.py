@@ -5,8 +5,10 @@ import pytest
 from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.curves import AXES, similarity_curves, similarity_map
-from calibration.images.solver import ImageSettings, calibrate_crossing, calibrate_images, prepare
+from calibration.images.angulation import PARAMETERS
+from calibration.images.report import similarity_curves, similarity_map
+from calibration.images.similarity import prepare
+from calibration.images.solver import ImageSettings, calibrate_from_sweeps, calibrate_images
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
@@ -27,7 +29,7 @@ def crossing(scene):
 @pytest.fixture(scope="module")
 def found(scene, crossing):
     start = displaced(scene[2], np.random.default_rng(0))
-    return calibrate_crossing(crossing, start)
+    return calibrate_from_sweeps(crossing, start)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,7 @@ def others():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     start = displaced(scene[2], np.random.default_rng(seed))
-    result = found if seed == 0 else calibrate_crossing(crossing, start)
+    result = found if seed == 0 else calibrate_from_sweeps(crossing, start)
     error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
     # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.
     assert np.linalg.norm(error) < 0.5
@@ -83,7 +85,7 @@ def test_held_out_frames_have_no_say(scene, crossing):
     spoilt = first.images.copy()
     spoilt[crossing.frames_held_out[0]] = 255 - spoilt[crossing.frames_held_out[0]]
     start = displaced(truth, np.random.default_rng(3), 2.0, 2.0)
-    plain = calibrate_crossing(crossing, start, REFINE)
+    plain = calibrate_from_sweeps(crossing, start, REFINE)
     other = calibrate_images(dataclasses.replace(first, images=spoilt), second, start, REFINE)
     np.testing.assert_array_equal(other.sensor_from_image.as_matrix(), plain.sensor_from_image.as_matrix())
     assert other.held_out.after < plain.held_out.after - 0.3
@@ -96,7 +98,7 @@ def test_pixel_sizes_are_found():
     wrong = ImageGrid(grid.vectors, grid.samples, grid.vector_pitch_mm / 1.03, grid.sample_spacing_mm / 0.98)
     views = [dataclasses.replace(view, grid=wrong) for view in (first, second)]
     start = displaced(truth, np.random.default_rng(4), 2.0, 2.0)
-    result = calibrate_images(*views, start, dataclasses.replace(REFINE, scales=True))
+    result = calibrate_images(*views, start, REFINE.model_copy(update={"scales": True}))
     assert (result.scale_errors > 0).all()
     # The size across the beams, three per cent off at first; that along them stays uncertain.
     assert abs(result.scales[0] - 1.03) < min(0.01, 4.0 * result.scale_errors[0])
@@ -170,7 +172,7 @@ def test_parallel_sweeps_leave_translation_undetermined():
 
 def test_similarity_falls_from_the_answer_whichever_parameter_moves(crossing, found):
     curves = similarity_curves(crossing, found.sensor_from_image, span=6.0, points=13)
-    assert curves.similarity.shape == (len(AXES), 13)
+    assert curves.similarity.shape == (len(PARAMETERS), 13)
     best = curves.offset[np.nanargmax(curves.similarity, axis=1)]
     assert (np.abs(best) <= 0.5).all()
     assert (curves.similarity[:, 6] - np.nanmin(curves.similarity, axis=1) > 0.05).all()
@@ -179,8 +181,8 @@ def test_similarity_falls_from_the_answer_whichever_parameter_moves(crossing, fo
 def test_similarity_map_contains_the_curves(crossing, found):
     curves = similarity_curves(crossing, found.sensor_from_image, span=4.0, points=5)
     surface = similarity_map(crossing, found.sensor_from_image, ("x", "yaw"), span=4.0, points=5)
-    np.testing.assert_allclose(surface.similarity[:, 2], curves.similarity[AXES.index("x")])
-    np.testing.assert_allclose(surface.similarity[2], curves.similarity[AXES.index("yaw")])
+    np.testing.assert_allclose(surface.similarity[:, 2], curves.similarity[PARAMETERS.index("x")])
+    np.testing.assert_allclose(surface.similarity[2], curves.similarity[PARAMETERS.index("yaw")])
     with pytest.raises(InvalidInputError, match="expected two of tilt, yaw"):
         similarity_map(crossing, found.sensor_from_image, ("x", "sideways"))
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from crossing_scenes import crossing_sweeps, displaced
 
-from calibration.images.crossing import Level, prepare
-from calibration.images.curvature import APART_MM, curvature, settle
-from calibration.images.fit import LEVERS_MM, SETTLED, Estimate, refine
+from calibration.images.fit import APART_MM, LEVERS_MM, SETTLED, Estimate, curvature, refine, settle
+from calibration.images.similarity import Level, prepare
 
 FREE = tuple(range(6))
 

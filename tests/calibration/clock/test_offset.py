@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import ImagePoints
-from calibration.clock.pairing import covered, estimate_offset
+from calibration.clock.offset import covered, estimate_offset
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from speckle3d.core.errors import InsufficientDataError
