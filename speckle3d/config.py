@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, TypeVar
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.correction.curves import Curves
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
@@ -22,6 +20,8 @@ from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.planes import PlaneSettings
+
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 class SensorSettings(BaseModel):
@@ -68,7 +68,7 @@ class Config(BaseModel):
         if consistent_subset is not None:
             sensors = sensors.model_copy(update={"consistent_subset": consistent_subset})
         if drift_curves is not None:
-            drift = replace(drift, curves=cast("Curves", drift_curves))
+            drift = _checked(DriftSettings, drift.model_dump() | {"curves": drift_curves}, "drift")
         return self.model_copy(update={"sensors": sensors, "drift": drift})
 
     def to_toml(self) -> str:
@@ -85,9 +85,15 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
         Naming the setting that is unknown or out of range.
     """
     try:
-        return Config.model_validate(tomllib.loads(text))
+        return _checked(Config, tomllib.loads(text), where)
     except tomllib.TOMLDecodeError as error:
         raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
+
+
+def _checked(model: type[_Model], values: dict[str, Any], where: str) -> _Model:
+    """Validate values, naming the first that is wrong in one line."""
+    try:
+        return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])

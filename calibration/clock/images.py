@@ -1,8 +1,8 @@
-"""The delay between images and a tracker, from tissue that the probe passes twice, forward and back.
+"""Clock offset between images and a tracker, from tissue that the probe passes twice, forward and back.
 
-With a wrong delay all images of the way there are shifted one way, all of the way back the other, and images
-of one way do not look like reslices of the other. No phantom is needed, and no good spatial calibration: the
-motion is along one line.
+A wrong offset shifts all images of the way forward to one side and all of the way back to the other, so that
+images of one way do not correlate with reslices of the other. Neither a phantom nor an accurate spatial
+calibration is needed, since the motion is along one line.
 
 References
 ----------
@@ -33,16 +33,16 @@ from speckle3d.imaging.images import ChosenImages, GreyArray, Images
 from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.3
-"""Of the compared images: finer than the beam, so that speckle tells too, which the way back shows again."""
+"""Pixel of the compared images: finer than the beam, since speckle, seen again on the way back, helps."""
 
 COARSE, FINE = 8, 60
-"""Images of each way that are compared to find the peak, and to place it; the paper takes four. A tracker's
-jitter of 0.15 mm is 15 ms at 10 mm/s, and only many images average it away."""
+"""Images of each way compared to find the peak, and to locate it; the paper takes four. A tracker's jitter of
+0.15 mm is 15 ms at 10 mm/s, and only many images average it out."""
 
 _SMOOTHED_S = 0.2
 _PLACES = 9
 _LEAST_TRAVEL_MM = 2.0
-"""About an elevational beam width: images of less travel look alike wherever they were taken."""
+"""About an elevational beam width: over less travel all images look alike."""
 
 _FEWEST_FRAMES = 20
 _SMALLEST_SHARE = 0.3
@@ -63,14 +63,14 @@ def delay_from_images(
     queries: int = FINE,
     progress: Callable[[int, int], None] | None = None,
 ) -> ClockOffset:
-    """Find the delay at which images of the way there look like reslices of the way back.
+    """Find the delay at which images of either way correlate best with reslices of the other.
 
     Parameters
     ----------
     tracked : TrackedImages
         A motion forward and back; its readings are interpolated by slerp.
     sensor_from_image : RigidTransform
-        Rough is enough.
+        A rough one is enough.
     search_s : float
         Delays within it of the recording's own are tried.
     queries : int
@@ -92,15 +92,15 @@ def delay_from_images(
     part = _there_and_back(steady.at(frame_time_s[there] - around_s) * sensor_from_image, grid)
     pooled = _Pooled(tracked.images, grid)
 
-    def likeness(number: int) -> _Likeness:
+    def correlations(number: int) -> _Correlations:
         ways = tuple(_way(there, each, number) for each in part)
-        return _Likeness(pooled, frame_time_s, steady, sensor_from_image, ways)
+        return _Correlations(pooled, frame_time_s, steady, sensor_from_image, ways)
 
     tried = delays_around(around_s, search_s, STEP_S)
-    tried, curves = curves_at(likeness(min(COARSE, queries)), tried, progress)
+    tried, curves = curves_at(correlations(min(COARSE, queries)), tried, progress)
     misfit = np.array([1.0 - mean_of(each) for each in curves])
     best = clear_peak(tried, curves, misfit, search_s)
-    fine, width = likeness(queries), half_width(tried, misfit, best)
+    fine, width = correlations(queries), half_width(tried, misfit, best)
     near = minimize_scalar(
         lambda delay: 1.0 - mean_of(fine(float(delay))),
         bounds=(tried[best - 1], tried[best + 1]),
@@ -109,7 +109,7 @@ def delay_from_images(
     )
     low, high = max(near.x - width, tried[0]), min(near.x + width, tried[-1])
     seconds, scatter = placed(fine, np.linspace(low, high, _PLACES))
-    # A top whose own error is not well within its width is none.
+    # A peak must be located to well within its own width.
     if not (near.fun < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
         raise InsufficientDataError(
             f"expected correlations with a top, got none near the best delay, {near.x:+.3f} s: "
@@ -149,7 +149,7 @@ class _Pooled:
         return self._kept[index]
 
 
-class _Likeness:
+class _Correlations:
     """Correlation of each query with its reslice through the other way's frames, at any delay."""
 
     def __init__(
@@ -184,7 +184,7 @@ class _Likeness:
 
 
 def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
-    """Readings with a tracker's jitter reduced by local parabolas over `window_s`, which follow a hand.
+    """Reduce the jitter of readings by local parabolas over `window_s`, which follow a hand's motion.
 
     Between gaps each stretch is smoothed by itself; one too short for a window stays as it is.
     """
@@ -205,7 +205,7 @@ def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
 
 @dataclass(frozen=True)
 class _Part:
-    """Indices of one way, and how far along each is, between the ends that both ways reach."""
+    """Frames of one way by index, and the share of the common travel at each."""
 
     index: npt.NDArray[np.int64]
     share: FloatArray
@@ -235,7 +235,7 @@ def _there_and_back(poses: RigidTransform, grid: ImageGrid) -> tuple[_Part, _Par
 
 
 def _require_across(poses: RigidTransform, grid: ImageGrid) -> None:
-    """Refuse images that all lie in one plane: none of them cuts the others."""
+    """Refuse a motion within the image plane, in which no image cuts another."""
     normal = poses.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
     places = np.array([poses.apply(corner) for corner in grid.corners_mm])
     across = float(np.ptp(places @ (normal / np.linalg.norm(normal)), axis=1).max())
@@ -247,20 +247,20 @@ def _require_across(poses: RigidTransform, grid: ImageGrid) -> None:
 
 
 def _way(there: npt.NDArray[np.int64], part: _Part, number: int) -> _Way:
-    """Queries spread evenly over the middle of the way: at its ends the probe is slow and tells nothing."""
+    """Choose queries evenly over the middle of the way; at its ends the probe is too slow to show a delay."""
     inner = part.index[(part.share > 0.1) & (part.share < 0.9)]
     chosen = np.unique(np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(int))
     return _Way(there[part.index], there[inner[chosen]])
 
 
 def _reach_mm(poses: RigidTransform) -> float:
-    """How far an image may be from a pixel: a little more than between the frames, where they are sparse."""
+    """Largest distance of an image from a pixel: twice the 95th percentile of the steps between frames."""
     steps = np.linalg.norm(np.diff(poses.translation, axis=0), axis=1)
     return max(1.0, 2.0 * float(np.percentile(steps, 95)))
 
 
 def _correlation(image: GreyArray, resliced: GreyArray) -> float:
-    """Normalised cross-correlation where both are; NaN if that is too little of the image."""
+    """Normalised cross-correlation where both have values; NaN if that is too little of the image."""
     both = np.isfinite(image) & np.isfinite(resliced)
     if both.sum() < _SMALLEST_SHARE * image.size:
         return float("nan")
@@ -277,9 +277,10 @@ def _from_jitter(
     sensor_from_image: RigidTransform,
     grid: ImageGrid,
 ) -> float:
-    """Standard error from the tracker's jitter, which no comparison of images shows.
+    """Standard error due to the tracker's jitter, which comparing images cannot show.
 
-    Both ways' mean positions are off by it, and the delay that makes up for it is that over twice the speed.
+    Jitter puts both ways' mean positions off; the delay that makes up for it is their difference over twice
+    the speed.
     """
     used = (readings.time_s >= times_s[0]) & (readings.time_s <= times_s[-1])
     raw, held = (

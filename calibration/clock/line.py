@@ -1,14 +1,14 @@
-"""The delay between images and a sensor, from a plane's echo line: its depth and slope follow the sensor.
+"""Clock offset between images and a sensor, from a plane's echo line: its depth and slope follow the sensor.
 
 The line's depth is a linear function of a tracker's position and, for small turns, of its rotation; its slope
-one of an orientation sensor's rotation. Which, need not be known: for every delay that is tried it is fitted,
-and the delay is right where the line follows the sensor best.
+is one of an orientation sensor's rotation. The function is fitted anew for every delay that is tried; the
+best delay leaves the least residual.
 
 References
 ----------
 .. [1] G. M. Treece, A. H. Gee, R. W. Prager, C. J. C. Cash and L. H. Berman, "High-definition freehand 3-D
-   ultrasound", Ultrasound in Medicine and Biology 29, 2003 (onsets of abrupt motion; here all of the motion
-   counts).
+   ultrasound", Ultrasound in Medicine and Biology 29, 2003 (from onsets of abrupt motion; here all motion is
+   used).
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 STEP_S = 0.005
 
 LEAST_FOLLOWED = 0.8
-"""Share of the line's variance that the sensor must explain. Readings of which another quarter is noise, or
-turns that are not small, fit best at delays that are wrong."""
+"""Share of the line's variance that the sensor must explain. Readings with a quarter of noise, or turns that
+are not small, fit best at wrong delays."""
 
 FEWEST_FRAMES = 20
 
 _STILL = 1e-9
-"""Motion, mm or rad, below which a line's is only rounding."""
+"""Range of a line's depth or slope, mm or rad, that is only rounding."""
 
 _TREND = 0.95
-"""Share of a motion that a constant speed may explain; such a motion fits at any delay."""
+"""Share of the variance that constant speed may explain; more, and the motion fits at any delay."""
 
 _ONE_WAY = "the motion goes one way and does not return: move the probe up and down"
 _IRREGULARLY = "move the probe up and down, irregularly"
@@ -119,7 +119,7 @@ def delay_from_lines(
 
 
 def _motion(readings: TimedPoses | TimedRotations, times_s: FloatArray) -> FloatArray:
-    """What a line may depend on: one, rotation about the mean, and position, shape (m, 4 or 7)."""
+    """Regressors of a line: one, rotation about the mean, and position, shape (m, 4 or 7)."""
     read: RigidTransform | Rotation = readings.at(times_s)
     turn = read if isinstance(read, Rotation) else read.rotation
     columns = [np.ones((len(times_s), 1)), (turn.mean().inv() * turn).as_rotvec()]
@@ -149,7 +149,7 @@ def _residuals(wanted: FloatArray, motion: FloatArray) -> FloatArray:
 
 
 def _require_varied(wanted: FloatArray, motion: FloatArray, least_misfit: float) -> None:
-    """Refuse a line that says so little that any slow motion would explain as much of it, at some delay."""
+    """Refuse a line with so few independent values that any slow motion would explain it at some delay."""
     # The delay is fitted too.
     count, fitted = (
         len(wanted) / autocorrelation_time(wanted),
@@ -170,7 +170,7 @@ def _returns(wanted: FloatArray, times_s: FloatArray) -> bool:
 
 
 def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int, returns: bool) -> None:
-    """Refuse what does not follow, lies at the end of the range, or has a rival."""
+    """Refuse a line that does not follow the sensor, and a best delay at the range's end or with a rival."""
     if 1.0 - misfit[best] < LEAST_FOLLOWED:
         raise InsufficientDataError(
             f"expected a line that follows the sensor, got {100 * (1 - misfit[best]):.0f} % of its motion "

@@ -84,7 +84,7 @@ def estimate_offset(
         raise InsufficientDataError(
             f"expected a clock offset within {search_s:g} s that gives a calibration, got none"
         )
-    # The last step but one does not count either: the curvature is measured a step further on.
+    # The curvature is measured a step further on, so the last step but one is refused too.
     if not 1 < best < len(tried) - 2:
         raise InsufficientDataError(
             f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its end"
@@ -141,7 +141,7 @@ def require_peak(
     Parameters
     ----------
     why : str
-        What a rival means.
+        Reason of a rival, for the message.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def require_peak(
 
     gain = float(np.median(misfit) - misfit[best])
     good = find_peaks(-misfit, height=-(misfit[best] + _AMBIGUOUS * gain))[0]
-    # A prominence would ask the misfit to rise beyond the rival too, where the range may end.
+    # Not by find_peaks' prominence: the range may end before the misfit rises beyond a rival.
     rivals = [
         i for i in good[good != best] if misfit[min(i, best) : max(i, best)].max() - misfit[best] > 0.5 * gain
     ]

@@ -1,7 +1,7 @@
-"""Whether two sweeps are angulated enough to show how the image sits on the sensor, before solving.
+"""Whether two sweeps are angulated enough to determine a calibration, judged by their poses before solving.
 
-A wrong calibration moves the same point of the object differently in two images. Where it moves both alike -
-along the beam, if the probe is never tilted - no comparison of images can tell.
+A wrong calibration moves the same point of the object differently in two images. An error that moves it alike
+in both, as a shift along the beam does if the probe is never tilted, cannot be seen by comparing images.
 
 References
 ----------
@@ -29,11 +29,12 @@ REFUSED = 0.05
 sweeps are refused: images that agree to 0.1 mm would leave 2 mm open. Along the beam, fans of 7 degrees."""
 
 WEAK = 0.15
-"""Below, the verdict says so; along the beam, fans of 21 degrees."""
+"""As `REFUSED`: below, the verdict says "weak"; along the beam, fans of 21 degrees."""
 
 _FRAMES, _POINTS = 12, 9
 _LEAST_OVERLAP = 0.25
-"""Below, the sweeps are judged as if their middles were in one place: a start off by 20 mm parts them."""
+"""Overlap below which the sweeps are judged with their middles put in one place: a start that is off by 20 mm
+puts sweeps of one place apart."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,12 @@ class Angulation:
 
     @property
     def weakest(self) -> str:
-        """The parameter that shows least."""
+        """Name of the parameter with the least `strength`."""
         return PARAMETERS[int(np.argmin(self.strength))]
 
     @property
     def verdict(self) -> str:
-        """In words."""
+        """One line: sufficient, weak or insufficient, with the weakest parameter and what to do."""
         weakest = float(self.strength.min())
         if weakest >= WEAK:
             return "sufficient"
@@ -83,7 +84,7 @@ class Angulation:
         return f"{kind}: an error in {self.weakest} shows by {weakest:.2f} mm per mm; {_ADVICE}"
 
     def require(self) -> None:
-        """Refuse sweeps that cannot tell.
+        """Refuse sweeps that cannot determine every parameter.
 
         Raises
         ------
@@ -179,7 +180,7 @@ def angulation(
     centre, half = corners_mm.mean(axis=0), 0.5 * np.ptp(corners_mm, axis=0)
     blocks, overlap = _both_ways(one, other, corners_mm)
     if max(overlap) < _LEAST_OVERLAP:
-        # A bad start moves sweeps of one place apart; how they are angulated it changes little.
+        # A bad start puts sweeps of one place apart, but hardly changes the angles between them.
         blocks, _ = _both_ways(one, _moved_onto(other, one, centre), corners_mm)
     if not len(blocks):
         raise InsufficientDataError(
@@ -206,7 +207,7 @@ def point_motion(local_mm: FloatArray) -> FloatArray:
 
 def _grid(corners_mm: FloatArray) -> FloatArray:
     low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
-    # The middles of cells, so that each point stands for the same area.
+    # Centres of cells, so that each point stands for the same area.
     share = (np.arange(_POINTS) + 0.5) / _POINTS
     x, y = np.meshgrid(low[0] + share * (high - low)[0], low[1] + share * (high - low)[1])
     return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -260,7 +261,7 @@ def _passing(distance_mm: FloatArray) -> tuple[npt.NDArray[np.int64], BoolArray]
 
 
 def _with_others_free(information: FloatArray) -> FloatArray:
-    """Square root of the Schur complement of each parameter, zero where others can hide it."""
+    """Square root of the Schur complement of each parameter; zero where others can make up for it."""
     found = np.zeros(len(information))
     for k in range(len(information)):
         rest = np.delete(np.arange(len(information)), k)

@@ -26,45 +26,47 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
 ROBUST = 0.5
-"""1 - correlation at which a patch counts a quarter of what one that is alike does."""
+"""1 - correlation at which a patch has a quarter of the weight of one that correlates fully."""
 
 MAX_STEPS = 25
 
 LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
-"""What a turn, a displacement, and a relative change of pixel size move: the image's edge, in mm."""
+"""How far the image's edge moves per unit of each parameter, mm."""
 
 SETTLED = 2e-3
-"""Step of the image's edge, mm, at which to stop: a hundredth of what speckle lets be known."""
+"""Step of the image's edge, mm, at which the fit has converged: a hundredth of speckle's error."""
 
 APART_MM = 0.3
-"""How far the image's edge is moved to either side for a difference: less than the blur of speckle."""
+"""Displacement of the image's edge, mm, for central differences of the slopes: less than speckle's blur."""
 
 LEAST_CURVATURE = 0.02
-"""Of Gauss-Newton's, what a direction keeps in which the similarity hardly falls, or rises; in scenes that
-tell it is 0.1 to 0.7. Errors along it are then so large that it is seen to be open."""
+"""Least curvature in any direction, as a share of Gauss-Newton's: where the similarity hardly falls, or
+rises, it makes the standard errors so large that the direction is seen to be undetermined. Scenes that
+determine all parameters have shares of 0.1 to 0.7."""
 
 _MOST_STEPS, _LONGEST_MM = 8, 1.0
-"""Steps, and how far one may move the image's edge: beyond the blur of speckle the curvature is another."""
+"""Steps, and how far one may move the image's edge, mm: over speckle's blur the curvature changes."""
 
 BLOCK_MM = 16.0
-"""Side of the blocks of tissue that err together, in units of the images' size: some patches wide, as
-neighbours see the same reflections."""
+"""Side of the blocks of tissue whose patches have correlated errors, in units of the images' size: a few
+patches, since neighbours show the same reflections."""
 
 STRETCH = 3
-"""Images compared that err together: a tracker's error lasts from one to the next."""
+"""Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
 
 SHARED_RAD = np.deg2rad(0.1)
 SHARED_MM = (0.03, 0.1, 0.04)
-"""Standard deviations, turns and displacements of the image's centre across, along the beam and out of plane,
-of what all of the tissue shares and no part of it can show: root mean squares of what was left over six
-simulated pairs of sweeps, whatever the start. A thick beam shows what is beside it deeper than it is."""
+"""Standard deviations of errors common to all of the tissue, which differences between its parts cannot show:
+turns, and displacements of the image's centre across, along the beam and out of plane. They are root mean
+squares of the errors in six simulated pairs of sweeps, whatever the start; a thick beam displays echoes from
+beside the image plane too deep."""
 
 NAMES = (*PARAMETERS, "lateral pixel size", "axial pixel size")
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A calibration under way.
+    """A calibration during the fit.
 
     Attributes
     ----------
@@ -85,7 +87,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Refined:
-    """What Gauss-Newton arrived at.
+    """Result of `refine`.
 
     Attributes
     ----------
@@ -164,7 +166,7 @@ def refine(
 
 
 def weights(likeness: Likeness) -> FloatArray:
-    """How much each patch counts, by its structure and by how unlike it is; zero where it does not."""
+    """Weight of each patch: its contrast, reduced where it correlates badly; zero without support."""
     valid = likeness.valid
     if not valid.any():
         return np.zeros(len(valid))
@@ -176,7 +178,7 @@ def weights(likeness: Likeness) -> FloatArray:
 
 
 def about_pivot(pivot_mm: FloatArray) -> FloatArray:
-    """Changes of turns and displacements at the image's origin by those at a pivot, shape (8, 8)."""
+    """Derivative of the parameters at the image's origin with respect to those at a pivot, shape (8, 8)."""
     base = np.eye(8)
     base[3:6, :3] = skew(pivot_mm)
     return base
@@ -188,19 +190,19 @@ def _system(likeness: Likeness, weight: FloatArray, base: FloatArray) -> tuple[F
 
 
 def better(here: Likeness, there: Likeness, weight: FloatArray) -> bool:
-    """Whether patches that count at both places are more alike; or the likeness would reward their loss."""
+    """Whether patches supported at both places correlate better; others would reward losing bad patches."""
     both = here.valid & there.valid
     if both.sum() < 0.5 * here.valid.sum():
         return False
     loss = [(1.0 - one.alike[both]) / (ROBUST + 1.0 - one.alike[both]) for one in (here, there)]
-    # The weight of structure alone: how unlike a patch is, is in the loss.
+    # The weight of contrast alone, since the loss accounts for the correlation.
     base = weight[both] * ((ROBUST + 1.0 - here.alike[both]) / ROBUST) ** 2
     return bool(base @ loss[1] < base @ loss[0])
 
 
 @dataclass(frozen=True)
 class Settled:
-    """An answer, and how fast the similarity falls about it.
+    """An answer with the curvature of the similarity about it.
 
     Attributes
     ----------
@@ -213,7 +215,7 @@ class Settled:
 
 
 def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
-    """Newton's steps from where Gauss-Newton stopped, all with the curvature found there."""
+    """Take Newton steps from where Gauss-Newton stopped, all with the curvature there."""
     bend = curvature(refined, pool)
     now, converged = refined, False
     for _ in range(_MOST_STEPS):
@@ -232,7 +234,7 @@ def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
 
 
 def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> FloatArray:
-    """Differences of the similarity's slope to either side of an answer, shape (f, f)."""
+    """Curvature of the similarity by central differences of its exact slope, shape (f, f)."""
     chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
     found = np.empty((len(chosen), len(chosen)))
     for column, parameter in enumerate(chosen):
@@ -256,7 +258,7 @@ def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None
 
 
 def _positive(found: FloatArray, normal: FloatArray) -> FloatArray:
-    """Symmetric, and in no direction less than a small part of Gauss-Newton's matrix."""
+    """Symmetrise, and raise to at least `LEAST_CURVATURE` of Gauss-Newton's matrix in every direction."""
     firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
     part, axes = eigh((found + found.T) / 2.0, firm)
     back = firm @ axes
@@ -273,11 +275,11 @@ class Spread:
 
 
 def covariance_at_origin(settled: Settled, unit: float) -> Spread:
-    """Sandwich of the curvature and of how slopes differ between blocks of tissue and stretches of sweeps.
+    """Sandwich of the curvature and the slopes' scatter over blocks of tissue and stretches of images.
 
-    What differs from block to block of tissue (speckle, reflections) and from image to image (poses) adds up.
-    Poses count twice: those of the images compared, and those of the images cut, of which there are as many.
-    What all of the tissue shares is added (`SHARED_MM`).
+    Errors that differ between blocks of tissue (speckle, reflections) and between images (poses) are summed.
+    Poses count twice: for the images compared, and for as many images cut. Errors common to all of the tissue
+    are added (`SHARED_MM`).
 
     Parameters
     ----------
@@ -304,14 +306,14 @@ def covariance_at_origin(settled: Settled, unit: float) -> Spread:
 
 
 def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
-    """Covariance at the origin of what no part of the tissue can show; pixel sizes have none."""
+    """Covariance at the origin of errors common to all of the tissue; none for pixel sizes."""
     variance = np.concatenate([np.full(3, SHARED_RAD), unit * np.array(SHARED_MM), np.zeros(2)]) ** 2
     base = about_pivot(pivot_mm)
     return np.asarray(base @ np.diag(variance) @ base.T)
 
 
 def _scatter(slopes: FloatArray, cluster: IntArray) -> FloatArray:
-    """Covariance of the sum of patches' slopes, if those of one cluster err together."""
+    """Covariance of the sum of patches' slopes that are correlated within clusters."""
     count = int(cluster.max()) + 1
     if count < 2:
         raise InsufficientDataError(
@@ -329,7 +331,7 @@ def _numbered(cells: FloatArray) -> IntArray:
 
 
 def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
-    """Sweep, and stretch of it, that each patch's image belongs to."""
+    """Sweep, and stretch of `STRETCH` images in it, of each patch."""
     sweep, image = refined.comparison.images.T
     return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
 

@@ -1,4 +1,4 @@
-"""A calibration from two crossing sweeps in pictures: images beside reslices, similarity about the answer.
+"""Figures of a calibration from two crossing sweeps: images beside reslices, similarity about the answer.
 
 References
 ----------
@@ -168,7 +168,7 @@ def figure_images(
     maps: Sequence[SimilarityMap],
     title: str,
 ) -> Figure:
-    """One page: images beside reslices before and after, similarity about the answer, what errors do.
+    """One page: images beside reslices before and after, similarity curves and maps, strength of the sweeps.
 
     The maps are Figure 4 of [1]_.
 
@@ -253,7 +253,7 @@ def _errors(axis: int, values: FloatArray, shift: bool) -> RigidTransform:
 
 
 def _reach_mm(poses: RigidTransform) -> float:
-    """A little more than the frames are apart, deep in a fan."""
+    """A little more than the distance between frames deep in a fan."""
     steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
     return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
 
@@ -281,7 +281,7 @@ def _unit_of(axis: str) -> str:
 
 
 def _draw_strength(axes: Axes, angulation: Angulation) -> None:
-    """How strongly each error shows, by itself and with the others free to hide it."""
+    """Disagreement caused by each error, by itself and with the other parameters free to make up for it."""
     place = np.arange(len(PARAMETERS))
     axes.bar(place - 0.2, angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
     axes.bar(place + 0.2, angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")

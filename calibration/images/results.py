@@ -1,4 +1,4 @@
-"""From two crossing sweeps to a calibration that can be saved, with what shows whether it is right."""
+"""A calibration from two crossing sweeps in the form that is saved, with its notes, figure and verdict."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ CURVES_TO, CURVE_POINTS, MAP_POINTS = 6.0, 25, 13
 """Reach of the similarity curves and maps in mm and degrees, and how finely they are drawn."""
 
 WEAK_SCALE = 0.01
-"""Standard error of a pixel size above which it is better taken from the scanner, which knows it to that."""
+"""Relative standard error of an estimated pixel size above which the scanner's own value is better."""
 
 MAPS = (("x", "y"), ("z", "tilt"), ("yaw", "roll"))
 _WORSE = 0.02
-"""Correlation held-out frames may lose against a start that was right: twice what starts in one place do."""
+"""Most that the correlation of held-out frames may fall below that at the start: twice what it varies between
+answers from different starts."""
 
 
 def calibration_from_images(
     result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
 ) -> Calibration:
-    """Put an answer into the form that is saved; the second sweep's frames follow the first's."""
+    """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
     counts = [len(each.frame_time_s) for each in sweeps]
     first, second = result.frames_used
     pose = result.sensor_from_image
@@ -102,7 +103,7 @@ def _parameters(result: ImageCalibration) -> tuple[Parameter, ...]:
 
 
 def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
-    """Frames that were neither used nor kept for the check."""
+    """Reasons of frames that were neither used nor held out, by number."""
     reasons: dict[int, str] = {}
     for k, before in enumerate((0, counts[0])):
         known = {*result.frames_used[k], *result.frames_held_out[k]}

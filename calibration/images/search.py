@@ -30,14 +30,14 @@ COMPARED = Level(2.0, images=8)
 DECIDED = Level(1.2, images=8, overlap=0.25)
 
 _GLANCES = 1024
-"""Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
-once, but slopes that lead to it start much farther out."""
+"""Places compared first: about one in a thousand of +-20 mm and +-20 degrees lies in Gauss-Newton's reach,
+but slopes that lead there start much farther out."""
 
 _MORE_GLANCES = 4096
-"""Places looked at where nothing came of those: the right one may lie in a corner of the box."""
+"""Places compared if none of those led to an answer: the right one may lie in a corner of the box."""
 
 _BESIDE = 256
-"""Places looked at about each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
+"""Places compared around each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
 
 _FOLLOWED, _COMPARED, _HOPPED, _DECIDED = 20, 5, 3, 3
 
@@ -46,10 +46,10 @@ _STEPS = 12
 _SAME_MM = 1.5
 
 PUBLISHED_IMAGES = 8
-"""Of each sweep; published: 5 to 10."""
+"""Images of each sweep that Nelder-Mead compares; published: 5 to 10."""
 
 MAX_EVALUATIONS = 1500
-"""Of Nelder-Mead."""
+"""Limit of Nelder-Mead."""
 
 _SIMPLEX_EDGE = 10.0
 """Edges of the first simplex, mm and degrees: half of the displacements it is to recover from."""
@@ -72,7 +72,7 @@ def search(
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
 ) -> Located:
-    """Look all over a box of six parameters about the start.
+    """Search a box of six parameters about the start, from coarse to fine.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def search(
             f"of the start, got {got}"
         )
     compared = _refined(crossing, COMPARED, _distinct(followed, crossing)[:_COMPARED], pool, say, "comparing")
-    # Where the tissue is layered, or repeats itself, the best place so far is often beside the right one.
+    # In layered or repetitive tissue the best place so far is often a neighbour of the right one.
     hopped = _beside(crossing, compared[:_HOPPED], capture_mm, capture_rad, pool, say)
     hopped = [one for one in hopped if _within(first, one.estimate, capture_mm, capture_rad)]
     again = _refined(crossing, COMPARED, _distinct(hopped, crossing)[:_COMPARED], pool, say, "comparing")
@@ -118,7 +118,7 @@ def climb(
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
 ) -> Located:
-    """Maximise over an increment of Euler angles and translation that starts at zero and multiplies right."""
+    """Maximise the mean correlation by Nelder-Mead over increments of the start; see `incremented`."""
     comparison = crossing.published(PUBLISHED_IMAGES)
     count = 0
 
@@ -143,7 +143,7 @@ def climb(
 
 
 def incremented(start: Estimate, increment: FloatArray) -> Estimate:
-    """Right-multiply an increment: Euler angles about x, y, z in degrees, mm; then scales in per cent."""
+    """Right-multiply by Euler angles about x, y, z in degrees and mm; scale pixels by per cent, if given."""
     turn = Rotation.from_euler("xyz", increment[:3], degrees=True)
     moved = start.sensor_from_image * RigidTransform.from_components(increment[3:6], turn)
     scales = start.scales * (1.0 + 0.01 * increment[6:8]) if len(increment) > 6 else start.scales
@@ -159,7 +159,7 @@ def _glanced(
     pool: ThreadPoolExecutor,
     say: Progress,
 ) -> list[Estimate]:
-    """The best of many places all over the box."""
+    """Compare many places all over the box, and return the best."""
     places = _spread(start.sensor_from_image, capture_mm, capture_rad, count)
     glance = crossing.level(GLANCE, start.sensor_from_image)
     scores = np.empty(len(places))
@@ -178,7 +178,7 @@ def _beside(
     pool: ThreadPoolExecutor,
     say: Progress,
 ) -> list[Refined]:
-    """Look around the best places, in a box of half the capture, and follow up the best of what is there."""
+    """Compare places around the best ones, in boxes of half the size, and refine the best found there."""
     best: list[Estimate] = []
     for number, one in enumerate(about):
         estimate = one.estimate
@@ -194,7 +194,7 @@ def _beside(
 
 
 def _spread(first: RigidTransform, capture_mm: float, capture_rad: float, count: int) -> list[RigidTransform]:
-    """The start, and places spread evenly from which an increment within the box leads to it."""
+    """The start, and a Sobol sequence of places from which an increment within the box leads to it."""
     places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
     places[0] = 0.0
     turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
@@ -220,7 +220,7 @@ def _refined(
 
 
 def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_rad: float) -> bool:
-    """Whether a place is no farther from the start than a corner of the box, and a fifth."""
+    """Whether a place is within 1.2 times the distance of the box's corners from the start."""
     step = found.sensor_from_image.inv() * first
     far = np.sqrt(3.0) * 1.2
     length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
@@ -228,7 +228,7 @@ def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_r
 
 
 def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:
-    """Estimates, less those that came to the same place as a better one."""
+    """Estimates without those within `_SAME_MM` of a better one."""
     kept: list[Estimate] = []
     for one in found:
         if all(_apart(one.estimate, other, crossing.centre_mm) > _SAME_MM for other in kept):
@@ -237,7 +237,7 @@ def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:
 
 
 def _apart(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
-    """Distance, mm: of the centre, and of what turns about it 20 mm away."""
+    """Distance between estimates, mm: of the image's centre and of points that turn 20 mm away from it."""
     step = other.sensor_from_image.inv() * one.sensor_from_image
     moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))
     return float(np.hypot(moved, 20.0 * step.rotation.magnitude()))

@@ -1,6 +1,6 @@
-"""Two crossing sweeps side by side: how alike their images are for a given calibration.
+"""Similarity of two crossing sweeps for a given calibration: patches of one compared with cuts of the other.
 
-Patches of one sweep's images are compared with cuts of the other, at a chosen resolution, place and number.
+`prepare` reads the sweeps once; `CrossingSweeps` then makes a `Comparison` at any resolution.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.kernels.slicing import PARAMETERS, PatchGrid, PatchScores, PlacedImages, compare_patches
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, and how many of how many of its steps are done."""
+"""Called with the stage, the number of its steps that are done, and the number of all."""
 
 USUAL_EXTENT_MM = 40.0
-"""Geometric mean of width and depth to which lengths below are matched; others scale with the image."""
+"""Geometric mean of width and depth of images whose `CrossingSweeps.unit` is one."""
 
 LEAST_OVERLAP = 0.3
 """Part of an image that the other sweep must show for the image to count (Wein and Khamene 2008)."""
@@ -34,12 +34,12 @@ LEAST_SHARE = 0.5
 """Part of a patch that the other sweep must show."""
 
 FEWEST_PATCHES = 0.1
-"""Part of the patches that must have support; fewer say nothing of how well the sweeps fit."""
+"""Part of the patches that must have support for the score to mean anything."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """Correlation of patches with the other sweep, both ways, one after the other.
+    """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
 
     Attributes
     ----------
@@ -69,10 +69,10 @@ class Likeness:
 
     @property
     def score(self) -> float:
-        """Mean correlation by contrast, times the root of the share of patches that have support.
+        """Mean correlation weighted by contrast, times the root of the share of patches that have support.
 
-        For comparing places far apart: chance correlations fall with the root of the number of patches, so
-        that a few patches that happen to be alike do not win over many that are.
+        Made for comparing places far apart. Chance correlations fall with the root of the number of patches,
+        so the factor keeps a few patches that correlate by chance from winning over many that do rightly.
         """
         valid = self.valid
         if valid.sum() < max(3.0, FEWEST_PATCHES * len(valid)):
@@ -84,9 +84,9 @@ class Likeness:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two stacks, and patches on each that are looked for in the other.
+    """Two stacks, with patches on each that are compared with the other.
 
-    `sources` are the stacks that are cut, the other one's patches against each; by default the stacks.
+    `sources` are the stacks that are cut; by default the stacks themselves.
     """
 
     stacks: tuple[Stack, Stack]
@@ -156,7 +156,7 @@ class Comparison:
 def spread_patches(
     stack: Stack, images: Sequence[int] | IntArray, side: int, spacing_mm: float, overlap: float = 0.5
 ) -> PatchGrid:
-    """Square patches all over some images, leaving out those that mostly show nothing.
+    """Square patches all over some images, without those that are mostly empty.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ class CrossingSweeps:
         return self.used[0].centre_mm
 
     def level(self, level: Level, sensor_from_image: RigidTransform) -> Comparison:
-        """Compare patches all over a number of images, both ways, near a calibration."""
+        """Comparison of patches all over some images, for calibrations near the given one."""
         sigma = level.sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image, level.least_weight)
         patches = [
@@ -254,7 +254,7 @@ class CrossingSweeps:
         return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
 
     def whole(self, sigma_mm: float, images: int, sensor_from_image: RigidTransform) -> Comparison:
-        """Compare whole images with what the other sweep shows, as published."""
+        """Comparison of whole blurred images, as in the published method, near a calibration."""
         sigma = sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image)
         a, b = (whole_images(stack, evenly(len(stack), images), sigma) for stack in thin)
@@ -262,7 +262,7 @@ class CrossingSweeps:
         return Comparison(thin, (a, b), gap, least_share=LEAST_OVERLAP)
 
     def check(self, sigma_mm: float, sensor_from_image: RigidTransform) -> Comparison:
-        """Compare the images held out with cuts of the other sweep, from which its own are left out too."""
+        """Comparison of the held-out images with the other sweep's used ones, near a calibration."""
         sigma = sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image)
         held = (
@@ -274,7 +274,7 @@ class CrossingSweeps:
         return Comparison(held, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
 
     def published(self, images: int) -> Comparison:
-        """Compare whole images as they are with cuts of all of the other sweep's."""
+        """Comparison of whole images, not thinned, with all of the other sweep's: the published method."""
         fine = self._blurred(0, 0.5 * self.unit), self._blurred(1, 0.5 * self.unit)
         a, b = (whole_images(stack, evenly(len(stack), images), 0.7 * self.unit) for stack in fine)
         return Comparison(fine, (a, b), max(2.0 * self.unit, 2.0), least_share=LEAST_OVERLAP)
@@ -302,7 +302,7 @@ class CrossingSweeps:
         return self._kept[key]
 
     def _gap(self, sigma_mm: float, stacks: tuple[Stack, Stack], sensor_from_image: RigidTransform) -> float:
-        """Gap that is still interpolated across: three of the usual distances between images."""
+        """Largest gap that is interpolated across: three times the usual distance between images."""
         spacing = max(frame_spacing(stack, sensor_from_image) for stack in stacks)
         return max(2.25 * sigma_mm, 3.0 * spacing, 2.0 * self.unit)
 
@@ -342,13 +342,13 @@ def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | No
 
 
 def evenly(count: int, wanted: int) -> IntArray:
-    """Numbers of `wanted` images, spread over all `count` but for the two at the ends."""
+    """Numbers of `wanted` images spread evenly over `count`, without the two at the ends."""
     spread = np.linspace(0.5, count - 1.5, min(wanted, count)).round()
     return np.unique(np.clip(spread, 0, count - 1).astype(np.int64))
 
 
 def frame_spacing(stack: Stack, sensor_from_image: RigidTransform) -> float:
-    """Usual distance between neighbouring images, mm, pauses aside."""
+    """Mean distance between neighbouring images along their normals, mm."""
     way = stack.travelled(sensor_from_image)
     return float(way[-1] / max(len(way) - 1, 1))
 

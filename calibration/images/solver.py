@@ -1,7 +1,7 @@
-"""Calibration without a phantom: two crossing sweeps of anything with structure must agree with each other.
+"""Calibration without a phantom, from two crossing sweeps of anything with structure.
 
-Images of each sweep are compared with what the other shows in their place, cut straight from its frames, and
-the calibration is moved until they are as alike as they can be.
+Images of each sweep are compared with cuts straight from the other's frames, and the calibration is changed
+until the correlation is largest.
 
 References
 ----------
@@ -36,8 +36,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
-"""Resolutions at which the answer of the search is refined. The last is still coarser than speckle; many
-images tell more there than patches that overlap, since every pose errs for itself."""
+"""Resolutions at which the search's answer is refined. The last is still coarser than speckle; there many
+images are worth more than overlapping patches, since the errors of their poses are independent."""
 
 SHOWN_SIGMA_MM = 1.0
 """Blur at which similarities are reported, in units of the crossing."""
@@ -48,8 +48,8 @@ below which sweeps are taken to show too little in common. Of sweeps of differen
 0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
 
 SPECKLED_SIMILARITY = 0.45
-"""Below, the verdict warns: shadows and reflections that the sweeps do not share displaced such answers by up
-to a millimetre and two degrees, more than the covariance says."""
+"""Correlation below which the verdict warns: shadows and reflections that the sweeps do not share
+displaced such answers by up to a millimetre and two degrees, more than the covariance says."""
 
 
 class ImageSettings(BaseModel):
@@ -178,7 +178,7 @@ def calibrate_from_sweeps(
     settings: ImageSettings | None = None,
     progress: Progress | None = None,
 ) -> ImageCalibration:
-    """Calibrate from sweeps that are prepared already: `calibrate_images` for many starts."""
+    """Calibrate as `calibrate_images`, from sweeps that are prepared already: for many starts."""
     if not start.single:
         raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageSettings()
@@ -233,7 +233,7 @@ def _refined(
 def _look(
     crossing: CrossingSweeps, found: Estimate, settings: ImageSettings, pool: ThreadPoolExecutor
 ) -> Refined:
-    """The derivatives at an answer that was found without them."""
+    """Compute the derivatives at an answer that was found without them."""
     comparison = crossing.level(FINE[-1], found.sensor_from_image)
     return refine(comparison, found, _free(settings), max_steps=1, pool=pool)
 
@@ -243,7 +243,7 @@ def _free(settings: ImageSettings) -> tuple[int, ...]:
 
 
 def _require_alike(crossing: CrossingSweeps, found: Estimate, pool: ThreadPoolExecutor) -> float:
-    """How alike the sweeps are at an answer, where speckle is blurred away."""
+    """Score of the sweeps at an answer, with speckle blurred away; refuse one below `LEAST_SIMILARITY`."""
     seen = crossing.level(DECIDED, found.sensor_from_image)
     score = seen.at(found.sensor_from_image, found.scales, pool=pool).score
     if score < LEAST_SIMILARITY:

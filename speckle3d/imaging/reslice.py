@@ -1,4 +1,4 @@
-"""Any plane through a sweep, straight from its frames or from voxels.
+"""Reslices: any plane through a sweep, straight from its frames or from voxels.
 
 Resliced from the frames, each pixel blends the two images nearest to it, one on either side, sampled
 bilinearly where the pixel projects onto them: no voxels, no hole filling, and the images' own resolution.
@@ -21,14 +21,14 @@ from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, GreyArray, Images, PosedImages, require_poses
 
 MAX_PIXELS = 100_000_000
-"""Largest reslice made: above it a unit is wrong somewhere (at 0.01 mm this is 100 mm x 100 mm)."""
+"""Largest reslice, to catch wrong units: 100 mm x 100 mm at 0.01 mm."""
 
 DEFAULT_PIXEL_MM = 0.2
 """Between the axial and the lateral resolution of a 5-10 MHz probe."""
 
 _THREADS = 2
 _BATCH = 16
-"""Images read at a time, so that a thread has milliseconds to do; memory for them does not grow."""
+"""Images read at a time: enough for milliseconds of work per thread, few enough for memory."""
 
 
 class _Band:
@@ -282,7 +282,7 @@ def _touches(maps: FloatArray, grid: ImageGrid, plane: ReslicePlane, max_distanc
 
 
 def _blend(distance_mm: GreyArray, grey: GreyArray) -> GreyArray:
-    """Interpolate between the two sides' nearest images; take the one there is where the other is missing."""
+    """Interpolate between the nearest images of either side, or take the only one there is."""
     gap = distance_mm.sum(axis=0)
     share = np.divide(distance_mm[0], gap, out=np.zeros_like(gap), where=gap > 0)
     between = grey[0] + share * (grey[1] - grey[0])
@@ -307,7 +307,7 @@ def _plane_along(world_from_image: RigidTransform, line_mm: FloatArray, pixel_mm
 
 
 def _mean_travel(points_mm: FloatArray, world_from_image: RigidTransform) -> FloatArray:
-    """Regress position on elevational position: travel per mm forward, whatever the order of the images."""
+    """Mean travel per mm forward, by regressing position on elevational position; order does not matter."""
     normal = world_from_image.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
     forward = _unit(normal, "elevational")
     moved = points_mm - points_mm.mean(axis=0)

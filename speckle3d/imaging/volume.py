@@ -24,7 +24,7 @@ DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
 
 MAX_MEMORY_GB = 4.0
-"""What compounding may take: more is a wrong unit more often than a large sweep."""
+"""Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
 
 BYTES_PER_VOXEL = 16
 """Sum, count and hole distance at four bytes each, and as much again of passing masks and copies."""
@@ -52,7 +52,7 @@ class VoxelGrid:
 
     @property
     def memory_gb(self) -> float:
-        """What compounding on this grid takes."""
+        """Memory that compounding on this grid takes, GB."""
         return float(np.prod(np.asarray(self.shape, dtype=float)) * BYTES_PER_VOXEL / 1e9)
 
 

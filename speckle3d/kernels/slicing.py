@@ -160,7 +160,7 @@ def keep_nearest(
 
 
 _SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
-"""So that several terms are summed at once; NaN must stay what it is."""
+"""Lets the compiler sum several terms at once; NaN keeps its meaning."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
@@ -235,7 +235,7 @@ def _images_near(
     max_gap_mm: float,
     near: IntArray,
 ) -> int:
-    """Fill in the numbers of the images that pass near patch `p`, and so may near its points; how many."""
+    """Fill `near` with the numbers of images that pass near patch `p`; return how many."""
     pixels = sample.pixels
     half_u = 0.5 * (patches.sides[0] - 1) * patches.stride * pixels[0]
     half_v = 0.5 * (patches.sides[1] - 1) * patches.stride * pixels[1]
@@ -269,7 +269,7 @@ def _cut_patch(
     rows: FloatArray,
     derivatives: bool,
 ) -> tuple[int, int]:
-    """Levels of a patch's points (`f`) and of the cut there (`g`), its derivatives; points found, wanted."""
+    """Fill levels of a patch (`f`), of the cut there (`g`) and derivatives; return points found and wanted."""
     slope, place = np.empty((2, 3)), np.empty((2, 3))
     frame, distance, level = np.empty(2, np.int64), np.empty(2), np.empty(2)
     k, u0, v0 = patches.where[p]
@@ -316,7 +316,7 @@ def _cut_patch(
             f[n] = value
             g[n] = level[0] + part * (level[1] - level[0])
             if derivatives:
-                # Between images that all but touch, noise is no slope.
+                # Between images that nearly touch, the difference is mostly noise.
                 rise = (level[1] - level[0]) / (gap * max(gap, LEAST_GAP * max_gap_mm))
                 slope[0, 2] = rise * distance[1]
                 slope[1, 2] = rise * distance[0]

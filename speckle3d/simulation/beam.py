@@ -77,7 +77,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class BeamGrid:
-    """Where the beam is tabulated. Lateral positions are `per_pitch` to the element pitch.
+    """Grid on which the beam is tabulated, with `per_pitch` lateral positions per element pitch.
 
     The field is computed at the frequencies `node_hz` and kept as its `components` main components over
     frequency, which is what makes a short sum broadband.
@@ -128,12 +128,12 @@ class BeamTable:
 
     @property
     def lateral_extent_mm(self) -> float:
-        """How far from a vector the field is anywhere above the floor."""
+        """Largest lateral distance from a vector at which the field is above the floor."""
         return float(self.lateral_mm[np.flatnonzero(self.reach.any(axis=0))[-1]])
 
     @property
     def elevation_extent_mm(self) -> FloatArray:
-        """How far from the image plane the field is above the floor, per depth."""
+        """Largest distance from the image plane at which the field is above the floor, at each depth."""
         return np.asarray(self.reach.max(axis=1) * self.grid.elevation_step_mm)
 
     def spectra(self, frequency_hz: FloatArray) -> npt.NDArray[np.complex128]:
@@ -259,7 +259,7 @@ def _line_sources(
     elevation: FloatArray,
     wavenumbers: FloatArray,
 ) -> npt.NDArray[np.complex128]:
-    """Field of elevational line sources: translation along the array makes one table serve all elements."""
+    """Field of elevational line sources; all elements share one table, shifted along the array."""
     strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
     strip = strip - probe.elevation_aperture_mm / 2.0
     lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
@@ -305,7 +305,7 @@ def _fit_curvature(
 
 
 def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumber: float) -> float:
-    """Least-squares `a` of path = a x^2 over the main lobe (above a third of the axis), by its energy."""
+    """Least-squares `a` of path = a x^2 over the main lobe (above a third of the axis), weighted by energy."""
     fallen = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
     lobe = slice(0, max(int(fallen[0]) if fallen.size else profile.size, 3))
     path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
@@ -316,7 +316,7 @@ def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumbe
 def _compress(
     field: npt.NDArray[np.complex128], pulse: FloatArray, count: int
 ) -> tuple[Complex64Array, npt.NDArray[np.complex128]]:
-    """Principal components of the field over frequency, every depth and the pulse's band counting alike."""
+    """Principal components of the field over frequency, with depths and the pulse's band equally weighted."""
     weight = np.maximum(pulse, 0.1 * pulse.max())
     depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3)))
     rows = (field * weight / depth_rms[:, None, None, None]).reshape(-1, pulse.size)

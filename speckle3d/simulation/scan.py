@@ -1,4 +1,4 @@
-"""Frames of RF from a beam, a medium and poses; computed when read, the same each time."""
+"""RF frames from a beam, a medium and poses, computed when read and the same each time."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ class SimulatedFrames:
 
 
 class _Spectra:
-    """Pulse spectra of the beam's components on the FFT's bins, and the way from baseband echoes to RF."""
+    """Pulse spectra of the beam's components on the FFT's bins; turns baseband echoes into RF."""
 
     def __init__(self, beam: BeamTable, samples: int) -> None:
         rate = beam.probe.sampling_rate_hz

