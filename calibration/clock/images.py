@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
@@ -25,11 +24,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around
 from calibration.clock.peak import SIGMAS, STEP_S, clear_peak, curves_at, doubts, half_width, mean_of, placed
 from calibration.images.stacks import TrackedImages, block_means
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import ChosenImages, GreyArray, Images
+from speckle3d.imaging.images import ChosenImages, Images
 from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.3
@@ -52,8 +51,8 @@ _SMALLEST_SHARE = 0.3
 class _Way:
     """Frames of one way, and those of them that are compared with the other."""
 
-    frames: npt.NDArray[np.int64]
-    queries: npt.NDArray[np.int64]
+    frames: IntArray
+    queries: IntArray
 
 
 def delay_from_images(
@@ -140,9 +139,9 @@ class _Pooled:
             grid.sample_spacing_mm * down,
             grid.first_sample_depth_mm + (down - 1) / 2 * grid.sample_spacing_mm,
         )
-        self._kept: dict[int, GreyArray] = {}
+        self._kept: dict[int, Float32Array] = {}
 
-    def __getitem__(self, index: int) -> GreyArray:
+    def __getitem__(self, index: int) -> Float32Array:
         if index not in self._kept:
             image = self._images(index) if callable(self._images) else self._images[index]
             self._kept[index] = block_means(np.asarray(image, dtype=np.float32), self._by)
@@ -179,7 +178,7 @@ class _Correlations:
                 found.append(_correlation(self._own[int(query)], resliced))
         return np.array(found)
 
-    def _poses(self, frames: npt.NDArray[np.int64], delay_s: float) -> RigidTransform:
+    def _poses(self, frames: IntArray, delay_s: float) -> RigidTransform:
         return self._readings.at(self._times[frames] - delay_s) * self._mounting
 
 
@@ -207,7 +206,7 @@ def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
 class _Part:
     """Frames of one way by index, and the share of the common travel at each."""
 
-    index: npt.NDArray[np.int64]
+    index: IntArray
     share: FloatArray
 
 
@@ -246,7 +245,7 @@ def _require_across(poses: RigidTransform, grid: ImageGrid) -> None:
         )
 
 
-def _way(there: npt.NDArray[np.int64], part: _Part, number: int) -> _Way:
+def _way(there: IntArray, part: _Part, number: int) -> _Way:
     """Choose queries evenly over the middle of the way; at its ends the probe is too slow to show a delay."""
     inner = part.index[(part.share > 0.1) & (part.share < 0.9)]
     chosen = np.unique(np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(int))
@@ -259,7 +258,7 @@ def _reach_mm(poses: RigidTransform) -> float:
     return max(1.0, 2.0 * float(np.percentile(steps, 95)))
 
 
-def _correlation(image: GreyArray, resliced: GreyArray) -> float:
+def _correlation(image: Float32Array, resliced: Float32Array) -> float:
     """Normalised cross-correlation where both have values; NaN if that is too little of the image."""
     both = np.isfinite(image) & np.isfinite(resliced)
     if both.sum() < _SMALLEST_SHARE * image.size:

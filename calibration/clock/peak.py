@@ -23,7 +23,7 @@ more for images reversed in time and ones 1.2 s late, in which no peak could be 
 
 LEAST_CORRELATION = 0.1
 """Least mean correlation of images with their reslices at the best delay. The best of a hundred delays
-reaches 0.06 for noise as smooth as speckle, and 0.23 for tissue under noise of twice the picture's strength."""
+reaches 0.06 for noise as smooth as speckle, and 0.23 for tissue under noise of twice its strength."""
 
 Correlations = Callable[[float], FloatArray]
 """Correlations of the queries at a delay, NaN where a query has no support."""

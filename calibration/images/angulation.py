@@ -14,10 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
@@ -100,56 +99,6 @@ class Angulation:
 
 
 _ADVICE = "tilt the probe to and fro within each sweep, and turn it by about 90 degrees between them"
-
-
-def displacement_mm(
-    first: RigidTransform,
-    second: RigidTransform,
-    sensor_from_image: RigidTransform,
-    error: RigidTransform,
-    point_mm: npt.ArrayLike,
-) -> FloatArray:
-    """How far apart a wrong calibration puts one point that two images show, equation 5 of [1]_.
-
-    Parameters
-    ----------
-    first, second : RigidTransform
-        World from sensor for the two images.
-    sensor_from_image : RigidTransform
-        The right calibration; the wrong one is ``sensor_from_image * error``.
-    point_mm : array_like, shape (3,) or (n, 3)
-        In the first image's frame.
-
-    Returns
-    -------
-    ndarray, shape (3,) or (n, 3)
-
-    References
-    ----------
-    .. [1] Wein and Khamene, 2008.
-    """
-    point = np.asarray(point_mm, dtype=float)
-    one, other = first * sensor_from_image, second * sensor_from_image
-    seen = (other.inv() * one).apply(point)
-    return np.asarray((other * error).apply(seen) - (one * error).apply(point), dtype=float)
-
-
-def translation_errors_mm(shift_mm: npt.ArrayLike, alpha_rad: float, beta_rad: float) -> FloatArray:
-    """Equations 9 to 11 of [1]_: disagreement of a shift along x, y or z alone, for perpendicular fans.
-
-    Parameters
-    ----------
-    shift_mm : array_like, shape (3,)
-    alpha_rad, beta_rad : float
-        Tilt of the two images about the axis of their fans.
-
-    References
-    ----------
-    .. [1] Wein and Khamene, 2008.
-    """
-    cosines, sines = np.cos(alpha_rad) * np.cos(beta_rad), np.sin(alpha_rad) * np.sin(beta_rad)
-    factors = np.sqrt(2.0 * np.array([1.0, 1.0 - cosines, 1.0 - sines]))
-    return np.asarray(np.abs(np.asarray(shift_mm, dtype=float)) * factors)
 
 
 def angulation(
@@ -253,7 +202,7 @@ def _disagreements(
     return np.concatenate(blocks), np.concatenate(inside)
 
 
-def _passing(distance_mm: FloatArray) -> tuple[npt.NDArray[np.int64], BoolArray]:
+def _passing(distance_mm: FloatArray) -> tuple[IntArray, BoolArray]:
     """The frame of a sweep whose plane is nearest to each point, and whether the sweep passes the point."""
     nearest = np.abs(distance_mm).argmin(axis=0)
     passes = (distance_mm.min(axis=0) <= 0.0) & (distance_mm.max(axis=0) >= 0.0)

@@ -16,16 +16,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from calibration.images.angulation import PARAMETERS, Angulation, displacement_mm
+from calibration.images.angulation import PARAMETERS, Angulation
 from calibration.images.fit import Estimate
 from calibration.images.search import incremented
 from calibration.images.similarity import CrossingSweeps
 from calibration.images.stacks import TrackedImages
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.images import ChosenImages, GreyArray
+from speckle3d.imaging.images import ChosenImages
 from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.15
@@ -136,9 +136,9 @@ class Pictures:
     title : str
     """
 
-    image: GreyArray
-    before: GreyArray
-    after: GreyArray
+    image: Float32Array
+    before: Float32Array
+    after: Float32Array
     width_mm: float
     height_mm: float
     title: str
@@ -200,65 +200,13 @@ def figure_images(
     return figure
 
 
-def figure_reconstruction_error(
-    alpha_rad: float = -np.pi / 6,
-    point_mm: Sequence[float] = (40.0, 20.0, 0.0),
-    distance_mm: float = 100.0,
-    reach: float = 20.0,
-) -> Figure:
-    """Figure 2 of [1]_: how far apart two perpendicular fans put one point, against each calibration error.
-
-    Parameters
-    ----------
-    alpha_rad : float
-        Tilt of the first image; the second's follows from the point (equation 7).
-    point_mm : sequence of float
-        The point in the first image.
-    distance_mm : float
-        From the axis of the fans to the image's origin.
-    reach : float
-        Largest error, in mm and in degrees.
-
-    References
-    ----------
-    .. [1] Wein and Khamene, SPIE Medical Imaging 6920, 2008.
-    """
-    u, v, _ = point_mm
-    beta = -np.arctan(-u / ((v - distance_mm) * np.cos(alpha_rad)))
-    first = RigidTransform.from_rotation(Rotation.from_rotvec([alpha_rad, 0.0, 0.0]))
-    turned = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]) * Rotation.from_rotvec([beta, 0.0, 0.0])
-    second = RigidTransform.from_rotation(turned)
-    mounting = RigidTransform.from_translation([0.0, -distance_mm, 0.0])
-    values = np.linspace(-reach, reach, 81)
-    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, names, unit in zip(figure.subplots(1, 2), ("xyz", "θ"), ("mm", "degrees"), strict=True):
-        for k, colour in enumerate(_COLOURS):
-            errors = _errors(k, values, unit == "mm")
-            apart = [
-                np.linalg.norm(displacement_mm(first, second, mounting, e, list(point_mm))) for e in errors
-            ]
-            name = names[k] if unit == "mm" else f"{names}{'xyz'[k]}"
-            axes.plot(values, apart, color=colour, label=name)
-        _label(axes, f"calibration error / {unit}", "reconstruction error / mm")
-        axes.legend(fontsize=8)
-    return figure
-
-
-def _errors(axis: int, values: FloatArray, shift: bool) -> RigidTransform:
-    along = np.outer(values, np.eye(3)[axis])
-    if shift:
-        return RigidTransform.from_translation(along)
-    return RigidTransform.from_rotation(Rotation.from_rotvec(np.deg2rad(along)))
-
-
 def _reach_mm(poses: RigidTransform) -> float:
     """A little more than the distance between frames deep in a fan."""
     steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
     return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
 
 
-def _draw_image(axes: Axes, image: GreyArray, of: Pictures, title: str) -> None:
+def _draw_image(axes: Axes, image: Float32Array, of: Pictures, title: str) -> None:
     grey = of.image[np.isfinite(of.image)]
     low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
     extent = (0.0, of.width_mm, of.height_mm, 0.0)

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import GreyArray, Images, PosedImages
+from speckle3d.imaging.images import Images, PosedImages
 
 BASE_PIXEL_MM = 0.35
 """Pixel size to which images are reduced: half the finest blur that comparisons use."""
@@ -83,7 +83,7 @@ class Stack:
     world_from_sensor : RigidTransform, length n
     """
 
-    images: GreyArray
+    images: Float32Array
     pixels: FloatArray
     world_from_sensor: RigidTransform
 
@@ -223,7 +223,7 @@ def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
     return RigidTransform.identity(len(tracked.frame_time_s))
 
 
-def block_means(image: GreyArray, by: tuple[int, int]) -> GreyArray:
+def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:
     """Means over whole blocks of `by` pixels, those left over at the far edges dropped; NaN where any is."""
     from skimage.transform import downscale_local_mean
 
@@ -232,7 +232,7 @@ def block_means(image: GreyArray, by: tuple[int, int]) -> GreyArray:
     return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)  # type: ignore[no-untyped-call]
 
 
-def _weighted(images: GreyArray, weight: FloatArray) -> GreyArray:
+def _weighted(images: Float32Array, weight: FloatArray) -> Float32Array:
     """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
     flat = images.reshape(len(images), -1)
     there = np.isfinite(flat)

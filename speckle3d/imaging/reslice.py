@@ -14,11 +14,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import ChosenImages, GreyArray, Images, PosedImages, require_poses
+from speckle3d.imaging.images import ChosenImages, Images, PosedImages, require_poses
 
 MAX_PIXELS = 100_000_000
 """Largest reslice, to catch wrong units: 100 mm x 100 mm at 0.01 mm."""
@@ -96,7 +96,7 @@ def reslice_frames(
     world_from_image: RigidTransform,
     plane: ReslicePlane,
     max_distance_mm: float,
-) -> GreyArray:
+) -> Float32Array:
     """Cut a plane through a sweep's images.
 
     One pass over the images, in any order, with memory for the plane and a few images; images too far from
@@ -152,7 +152,7 @@ def reslice_frames(
     return np.concatenate([_blend(band.distance_mm, band.grey) for band in bands])
 
 
-def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> GreyArray:
+def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
     """One image on square pixels, as a reslice through its own plane shows it.
 
     Returns
@@ -164,7 +164,7 @@ def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float)
     return reslice_frames(alone, grid, RigidTransform.identity(1), plane, 1.0)
 
 
-def reslice_volume(volume: Volume, plane: ReslicePlane) -> GreyArray:
+def reslice_volume(volume: Volume, plane: ReslicePlane) -> Float32Array:
     """Cut a plane through voxels, linear between them.
 
     Parameters
@@ -281,7 +281,7 @@ def _touches(maps: FloatArray, grid: ImageGrid, plane: ReslicePlane, max_distanc
     return np.asarray(near[0] & near[1] & near[2])
 
 
-def _blend(distance_mm: GreyArray, grey: GreyArray) -> GreyArray:
+def _blend(distance_mm: Float32Array, grey: Float32Array) -> Float32Array:
     """Interpolate between the nearest images of either side, or take the only one there is."""
     gap = distance_mm.sum(axis=0)
     share = np.divide(distance_mm[0], gap, out=np.zeros_like(gap), where=gap > 0)

@@ -269,7 +269,7 @@ def _cut_patch(
     rows: FloatArray,
     derivatives: bool,
 ) -> tuple[int, int]:
-    """Fill levels of a patch (`f`), of the cut there (`g`) and derivatives; return points found and wanted."""
+    """Fill levels of a patch (`f`), of its cut (`g`) and derivatives; return points found and wanted."""
     slope, place = np.empty((2, 3)), np.empty((2, 3))
     frame, distance, level = np.empty(2, np.int64), np.empty(2), np.empty(2)
     k, u0, v0 = patches.where[p]

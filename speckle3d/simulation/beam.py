@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import Complex64Array, FloatArray
+from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.field import line_field, two_way_field
@@ -122,8 +121,8 @@ class BeamTable:
     lateral_mm: FloatArray
     elevation_mm: FloatArray
     residual: Complex64Array
-    components: npt.NDArray[np.complex128]
-    reach: npt.NDArray[np.int64]
+    components: ComplexArray
+    reach: IntArray
     curvature_per_mm: FloatArray
 
     @property
@@ -136,7 +135,7 @@ class BeamTable:
         """Largest distance from the image plane at which the field is above the floor, at each depth."""
         return np.asarray(self.reach.max(axis=1) * self.grid.elevation_step_mm)
 
-    def spectra(self, frequency_hz: FloatArray) -> npt.NDArray[np.complex128]:
+    def spectra(self, frequency_hz: FloatArray) -> ComplexArray:
         """Two-way pulse spectrum of each component, shape (component, frequency)."""
         nodes = np.asarray(self.grid.node_hz)
         hats = np.stack([np.interp(frequency_hz, nodes, row) for row in np.eye(nodes.size)])
@@ -236,7 +235,7 @@ def _last_crossing(coordinate: FloatArray, profile: FloatArray, level: float) ->
 
 def _sum_sources(
     probe: Probe, grid: BeamGrid, depth: FloatArray, lateral: FloatArray, elevation: FloatArray
-) -> npt.NDArray[np.complex128]:
+) -> ComplexArray:
     wavenumbers = _wavenumbers(probe, np.asarray(grid.node_hz))
     step = probe.pitch_mm / grid.per_pitch
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
@@ -258,7 +257,7 @@ def _line_sources(
     distance: FloatArray,
     elevation: FloatArray,
     wavenumbers: FloatArray,
-) -> npt.NDArray[np.complex128]:
+) -> ComplexArray:
     """Field of elevational line sources; all elements share one table, shifted along the array."""
     strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
     strip = strip - probe.elevation_aperture_mm / 2.0
@@ -270,7 +269,7 @@ def _line_sources(
 
 def _apertures(
     probe: Probe, element: FloatArray, depth: FloatArray, wavenumbers: FloatArray
-) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
+) -> tuple[ComplexArray, ComplexArray]:
     """Weights and focusing phases of the sources, shape (depth, source, node), transmit and receive."""
     half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
     focus = np.full(depth.size, probe.transmit_focus_mm)
@@ -281,7 +280,7 @@ def _apertures(
 
 def _focused(
     probe: Probe, element: FloatArray, half_width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
-) -> npt.NDArray[np.complex128]:
+) -> ComplexArray:
     across = element / half_width[:, None]
     raised = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
     weight = np.where(np.abs(across) <= 1.0, raised, 0.0)
@@ -290,7 +289,7 @@ def _focused(
 
 
 def _fit_curvature(
-    field: npt.NDArray[np.complex128],
+    field: ComplexArray,
     depth: FloatArray,
     lateral: FloatArray,
     elevation: FloatArray,
@@ -304,8 +303,8 @@ def _fit_curvature(
     return np.stack([lateral_fit, elevation_fit], axis=1)
 
 
-def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumber: float) -> float:
-    """Least-squares `a` of path = a x^2 over the main lobe (above a third of the axis), weighted by energy."""
+def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> float:
+    """Least-squares `a` of path = a x^2 over the main lobe (a third of the axis), by energy."""
     fallen = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
     lobe = slice(0, max(int(fallen[0]) if fallen.size else profile.size, 3))
     path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
@@ -313,9 +312,7 @@ def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumbe
     return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())
 
 
-def _compress(
-    field: npt.NDArray[np.complex128], pulse: FloatArray, count: int
-) -> tuple[Complex64Array, npt.NDArray[np.complex128]]:
+def _compress(field: ComplexArray, pulse: FloatArray, count: int) -> tuple[Complex64Array, ComplexArray]:
     """Principal components of the field over frequency, with depths and the pulse's band equally weighted."""
     weight = np.maximum(pulse, 0.1 * pulse.max())
     depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3)))
@@ -326,7 +323,7 @@ def _compress(
     return residual.astype(np.complex64), main.conj().T / weight
 
 
-def _reach(amplitude: FloatArray, floor: float) -> npt.NDArray[np.int64]:
+def _reach(amplitude: FloatArray, floor: float) -> IntArray:
     """Elevational steps beyond which the field stays below `floor` of that depth's peak."""
     nz = amplitude.shape[2]
     above = amplitude > floor * amplitude.max(axis=(1, 2), keepdims=True)

@@ -13,10 +13,9 @@ from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 
 Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
@@ -133,7 +132,7 @@ class Layer:
         """Depth of the boundary above or below positions, shape (n, 3)."""
         return np.asarray(self.top_mm + self.undulation.at(position_mm * [1.0, 0.0, 1.0]))
 
-    def covers(self, position_mm: FloatArray) -> npt.NDArray[np.bool_]:
+    def covers(self, position_mm: FloatArray) -> BoolArray:
         """Whether positions, shape (n, 3), lie below the boundary."""
         below = position_mm[:, 1] - self.top_mm
         # Waves are slow to evaluate, so only near the boundary, where they can change the answer.

@@ -47,6 +47,21 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     """Prepare the sweeps of `settings`: two for `crossed`, one otherwise.
 
     Nothing but the beam table is computed here (about a second); frames are made when indexed.
+
+    Parameters
+    ----------
+    settings : SimulationSettings
+
+    Returns
+    -------
+    tuple of SimulatedSweep
+
+    Examples
+    --------
+    >>> from speckle3d import SimulationSettings, simulate
+    >>> (made,) = simulate(SimulationSettings(preset="phantom", vectors=8, samples=600, frames=5))
+    >>> made.sweep.frames[0].shape, len(made.sweep.truth)
+    ((8, 600), 5)
     """
     seeds = np.random.SeedSequence(settings.seed)
     medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)

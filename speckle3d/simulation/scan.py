@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Complex64Array, FloatArray, IntArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.scatter import (
     BeamLimits,
@@ -192,13 +192,13 @@ class _Spectra:
         self._band = np.flatnonzero(spectra.any(axis=0))
         self._pulse = np.ascontiguousarray(spectra[:, self._band].T).astype(np.complex64)
 
-    def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> npt.NDArray[np.float32]:
+    def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> Float32Array:
         """RF, shape (vector, sample): each component's echoes through its pulse, and the noise, summed."""
         # The band holds less than half of the bins: baseband bins wrap, so negative ones are in place.
         baseband = fft(echoes, axis=1, workers=2)[:, self._band - self._carrier_bin]
         spectrum = noise
         spectrum[:, self._band] += np.einsum("vfk,fk->vf", baseband, self._pulse)
-        wave: npt.NDArray[np.float32] = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
+        wave: Float32Array = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
         return wave
 
 

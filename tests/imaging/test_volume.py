@@ -14,7 +14,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.reslice import ReslicePlane, reslice_volume
-from speckle3d.imaging.volume import compound, compound_on, grid_around
+from speckle3d.imaging.volume import compound, grid_around
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -123,15 +123,6 @@ def test_uint8_rounds_clips_and_marks_empty_as_zero():
     images = [np.full((9, 14), level) for level in (12.6, -5.0, 300.0)]
     volume = compound(images, GRID, poses, 1.0, fill_radius=0, voxel_type="uint8")
     np.testing.assert_array_equal(volume.voxels[2, 2], [13, 0, 0, 0, 255])
-
-
-def test_samples_outside_a_given_grid_are_left_out():
-    poses = RigidTransform.from_translation(np.outer(np.arange(4.0), [0, 0, 1]))
-    images = [np.full((9, 14), level) for level in range(4)]
-    whole = compound(images, GRID, poses, 1.0, fill_radius=0)
-    part = grid_around(GRID, poses[1:3], 1.0)
-    cropped = compound_on(part, images, GRID, poses, fill_radius=0)
-    np.testing.assert_array_equal(cropped.voxels, whole.voxels[:, :, 1:3])
 
 
 def test_absurd_sizes_are_refused_before_a_frame_is_read():
