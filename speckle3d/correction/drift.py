@@ -154,20 +154,17 @@ def correct_orientation(
 
     Parameters
     ----------
-    world_from_image : RigidTransform, length n
-        Image-based poses, in any world, mm.
+    world_from_image, covered, settings
+        As for `correct_pose`.
     reference : Rotation, length n or the number of covered frames
         The sensor's ``world_from_image``; where not covered its values are ignored.
-    covered : array_like of bool, shape (n,)
     centre_mm : array_like, shape (3,)
         Image centre in the image frame.
 
     Raises
     ------
-    InsufficientDataError
-        If the sweep is too short, its coverage too small, or "distance" curves lack travel.
-    MismatchError
-        If the lengths do not belong together.
+    InsufficientDataError, MismatchError
+        As for `correct_pose`.
 
     References
     ----------

@@ -5,22 +5,12 @@ import json
 import h5py
 import numpy as np
 import pytest
-from commands import run_command
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.io.calibrations import read_calibration, write_calibration
 
-BACK = ("--preset", "reversal", "--vectors", "20", "--samples", "1000", "--length-mm", "10", "--frames", "50")
 IMAGES = ("--by", "images", "--search-s", "0.2")
-
-
-@pytest.fixture(scope="module")
-def back(tmp_path_factory):
-    """A sweep forward and back over tissue."""
-    path = tmp_path_factory.mktemp("clock") / "back.h5"
-    run_command("simulate", path, *BACK, "--seed", "3")
-    return path
 
 
 @pytest.fixture

@@ -11,19 +11,16 @@ from calibration.clock.images import delay_from_images, smoothed
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
-from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.io.load import load_sweep
 from speckle3d.study.images import GreyImages
 
 RATE_HZ = 50.0
 
 
 @pytest.fixture(scope="module")
-def recording():
-    """Tissue passed forward and back at 10 mm/s, 25 frames/s; the simulated images, not the sensor."""
-    settings = SimulationSettings(
-        preset="reversal", vectors=26, samples=1200, seed=77, length_mm=10.0, frames=50
-    )
-    sweep = simulate(settings)[0].sweep
+def recording(back):
+    """Tissue passed forward and back; the simulated images, not the sensor."""
+    sweep = load_sweep(back)
     made = GreyImages(sweep, 60.0, clipped=False)
     return sweep, np.stack([made[i] for i in range(len(sweep))]), made.grid
 

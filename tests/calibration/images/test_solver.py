@@ -24,14 +24,20 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def crossing(scene):
-    return prepare(*scene[:2])
+def told():
+    """What was told of the progress of `crossing` and `found`."""
+    return []
 
 
 @pytest.fixture(scope="module")
-def found(scene, crossing):
+def crossing(scene, told):
+    return prepare(*scene[:2], lambda *step: told.append(step))
+
+
+@pytest.fixture(scope="module")
+def found(scene, crossing, told):
     start = displaced(scene[2], np.random.default_rng(0))
-    return calibrate_from_sweeps(crossing, start)
+    return calibrate_from_sweeps(crossing, start, progress=lambda *step: told.append(step))
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +88,7 @@ def test_covariance_of_a_point_is_that_of_its_place(found):
     np.testing.assert_allclose(np.diag(found.covariance_of(point)), moved.var(axis=0), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_held_out_frames_have_no_say(scene, crossing):
     first, second, truth = scene
     spoilt = first.images.copy()
@@ -196,10 +203,7 @@ def test_similarity_map_contains_the_curves(crossing, found):
         similarity_map(crossing, found.sensor_from_image, ("x", "sideways"))
 
 
-def test_progress_is_told(scene, others):
-    told = []
-    start = displaced(others[2], np.random.default_rng(10), 1.0, 1.0)
-    calibrate_images(*others[:2], start, progress=lambda *step: told.append(step))
+def test_progress_is_told(found, told):
     stages = [stage for stage, *_ in told]
     order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
     order += ["looking beside", "deciding", "refining"]
