@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
@@ -20,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
 from calibration.images.fit import Estimate, Refined, refine
-from calibration.images.similarity import CrossingSweeps, Level, Progress
+from calibration.images.similarity import Comparison, CrossingSweeps, Level, Progress
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -79,17 +80,12 @@ def search(
     InsufficientDataError
         If the sweeps show nothing in common anywhere.
     """
-    say = progress or _silent
-    first = start.sensor_from_image
+    box = _Box(crossing, start, capture_mm, capture_rad, pool, progress or _silent)
     looks, followed = 0, []
     for glances in (_GLANCES, _MORE_GLANCES):
         looks += glances
-        best = _glanced(crossing, start, glances, capture_mm, capture_rad, pool, say)
-        followed = [
-            one
-            for one in (_refined(crossing, FOLLOWED, best, pool, say, "following up") if best else [])
-            if _within(first, one.estimate, capture_mm, capture_rad)
-        ]
+        best = box.best_of(glances)
+        followed = box.inside(box.refined(FOLLOWED, best, "following up"))
         if followed:
             break
     if not followed:
@@ -98,14 +94,12 @@ def search(
             f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
             f"of the start, got {got}"
         )
-    compared = _refined(crossing, COMPARED, _distinct(followed, crossing)[:_COMPARED], pool, say, "comparing")
+    compared = box.refined(COMPARED, _distinct(followed, crossing)[:_COMPARED], "comparing")
     # In layered or repetitive tissue the best place so far is often a neighbour of the right one.
-    hopped = _beside(crossing, compared[:_HOPPED], capture_mm, capture_rad, pool, say)
-    hopped = [one for one in hopped if _within(first, one.estimate, capture_mm, capture_rad)]
-    again = _refined(crossing, COMPARED, _distinct(hopped, crossing)[:_COMPARED], pool, say, "comparing")
+    hopped = box.inside(box.beside(compared[:_HOPPED]))
+    again = box.refined(COMPARED, _distinct(hopped, crossing)[:_COMPARED], "comparing")
     best_first = sorted(compared + again, key=lambda one: -one.likeness.score)
-    left = _distinct(best_first, crossing)[:_DECIDED]
-    decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
+    decided = box.refined(DECIDED, _distinct(best_first, crossing)[:_DECIDED], "deciding")
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
     return Located(decided[0].estimate, looks)
@@ -150,81 +144,72 @@ def incremented(start: Estimate, increment: FloatArray) -> Estimate:
     return Estimate(moved, scales)
 
 
-def _glanced(
-    crossing: CrossingSweeps,
-    start: Estimate,
-    count: int,
-    capture_mm: float,
-    capture_rad: float,
-    pool: ThreadPoolExecutor,
-    say: Progress,
-) -> list[Estimate]:
-    """Compare many places all over the box, and return the best."""
-    places = _spread(start.sensor_from_image, capture_mm, capture_rad, count)
-    glance = crossing.level(GLANCE, start.sensor_from_image)
-    scores = np.empty(len(places))
-    for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
-        scores[n] = score
-        say("looking around", n + 1, len(places))
-    most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
-    return [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:most] if scores[n] > -1]
+@dataclass(frozen=True)
+class _Box:
+    """A box of calibrations about a start, and how to compare and refine places in it."""
+
+    crossing: CrossingSweeps
+    start: Estimate
+    mm: float
+    rad: float
+    pool: ThreadPoolExecutor
+    say: Progress
+
+    def best_of(self, count: int) -> list[Estimate]:
+        """Compare many places all over the box, and return the best."""
+        places = self._spread(self.start, 1.0, count)
+        glance = self.crossing.level(GLANCE, self.start.sensor_from_image)
+        scores = np.empty(len(places))
+        for n, score in enumerate(self.pool.map(partial(_score, glance), places)):
+            scores[n] = score
+            self.say("looking around", n + 1, len(places))
+        most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
+        return [places[int(n)] for n in np.argsort(-scores)[:most] if scores[n] > -1]
+
+    def beside(self, about: list[Refined]) -> list[Refined]:
+        """Compare places around the best ones, in boxes of half the size, and refine the best found there."""
+        best: list[Estimate] = []
+        for number, one in enumerate(about):
+            comparison = self.crossing.level(FOLLOWED, one.estimate.sensor_from_image)
+            places = self._spread(one.estimate, 0.5, _BESIDE)
+            scores = np.array(list(self.pool.map(partial(_score, comparison), places)))
+            chosen = np.argsort(-scores)[: _FOLLOWED // len(about)]
+            best += [places[int(n)] for n in chosen if scores[n] > -1]
+            self.say("looking beside", number + 1, len(about))
+        return self.refined(FOLLOWED, best, "following up")
+
+    def refined(self, level: Level, starts: list[Estimate], stage: str) -> list[Refined]:
+        """Refine each start, best first."""
+        if not starts:
+            return []
+        comparison = self.crossing.level(level, starts[0].sensor_from_image)
+        done = []
+        for one in self.pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
+            done.append(one)
+            self.say(stage, len(done), len(starts))
+        return sorted(done, key=lambda one: -one.likeness.score)
+
+    def inside(self, found: list[Refined]) -> list[Refined]:
+        """Keep those within 1.2 times the distance of the box's corners from the start."""
+        far, kept = np.sqrt(3.0) * 1.2, []
+        for one in found:
+            step = one.estimate.sensor_from_image.inv() * self.start.sensor_from_image
+            length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
+            if length <= far * self.mm + 1.0 and angle <= far * self.rad + 0.02:
+                kept.append(one)
+        return kept
+
+    def _spread(self, about: Estimate, part: float, count: int) -> list[Estimate]:
+        """A place, and a Sobol sequence of those from which an increment in part of the box leads to it."""
+        places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
+        places[0] = 0.0
+        turn = Rotation.from_euler("xyz", part * self.rad * places[:, :3])
+        away = RigidTransform.from_components(part * self.mm * places[:, 3:], turn)
+        return [Estimate(place, about.scales) for place in about.sensor_from_image * away.inv()]
 
 
-def _beside(
-    crossing: CrossingSweeps,
-    about: list[Refined],
-    capture_mm: float,
-    capture_rad: float,
-    pool: ThreadPoolExecutor,
-    say: Progress,
-) -> list[Refined]:
-    """Compare places around the best ones, in boxes of half the size, and refine the best found there."""
-    best: list[Estimate] = []
-    for number, one in enumerate(about):
-        estimate = one.estimate
-        comparison = crossing.level(FOLLOWED, estimate.sensor_from_image)
-        places = _spread(estimate.sensor_from_image, 0.5 * capture_mm, 0.5 * capture_rad, _BESIDE)
-        found = list(
-            pool.map(lambda place, at=comparison, by=estimate: at.at(place, by.scales).score, places)
-        )
-        chosen = np.argsort(-np.array(found))[: _FOLLOWED // len(about)]
-        best += [Estimate(places[int(n)], estimate.scales) for n in chosen if found[int(n)] > -1]
-        say("looking beside", number + 1, len(about))
-    return _refined(crossing, FOLLOWED, best, pool, say, "following up") if best else []
-
-
-def _spread(first: RigidTransform, capture_mm: float, capture_rad: float, count: int) -> list[RigidTransform]:
-    """The start, and a Sobol sequence of places from which an increment within the box leads to it."""
-    places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
-    places[0] = 0.0
-    turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
-    away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
-    return list(first * away.inv())
-
-
-def _refined(
-    crossing: CrossingSweeps,
-    level: Level,
-    starts: list[Estimate],
-    pool: ThreadPoolExecutor,
-    say: Progress,
-    stage: str,
-) -> list[Refined]:
-    """Refine each, best first."""
-    comparison = crossing.level(level, starts[0].sensor_from_image)
-    done = []
-    for one in pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
-        done.append(one)
-        say(stage, len(done), len(starts))
-    return sorted(done, key=lambda one: -one.likeness.score)
-
-
-def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_rad: float) -> bool:
-    """Whether a place is within 1.2 times the distance of the box's corners from the start."""
-    step = found.sensor_from_image.inv() * first
-    far = np.sqrt(3.0) * 1.2
-    length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
-    return bool(length <= far * capture_mm + 1.0 and angle <= far * capture_rad + 0.02)
+def _score(comparison: Comparison, place: Estimate) -> float:
+    return comparison.at(place.sensor_from_image, place.scales).score
 
 
 def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:

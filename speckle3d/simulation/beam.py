@@ -158,24 +158,6 @@ class BeamTable:
         power = np.einsum("yxzk,kl,yxzl,xz->y", field, gram, field.conj(), sides, optimize=True).real
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
 
-    def elevational_width_mm(self, level_db: float = -6.0) -> FloatArray:
-        """Full two-way thickness of the beam at each depth of `depth_mm`.
-
-        The power is that of the whole pulse, summed over the lateral positions, as a rough surface across the
-        image sends it back. Where the profile has two peaks (nearer than half the lens's focus) its outermost
-        crossings of `level_db`, relative to its maximum, count.
-        """
-        frequency = np.linspace(0.0, self.probe.sampling_rate_hz / 2.0, 513)
-        spectra = self.spectra(frequency)
-        gram = spectra @ spectra.conj().T
-        sides = _sides(self.lateral_mm)
-        power = np.einsum(
-            "yxzk,kl,yxzl,x->yz", self.residual, gram, self.residual.conj(), sides, optimize=True
-        ).real
-        level = power.max(axis=1) * 10.0 ** (level_db / 10.0)
-        pairs = zip(power, level, strict=True)
-        return 2.0 * np.array([_last_crossing(self.elevation_mm, row, at) for row, at in pairs])
-
 
 @lru_cache(maxsize=2)
 def tabulate_beam(
@@ -222,15 +204,6 @@ def _wavenumbers(probe: Probe, frequency_hz: FloatArray) -> FloatArray:
 
 def _sides(coordinate: FloatArray) -> FloatArray:
     return np.where(coordinate > 0.0, 2.0, 1.0)
-
-
-def _last_crossing(coordinate: FloatArray, profile: FloatArray, level: float) -> float:
-    """Where a profile falls through `level` for good; the last coordinate if it never does."""
-    last = int(np.flatnonzero(profile >= level)[-1])
-    if last + 1 == profile.size:
-        return float(coordinate[-1])
-    part = (profile[last] - level) / (profile[last] - profile[last + 1])
-    return float(coordinate[last] + part * (coordinate[last + 1] - coordinate[last]))
 
 
 def _sum_sources(
