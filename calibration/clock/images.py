@@ -17,11 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around
+from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, minimum_between
 from calibration.clock.peak import SIGMAS, STEP_S, clear_peak, curves_at, doubts, half_width, mean_of, placed
 from calibration.images.stacks import TrackedImages, block_means
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
@@ -100,18 +99,13 @@ def delay_from_images(
     misfit = np.array([1.0 - mean_of(each) for each in curves])
     best = clear_peak(tried, curves, misfit, search_s)
     fine, width = correlations(queries), half_width(tried, misfit, best)
-    near = minimize_scalar(
-        lambda delay: 1.0 - mean_of(fine(float(delay))),
-        bounds=(tried[best - 1], tried[best + 1]),
-        method="bounded",
-        options={"xatol": 2e-4},
-    )
-    low, high = max(near.x - width, tried[0]), min(near.x + width, tried[-1])
+    near, misfit_there = minimum_between(lambda delay: 1.0 - mean_of(fine(delay)), tried, best, 2e-4)
+    low, high = max(near - width, tried[0]), min(near + width, tried[-1])
     seconds, scatter = placed(fine, np.linspace(low, high, _PLACES))
     # A peak must be located to well within its own width.
-    if not (near.fun < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
+    if not (misfit_there < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
         raise InsufficientDataError(
-            f"expected correlations with a top, got none near the best delay, {near.x:+.3f} s: "
+            f"expected correlations with a top, got none near the best delay, {near:+.3f} s: "
             f"{doubts(search_s)}"
         )
     jitter = _from_jitter(readings, steady, frame_time_s[there] - seconds, sensor_from_image, grid)
@@ -121,7 +115,7 @@ def delay_from_images(
             f"expected readings that tell the delay, got {seconds:+.3f} s +- {error:.3g} s from their jitter "
             f"alone, no better than the {search_s:g} s searched: move the probe faster"
         )
-    return ClockOffset(seconds, error, 1.0 - float(near.fun))
+    return ClockOffset(seconds, error, 1.0 - misfit_there)
 
 
 class _Pooled:

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.clock.offset import (
@@ -25,6 +24,7 @@ from calibration.clock.offset import (
     covered,
     curvature_error,
     delays_around,
+    minimum_between,
     require_peak,
 )
 from speckle3d.core.arrays import FloatArray
@@ -103,19 +103,17 @@ def delay_from_lines(
     _require_clear(tried, misfit, best, returns)
     motion = _motion(readings, frame_time_s[there] - tried[best])
     _require_varied(wanted - wanted.mean(), motion, float(misfit[best]))
-    near = minimize_scalar(
-        misfit_at, bounds=(tried[best - 1], tried[best + 1]), method="bounded", options={"xatol": 1e-5}
-    )
-    motion = _motion(readings, frame_time_s[there] - near.x)
+    delay, least = minimum_between(misfit_at, tried, best, 1e-5)
+    motion = _motion(readings, frame_time_s[there] - delay)
     left = _residuals(wanted, motion)
     free = max(1.0, len(left) / autocorrelation_time(left) - motion.shape[1])
-    error = curvature_error(misfit_at, float(near.x), STEP_S, free)
+    error = curvature_error(misfit_at, delay, STEP_S, free)
     if not error < search_s:
         raise InsufficientDataError(
-            f"expected a motion that shows the delay, got {near.x:+.3f} s +- {error:.3g} s, no better than "
+            f"expected a motion that shows the delay, got {delay:+.3f} s +- {error:.3g} s, no better than "
             f"the {search_s:g} s searched: {_IRREGULARLY if returns else _ONE_WAY}"
         )
-    return ClockOffset(float(near.x), error, 1.0 - float(near.fun))
+    return ClockOffset(delay, error, 1.0 - least)
 
 
 def _motion(readings: TimedPoses | TimedRotations, times_s: FloatArray) -> FloatArray:

@@ -95,10 +95,8 @@ def estimate_offset(
     def cost(offset: float) -> float:
         return float(np.sum(calibrate(offset).residuals[used] ** 2))
 
-    near = minimize_scalar(
-        cost, bounds=(tried[best - 1], tried[best + 1]), method="bounded", options={"xatol": _TOLERANCE_S}
-    )
-    return ClockOffset(float(near.x), curvature_error(cost, float(near.x), _STEP_S, count))
+    seconds, _ = minimum_between(cost, tried, best, _TOLERANCE_S)
+    return ClockOffset(seconds, curvature_error(cost, seconds, _STEP_S, count))
 
 
 def _sigma(calibrate: Callable[[float], Solution], offset: float) -> float:
@@ -106,6 +104,17 @@ def _sigma(calibrate: Callable[[float], Solution], offset: float) -> float:
         return calibrate(offset).sigma
     except InsufficientDataError:
         return float("inf")
+
+
+def minimum_between(
+    cost: Callable[[float], float], tried_s: FloatArray, best: int, tolerance_s: float
+) -> tuple[float, float]:
+    """Delay of the least cost between the neighbours of the best one tried, and that cost."""
+    bounds = tried_s[best - 1], tried_s[best + 1]
+    found = minimize_scalar(
+        lambda delay: cost(float(delay)), bounds=bounds, method="bounded", options={"xatol": tolerance_s}
+    )
+    return float(found.x), float(found.fun)
 
 
 def curvature_error(cost: Callable[[float], float], at: float, step: float, free: float) -> float:

@@ -260,5 +260,5 @@ def test_no_bias_along_the_beams():
         start = displaced(truth, np.random.default_rng(seed), 0.5, 0.5)
         result = calibrate_images(first, second, start, REFINE)
         errors.append(centre_error_mm(result.sensor_from_image, truth, first.grid)[1])
-    # Published: 2 mm. The bound; of a scene's own reflections 0.1 mm remain, half as much of four.
+    # Published: 2 mm. A scene's own reflections leave 0.1 mm, half as much of four.
     assert abs(np.mean(errors)) < 0.15
