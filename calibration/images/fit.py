@@ -20,7 +20,7 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.angulation import PARAMETERS, point_motion
-from calibration.images.similarity import Comparison, Likeness
+from calibration.images.similarity import Comparison, Similarity
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -91,7 +91,7 @@ class Refined:
 
     Attributes
     ----------
-    likeness : Likeness
+    similarity : Similarity
         At the estimate, with derivatives.
     weight : ndarray, shape (p,)
         Of each patch.
@@ -104,7 +104,7 @@ class Refined:
     """
 
     estimate: Estimate
-    likeness: Likeness
+    similarity: Similarity
     weight: FloatArray
     comparison: Comparison
     pivot_mm: FloatArray
@@ -121,7 +121,7 @@ class Refined:
     def system(self) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton's matrix and the slope of the similarity, of the free parameters at the pivot."""
         chosen = np.array(self.free)
-        normal, gradient = _system(self.likeness, self.weight, about_pivot(self.pivot_mm))
+        normal, gradient = _system(self.similarity, self.weight, about_pivot(self.pivot_mm))
         return normal[np.ix_(chosen, chosen)], gradient[chosen]
 
 
@@ -137,7 +137,7 @@ def refine(
     base = about_pivot(pivot)
     chosen = np.array(free)
 
-    def look(estimate: Estimate) -> Likeness:
+    def look(estimate: Estimate) -> Similarity:
         return comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
 
     estimate, here = start, look(start)
@@ -165,14 +165,14 @@ def refine(
     return Refined(estimate, here, weight, comparison, pivot, free, evaluations, converged)
 
 
-def weights(likeness: Likeness) -> FloatArray:
+def weights(similarity: Similarity) -> FloatArray:
     """Weight of each patch: its contrast, reduced where it correlates badly; zero without support."""
-    valid = likeness.valid
+    valid = similarity.valid
     if not valid.any():
         return np.zeros(len(valid))
-    contrast = np.sqrt(likeness.energy[:, 0] * likeness.energy[:, 1])
+    contrast = np.sqrt(similarity.energy[:, 0] * similarity.energy[:, 1])
     usual = float(np.median(contrast[valid]))
-    unlike = 1.0 - np.where(valid, likeness.alike, 1.0)
+    unlike = 1.0 - np.where(valid, similarity.alike, 1.0)
     structure = contrast / (contrast + usual)
     return np.asarray(np.where(valid, structure * (ROBUST / (ROBUST + unlike)) ** 2, 0.0))
 
@@ -184,12 +184,12 @@ def about_pivot(pivot_mm: FloatArray) -> FloatArray:
     return base
 
 
-def _system(likeness: Likeness, weight: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
-    normal = base.T @ np.einsum("p,pij->ij", weight, likeness.normal) @ base
-    return normal, base.T @ (weight @ likeness.gradient)
+def _system(similarity: Similarity, weight: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
+    normal = base.T @ np.einsum("p,pij->ij", weight, similarity.normal) @ base
+    return normal, base.T @ (weight @ similarity.gradient)
 
 
-def better(here: Likeness, there: Likeness, weight: FloatArray) -> bool:
+def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     """Whether patches supported at both places correlate better; others would reward losing bad patches."""
     both = here.valid & there.valid
     if both.sum() < 0.5 * here.valid.sum():
@@ -226,7 +226,7 @@ def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
         if converged:
             break
         moved = _stepped(now, step * min(1.0, _LONGEST_MM / size), pool)
-        if not better(now.likeness, moved.likeness, now.weight):
+        if not better(now.similarity, moved.similarity, now.weight):
             converged = size < 10.0 * SETTLED  # no better within rounding
             break
         now = moved
@@ -254,7 +254,7 @@ def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None
     estimate = refined.estimate.stepped(step, refined.pivot_mm)
     seen = refined.comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
     count = refined.evaluations + 1
-    return replace(refined, estimate=estimate, likeness=seen, weight=weights(seen), evaluations=count)
+    return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)
 
 
 def _positive(found: FloatArray, normal: FloatArray) -> FloatArray:
@@ -294,7 +294,7 @@ def covariance_at_origin(settled: Settled, unit: float) -> Spread:
     refined = settled.refined
     chosen = np.array(refined.free)
     base = about_pivot(refined.pivot_mm)[:, chosen]
-    slopes = (refined.weight[:, None] * refined.likeness.gradient) @ base
+    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
     norms = np.sqrt(np.diag(settled.curvature))
     values, vectors = np.linalg.eigh(settled.curvature / np.outer(norms, norms))
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))

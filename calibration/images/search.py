@@ -98,7 +98,7 @@ def search(
     # In layered or repetitive tissue the best place so far is often a neighbour of the right one.
     hopped = box.inside(box.beside(compared[:_HOPPED]))
     again = box.refined(COMPARED, _distinct(hopped, crossing)[:_COMPARED], "comparing")
-    best_first = sorted(compared + again, key=lambda one: -one.likeness.score)
+    best_first = sorted(compared + again, key=lambda one: -one.similarity.score)
     decided = box.refined(DECIDED, _distinct(best_first, crossing)[:_DECIDED], "deciding")
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
@@ -187,7 +187,7 @@ class _Box:
         for one in self.pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
             done.append(one)
             self.say(stage, len(done), len(starts))
-        return sorted(done, key=lambda one: -one.likeness.score)
+        return sorted(done, key=lambda one: -one.similarity.score)
 
     def inside(self, found: list[Refined]) -> list[Refined]:
         """Keep those within 1.2 times the distance of the box's corners from the start."""

@@ -38,7 +38,7 @@ FEWEST_PATCHES = 0.1
 
 
 @dataclass(frozen=True)
-class Likeness:
+class Similarity:
     """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
 
     Attributes
@@ -101,13 +101,13 @@ class Comparison:
         scales: FloatArray | None = None,
         derivatives: bool = False,
         pool: ThreadPoolExecutor | None = None,
-    ) -> Likeness:
+    ) -> Similarity:
         """Compare at a calibration; pixel sizes are multiplied by `scales`, shape (2,)."""
         matrix = sensor_from_image.as_matrix()
         factor = np.ones(2) if scales is None else scales
         run = pool.map if pool else map
         parts = list(run(lambda way: self._one_way(way, matrix, factor, derivatives), (0, 1)))
-        return Likeness(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     @property
     def images(self) -> IntArray:

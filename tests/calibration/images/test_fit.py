@@ -59,4 +59,4 @@ def test_what_is_settled_cannot_be_bettered(refined, settled):
     # Ten times where steps stop: the curvature here is not quite that of where the steps began.
     assert np.abs(base @ left).max() < 10.0 * SETTLED
     # What is raised is a weighted mean; the plain one may lose a little by it.
-    assert settled.likeness.mean >= refined.likeness.mean - 1e-3
+    assert settled.similarity.mean >= refined.similarity.mean - 1e-3
