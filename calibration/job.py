@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import ImagePoints, as_directions
-from calibration.clock.pairing import Offset, covered, estimate_offset
+from calibration.clock.offset import ClockOffset, covered, estimate_offset
 from calibration.detection.lines import EchoLines, LineSettings, detect_lines
 from calibration.orientation import Viewed, calibrate_orientation
 from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
@@ -88,7 +88,7 @@ class Outcome:
     calibration: Calibration
     shots: tuple[Shot, ...]
     beam: tuple[BeamBias, ...] = ()
-    offset: Offset | None = None
+    offset: ClockOffset | None = None
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,20 @@ def shipped() -> Path:
 
 
 @pytest.fixture(scope="session")
+def back(tmp_path_factory) -> Path:
+    """File of simulated tissue passed forward and back at 10 mm/s, 25 frames/s; nothing may change it."""
+    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.simulation import SimulationSettings, simulate
+
+    settings = SimulationSettings(
+        preset="reversal", vectors=26, samples=1200, seed=77, length_mm=10.0, frames=50
+    )
+    path = tmp_path_factory.mktemp("back") / "back.h5"
+    write_sweep(path, simulate(settings)[0].sweep)
+    return path
+
+
+@pytest.fixture(scope="session")
 def python():
     """Run a few lines in a fresh interpreter and return what it prints."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.solver import TrackedImages
+from calibration.images.stacks import TrackedImages
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid

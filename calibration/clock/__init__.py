@@ -1,1 +1,1 @@
-"""The delay between images and a sensor."""
+"""Clock offset between images and a sensor."""

@@ -1,8 +1,8 @@
-"""The delay between images and a tracker, from tissue that the probe passes twice, forward and back.
+"""Clock offset between images and a tracker, from tissue that the probe passes twice, forward and back.
 
-With a wrong delay all images of the way there are shifted one way, all of the way back the other, and images
-of one way do not look like reslices of the other. No phantom is needed, and no good spatial calibration: the
-motion is along one line.
+A wrong offset shifts all images of the way forward to one side and all of the way back to the other, so that
+images of one way do not correlate with reslices of the other. Neither a phantom nor an accurate spatial
+calibration is needed, since the motion is along one line.
 
 References
 ----------
@@ -16,34 +16,31 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock.line import SEARCH_S, Delay
-from calibration.clock.pairing import covered
+from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, minimum_between
 from calibration.clock.peak import SIGMAS, STEP_S, clear_peak, curves_at, doubts, half_width, mean_of, placed
-from calibration.images.stacks import TrackedImages
-from speckle3d.core.arrays import FloatArray
+from calibration.images.stacks import TrackedImages, block_means
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import ChosenImages, GreyArray, Images
-from speckle3d.imaging.reslice import image_plane, reslice_frames
+from speckle3d.imaging.images import ChosenImages, Images
+from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.3
-"""Of the compared images: finer than the beam, so that speckle tells too, which the way back shows again."""
+"""Pixel of the compared images: finer than the beam, since speckle, seen again on the way back, helps."""
 
 COARSE, FINE = 8, 60
-"""Images of each way that are compared to find the peak, and to place it; the paper takes four. A tracker's
-jitter of 0.15 mm is 15 ms at 10 mm/s, and only many images average it away."""
+"""Images of each way compared to find the peak, and to locate it; the paper takes four. A tracker's jitter of
+0.15 mm is 15 ms at 10 mm/s, and only many images average it out."""
 
 _SMOOTHED_S = 0.2
 _PLACES = 9
 _LEAST_TRAVEL_MM = 2.0
-"""About an elevational beam width: images of less travel look alike wherever they were taken."""
+"""About an elevational beam width: over less travel all images look alike."""
 
 _FEWEST_FRAMES = 20
 _SMALLEST_SHARE = 0.3
@@ -53,8 +50,8 @@ _SMALLEST_SHARE = 0.3
 class _Way:
     """Frames of one way, and those of them that are compared with the other."""
 
-    frames: npt.NDArray[np.int64]
-    queries: npt.NDArray[np.int64]
+    frames: IntArray
+    queries: IntArray
 
 
 def delay_from_images(
@@ -63,15 +60,15 @@ def delay_from_images(
     search_s: float = SEARCH_S,
     queries: int = FINE,
     progress: Callable[[int, int], None] | None = None,
-) -> Delay:
-    """Find the delay at which images of the way there look like reslices of the way back.
+) -> ClockOffset:
+    """Find the delay at which images of either way correlate best with reslices of the other.
 
     Parameters
     ----------
     tracked : TrackedImages
         A motion forward and back; its readings are interpolated by slerp.
     sensor_from_image : RigidTransform
-        Rough is enough.
+        A rough one is enough.
     search_s : float
         Delays within it of the recording's own are tried.
     queries : int
@@ -93,28 +90,22 @@ def delay_from_images(
     part = _there_and_back(steady.at(frame_time_s[there] - around_s) * sensor_from_image, grid)
     pooled = _Pooled(tracked.images, grid)
 
-    def likeness(number: int) -> _Likeness:
+    def correlations(number: int) -> _Correlations:
         ways = tuple(_way(there, each, number) for each in part)
-        return _Likeness(pooled, frame_time_s, steady, sensor_from_image, ways)
+        return _Correlations(pooled, frame_time_s, steady, sensor_from_image, ways)
 
-    steps = np.arange(-round(search_s / STEP_S), round(search_s / STEP_S) + 1)
-    tried = np.asarray(around_s + steps * STEP_S, dtype=np.float64)
-    tried, curves = curves_at(likeness(min(COARSE, queries)), tried, progress)
+    tried = delays_around(around_s, search_s, STEP_S)
+    tried, curves = curves_at(correlations(min(COARSE, queries)), tried, progress)
     misfit = np.array([1.0 - mean_of(each) for each in curves])
     best = clear_peak(tried, curves, misfit, search_s)
-    fine, width = likeness(queries), half_width(tried, misfit, best)
-    near = minimize_scalar(
-        lambda delay: 1.0 - mean_of(fine(float(delay))),
-        bounds=(tried[best - 1], tried[best + 1]),
-        method="bounded",
-        options={"xatol": 2e-4},
-    )
-    low, high = max(near.x - width, tried[0]), min(near.x + width, tried[-1])
+    fine, width = correlations(queries), half_width(tried, misfit, best)
+    near, misfit_there = minimum_between(lambda delay: 1.0 - mean_of(fine(delay)), tried, best, 2e-4)
+    low, high = max(near - width, tried[0]), min(near + width, tried[-1])
     seconds, scatter = placed(fine, np.linspace(low, high, _PLACES))
-    # A top whose own error is not well within its width is none.
-    if not (near.fun < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
+    # A peak must be located to well within its own width.
+    if not (misfit_there < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
         raise InsufficientDataError(
-            f"expected correlations with a top, got none near the best delay, {near.x:+.3f} s: "
+            f"expected correlations with a top, got none near the best delay, {near:+.3f} s: "
             f"{doubts(search_s)}"
         )
     jitter = _from_jitter(readings, steady, frame_time_s[there] - seconds, sensor_from_image, grid)
@@ -124,7 +115,7 @@ def delay_from_images(
             f"expected readings that tell the delay, got {seconds:+.3f} s +- {error:.3g} s from their jitter "
             f"alone, no better than the {search_s:g} s searched: move the probe faster"
         )
-    return Delay(seconds, error, 1.0 - float(near.fun), tried, misfit)
+    return ClockOffset(seconds, error, 1.0 - misfit_there)
 
 
 class _Pooled:
@@ -142,18 +133,16 @@ class _Pooled:
             grid.sample_spacing_mm * down,
             grid.first_sample_depth_mm + (down - 1) / 2 * grid.sample_spacing_mm,
         )
-        self._kept: dict[int, GreyArray] = {}
+        self._kept: dict[int, Float32Array] = {}
 
-    def __getitem__(self, index: int) -> GreyArray:
+    def __getitem__(self, index: int) -> Float32Array:
         if index not in self._kept:
             image = self._images(index) if callable(self._images) else self._images[index]
-            (across, down), grid = self._by, self.grid
-            part = np.asarray(image, dtype=np.float32)[: grid.vectors * across, : grid.samples * down]
-            self._kept[index] = part.reshape(grid.vectors, across, grid.samples, down).mean(axis=(1, 3))
+            self._kept[index] = block_means(np.asarray(image, dtype=np.float32), self._by)
         return self._kept[index]
 
 
-class _Likeness:
+class _Correlations:
     """Correlation of each query with its reslice through the other way's frames, at any delay."""
 
     def __init__(
@@ -166,13 +155,9 @@ class _Likeness:
     ) -> None:
         self._images, self._times, self._readings = images, frame_time_s, readings
         self._mounting, self._ways = sensor_from_image, ways
-        plane = image_plane(RigidTransform.identity(), images.grid, PIXEL_MM)
-        alone = RigidTransform.identity(1)
         # An image in its own plane is the same whatever the delay.
         self._own = {
-            int(k): reslice_frames(ChosenImages(images, np.array([k])), images.grid, alone, plane, 1.0)
-            for way in ways
-            for k in way.queries
+            int(k): resample_image(images, int(k), images.grid, PIXEL_MM) for way in ways for k in way.queries
         }
 
     def __call__(self, delay_s: float) -> FloatArray:
@@ -187,12 +172,12 @@ class _Likeness:
                 found.append(_correlation(self._own[int(query)], resliced))
         return np.array(found)
 
-    def _poses(self, frames: npt.NDArray[np.int64], delay_s: float) -> RigidTransform:
+    def _poses(self, frames: IntArray, delay_s: float) -> RigidTransform:
         return self._readings.at(self._times[frames] - delay_s) * self._mounting
 
 
 def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
-    """Readings with a tracker's jitter reduced by local parabolas over `window_s`, which follow a hand.
+    """Reduce the jitter of readings by local parabolas over `window_s`, which follow a hand's motion.
 
     Between gaps each stretch is smoothed by itself; one too short for a window stays as it is.
     """
@@ -213,9 +198,9 @@ def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
 
 @dataclass(frozen=True)
 class _Part:
-    """Indices of one way, and how far along each is, between the ends that both ways reach."""
+    """Frames of one way by index, and the share of the common travel at each."""
 
-    index: npt.NDArray[np.int64]
+    index: IntArray
     share: FloatArray
 
 
@@ -243,7 +228,7 @@ def _there_and_back(poses: RigidTransform, grid: ImageGrid) -> tuple[_Part, _Par
 
 
 def _require_across(poses: RigidTransform, grid: ImageGrid) -> None:
-    """Refuse images that all lie in one plane: none of them cuts the others."""
+    """Refuse a motion within the image plane, in which no image cuts another."""
     normal = poses.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
     places = np.array([poses.apply(corner) for corner in grid.corners_mm])
     across = float(np.ptp(places @ (normal / np.linalg.norm(normal)), axis=1).max())
@@ -254,21 +239,21 @@ def _require_across(poses: RigidTransform, grid: ImageGrid) -> None:
         )
 
 
-def _way(there: npt.NDArray[np.int64], part: _Part, number: int) -> _Way:
-    """Queries spread evenly over the middle of the way: at its ends the probe is slow and tells nothing."""
+def _way(there: IntArray, part: _Part, number: int) -> _Way:
+    """Choose queries evenly over the middle of the way; at its ends the probe is too slow to show a delay."""
     inner = part.index[(part.share > 0.1) & (part.share < 0.9)]
     chosen = np.unique(np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(int))
     return _Way(there[part.index], there[inner[chosen]])
 
 
 def _reach_mm(poses: RigidTransform) -> float:
-    """How far an image may be from a pixel: a little more than between the frames, where they are sparse."""
+    """Largest distance of an image from a pixel: twice the 95th percentile of the steps between frames."""
     steps = np.linalg.norm(np.diff(poses.translation, axis=0), axis=1)
     return max(1.0, 2.0 * float(np.percentile(steps, 95)))
 
 
-def _correlation(image: GreyArray, resliced: GreyArray) -> float:
-    """Normalised cross-correlation where both are; NaN if that is too little of the image."""
+def _correlation(image: Float32Array, resliced: Float32Array) -> float:
+    """Normalised cross-correlation where both have values; NaN if that is too little of the image."""
     both = np.isfinite(image) & np.isfinite(resliced)
     if both.sum() < _SMALLEST_SHARE * image.size:
         return float("nan")
@@ -285,9 +270,10 @@ def _from_jitter(
     sensor_from_image: RigidTransform,
     grid: ImageGrid,
 ) -> float:
-    """Standard error from the tracker's jitter, which no comparison of images shows.
+    """Standard error due to the tracker's jitter, which comparing images cannot show.
 
-    Both ways' mean positions are off by it, and the delay that makes up for it is that over twice the speed.
+    Jitter puts both ways' mean positions off; the delay that makes up for it is their difference over twice
+    the speed.
     """
     used = (readings.time_s >= times_s[0]) & (readings.time_s <= times_s[-1])
     raw, held = (

@@ -1,71 +1,53 @@
-"""The delay between images and a sensor, from a plane's echo line: its depth and slope follow the sensor.
+"""Clock offset between images and a sensor, from a plane's echo line: its depth and slope follow the sensor.
 
 The line's depth is a linear function of a tracker's position and, for small turns, of its rotation; its slope
-one of an orientation sensor's rotation. Which, need not be known: for every delay that is tried it is fitted,
-and the delay is right where the line follows the sensor best.
+is one of an orientation sensor's rotation. The function is fitted anew for every delay that is tried; the
+best delay leaves the least residual.
 
 References
 ----------
 .. [1] G. M. Treece, A. H. Gee, R. W. Prager, C. J. C. Cash and L. H. Berman, "High-definition freehand 3-D
-   ultrasound", Ultrasound in Medicine and Biology 29, 2003 (onsets of abrupt motion; here all of the motion
-   counts).
+   ultrasound", Ultrasound in Medicine and Biology 29, 2003 (from onsets of abrupt motion; here all motion is
+   used).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock.pairing import covered
+from calibration.clock.offset import (
+    SEARCH_S,
+    ClockOffset,
+    covered,
+    curvature_error,
+    delays_around,
+    minimum_between,
+    require_peak,
+)
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
-SEARCH_S = 0.5
 STEP_S = 0.005
 
 LEAST_FOLLOWED = 0.8
-"""Share of the line's variance that the sensor must explain. Readings of which another quarter is noise, or
-turns that are not small, fit best at delays that are wrong."""
-
-_AMBIGUOUS = 0.1
-"""Another delay counts as a rival if it is worse by less than this share of what the best delay gains."""
+"""Share of the line's variance that the sensor must explain. Readings with a quarter of noise, or turns that
+are not small, fit best at wrong delays."""
 
 FEWEST_FRAMES = 20
 
 _STILL = 1e-9
-"""Motion, mm or rad, below which a line's is only rounding."""
+"""Range of a line's depth or slope, mm or rad, that is only rounding."""
 
 _TREND = 0.95
-"""Share of a motion that a constant speed may explain; such a motion fits at any delay."""
+"""Share of the variance that constant speed may explain; more, and the motion fits at any delay."""
 
 _ONE_WAY = "the motion goes one way and does not return: move the probe up and down"
 _IRREGULARLY = "move the probe up and down, irregularly"
-
-
-@dataclass(frozen=True)
-class Delay:
-    """A sensor's clock offset: a reading at t belongs to image time t + `seconds`.
-
-    Attributes
-    ----------
-    standard_error_s : float
-        Likeness of neighbouring residuals allowed for.
-    followed : float
-        Share of the line's variance that the sensor's motion explains.
-    tried_s, misfit : ndarray, shape (k,)
-        Delays tried, and the share of variance left at each.
-    """
-
-    seconds: float
-    standard_error_s: float
-    followed: float
-    tried_s: FloatArray
-    misfit: FloatArray
 
 
 def line_signal(points_px: FloatArray, pixel_mm: FloatArray, column: float) -> FloatArray:
@@ -88,7 +70,7 @@ def delay_from_lines(
     readings: TimedPoses | TimedRotations,
     around_s: float = 0.0,
     search_s: float = SEARCH_S,
-) -> Delay:
+) -> ClockOffset:
     """Find the delay at which a plane's line follows the sensor best.
 
     Parameters
@@ -114,28 +96,28 @@ def delay_from_lines(
         )
     wanted = signal[there, 0 if isinstance(readings, TimedPoses) else 1]
     misfit_at = _misfit(wanted - wanted.mean(), frame_time_s[there], readings)
-    steps = np.arange(-round(search_s / STEP_S), round(search_s / STEP_S) + 1)
-    tried = np.asarray(around_s + steps * STEP_S, dtype=np.float64)
+    tried = delays_around(around_s, search_s, STEP_S)
     misfit = np.array([misfit_at(float(delay)) for delay in tried], dtype=np.float64)
     best = int(np.argmin(misfit))
     returns = _returns(wanted, frame_time_s[there])
     _require_clear(tried, misfit, best, returns)
     motion = _motion(readings, frame_time_s[there] - tried[best])
     _require_varied(wanted - wanted.mean(), motion, float(misfit[best]))
-    near = minimize_scalar(
-        misfit_at, bounds=(tried[best - 1], tried[best + 1]), method="bounded", options={"xatol": 1e-5}
-    )
-    error = _standard_error(misfit_at, float(near.x), wanted, frame_time_s[there], readings)
+    delay, least = minimum_between(misfit_at, tried, best, 1e-5)
+    motion = _motion(readings, frame_time_s[there] - delay)
+    left = _residuals(wanted, motion)
+    free = max(1.0, len(left) / autocorrelation_time(left) - motion.shape[1])
+    error = curvature_error(misfit_at, delay, STEP_S, free)
     if not error < search_s:
         raise InsufficientDataError(
-            f"expected a motion that shows the delay, got {near.x:+.3f} s +- {error:.3g} s, no better than "
+            f"expected a motion that shows the delay, got {delay:+.3f} s +- {error:.3g} s, no better than "
             f"the {search_s:g} s searched: {_IRREGULARLY if returns else _ONE_WAY}"
         )
-    return Delay(float(near.x), error, 1.0 - float(near.fun), tried, misfit)
+    return ClockOffset(delay, error, 1.0 - least)
 
 
 def _motion(readings: TimedPoses | TimedRotations, times_s: FloatArray) -> FloatArray:
-    """What a line may depend on: one, rotation about the mean, and position, shape (m, 4 or 7)."""
+    """Regressors of a line: one, rotation about the mean, and position, shape (m, 4 or 7)."""
     read: RigidTransform | Rotation = readings.at(times_s)
     turn = read if isinstance(read, Rotation) else read.rotation
     columns = [np.ones((len(times_s), 1)), (turn.mean().inv() * turn).as_rotvec()]
@@ -165,9 +147,12 @@ def _residuals(wanted: FloatArray, motion: FloatArray) -> FloatArray:
 
 
 def _require_varied(wanted: FloatArray, motion: FloatArray, least_misfit: float) -> None:
-    """Refuse a line that says so little that any slow motion would explain as much of it, at some delay."""
+    """Refuse a line with so few independent values that any slow motion would explain it at some delay."""
     # The delay is fitted too.
-    count, fitted = len(wanted) / _likeness(wanted), int(np.linalg.matrix_rank(motion, rtol=1e-9)) + 1
+    count, fitted = (
+        len(wanted) / autocorrelation_time(wanted),
+        int(np.linalg.matrix_rank(motion, rtol=1e-9)) + 1,
+    )
     by_any = (count - 1.0) / (count - fitted) if count > fitted else float("inf")
     if not least_misfit * by_any <= 1.0 - LEAST_FOLLOWED:
         raise InsufficientDataError(
@@ -183,7 +168,7 @@ def _returns(wanted: FloatArray, times_s: FloatArray) -> bool:
 
 
 def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int, returns: bool) -> None:
-    """Refuse what does not follow, lies at the end of the range, or has a rival."""
+    """Refuse a line that does not follow the sensor, and a best delay at the range's end or with a rival."""
     if 1.0 - misfit[best] < LEAST_FOLLOWED:
         raise InsufficientDataError(
             f"expected a line that follows the sensor, got {100 * (1 - misfit[best]):.0f} % of its motion "
@@ -196,61 +181,3 @@ def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int, returns: 
         if returns:
             raise
         raise InsufficientDataError(f"expected one delay, got many that fit alike: {_ONE_WAY}") from None
-
-
-def require_peak(
-    tried_s: FloatArray,
-    misfit: FloatArray,
-    best: int,
-    why: str = "the motion repeats itself; move irregularly",
-) -> None:
-    """Refuse a best delay that lies at the end of the range, or that has a rival.
-
-    Parameters
-    ----------
-    why : str
-        What a rival means.
-
-    Raises
-    ------
-    InsufficientDataError
-    """
-    if best in (0, len(tried_s) - 1):
-        raise InsufficientDataError(
-            f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's "
-            "end: the delay may lie outside the range searched: --search-s"
-        )
-    inner = np.flatnonzero((misfit[1:-1] <= misfit[:-2]) & (misfit[1:-1] <= misfit[2:])) + 1
-    gain = float(np.median(misfit) - misfit[best])
-    rivals = [i for i in inner if i != best and misfit[i] - misfit[best] < _AMBIGUOUS * gain]
-    rivals = [i for i in rivals if misfit[min(i, best) : max(i, best)].max() - misfit[best] > 0.5 * gain]
-    if rivals:
-        pair = f"{tried_s[best]:+.3f} and {tried_s[rivals[0]]:+.3f} s"
-        raise InsufficientDataError(f"expected one delay, got {pair} nearly as good: {why}")
-
-
-def _standard_error(
-    misfit_at: Callable[[float], float],
-    delay_s: float,
-    wanted: FloatArray,
-    times_s: FloatArray,
-    readings: TimedPoses | TimedRotations,
-) -> float:
-    """From the curvature of the sum of squares, with as many independent residuals as there are."""
-    below, middle, above = (misfit_at(delay_s + step) for step in (-STEP_S, 0.0, STEP_S))
-    curvature = (below - 2.0 * middle + above) / STEP_S**2
-    motion = _motion(readings, times_s - delay_s)
-    left = _residuals(wanted, motion)
-    free = max(1.0, len(left) / _likeness(left) - motion.shape[1])
-    return float(np.sqrt(2.0 * middle / free / curvature)) if curvature > 0 else float("inf")
-
-
-def _likeness(residuals: FloatArray) -> float:
-    """How many neighbours in time say the same: one plus twice the correlations, up to the first of none."""
-    energy, likeness = float(residuals @ residuals), 1.0
-    for lag in range(1, len(residuals) // 4):
-        rho = float(residuals[lag:] @ residuals[:-lag]) / energy if energy > 0 else 0.0
-        if rho <= 0:
-            break
-        likeness += 2.0 * rho
-    return likeness

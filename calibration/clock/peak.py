@@ -1,6 +1,6 @@
-"""The best of the delays that were tried on images: whether it stands out, and where exactly it lies.
+"""The best of the delays tried on images: whether it stands out from chance, and where exactly it lies.
 
-Noise has a best delay too. So each image is asked for itself, and most must say the same.
+Even noise has a minimum, so each image votes with its own best delay, and most must agree.
 """
 
 from __future__ import annotations
@@ -9,23 +9,23 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calibration.clock.line import require_peak
+from calibration.clock.offset import require_peak
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
 STEP_S = 0.01
 
 LEAST_AGREEING = 0.5
-"""Share of the compared images that must fit best, each for itself, near the common best delay: how strong
-speckle and noise are does not matter. Of simulated tissue it is 0.7 to 1, 0.56 at worst under noise twice as
-strong as the picture; of noise, images in another order, ones that never change or delays outside the range
-it is up to 0.44; where it was more, of images reversed in time and ones 1.2 s late, no top was placed."""
+"""Share of the compared images whose own best delay must be near the common one; the strength of speckle and
+noise does not enter. It is 0.7 to 1 for simulated tissue and at least 0.56 under noise twice as strong as the
+picture; up to 0.44 for noise, shuffled images, ones that never change and delays outside the range. It was
+more for images reversed in time and ones 1.2 s late, in which no peak could be located."""
 
 LEAST_CORRELATION = 0.1
-"""Of images with their reslices, on average at the best delay: the best of a hundred delays reaches 0.06 with
-noise as smooth as speckle, and 0.23 with tissue under noise twice as strong as the picture."""
+"""Least mean correlation of images with their reslices at the best delay. The best of a hundred delays
+reaches 0.06 for noise as smooth as speckle, and 0.23 for tissue under noise of twice its strength."""
 
-Likeness = Callable[[float], FloatArray]
+Correlations = Callable[[float], FloatArray]
 """Correlations of the queries at a delay, NaN where a query has no support."""
 
 SIGMAS = 3.0
@@ -41,12 +41,12 @@ def mean_of(correlations: FloatArray) -> float:
 
 
 def curves_at(
-    likeness: Likeness, tried_s: FloatArray, progress: Callable[[int, int], None] | None
+    correlations: Correlations, tried_s: FloatArray, progress: Callable[[int, int], None] | None
 ) -> tuple[FloatArray, FloatArray]:
     """Delays at which enough queries have support, and their correlations there, shape (k, queries)."""
     rows = []
     for number, delay in enumerate(tried_s):
-        rows.append(likeness(float(delay)))
+        rows.append(correlations(float(delay)))
         if progress is not None:
             progress(number + 1, len(tried_s))
     curves = np.array(rows)
@@ -67,7 +67,7 @@ def clear_peak(tried_s: FloatArray, curves: FloatArray, misfit: FloatArray, sear
     """
     best = int(np.argmin(misfit))
     beside = tried_s[max(best - 1, 0) : best + 2]
-    # Farther out too few images may have support: that is an end of the range too.
+    # Delays without enough supported images were dropped, so the range may also end within the one tried.
     if beside.size < 3 or np.ptp(beside) > 3.0 * STEP_S:
         raise InsufficientDataError(
             f"expected a delay inside the {search_s:g} s searched either way, got {tried_s[best]:+.3f} s, at "
@@ -93,7 +93,7 @@ def clear_peak(tried_s: FloatArray, curves: FloatArray, misfit: FloatArray, sear
 
 
 def doubts(search_s: float) -> str:
-    """What may be wrong where no delay is better than chance."""
+    """Likely causes where no delay is better than chance, for messages."""
     return (
         "images and readings do not belong together, or the delay lies outside the "
         f"{search_s:g} s searched: --search-s"
@@ -101,20 +101,20 @@ def doubts(search_s: float) -> str:
 
 
 def half_width(tried_s: FloatArray, misfit: FloatArray, best: int) -> float:
-    """How far from the best delay half of what it gains over the others is lost."""
+    """Distance from the best delay at which half of its gain over the median is lost."""
     half = 0.5 * (misfit[best] + float(np.median(misfit)))
     above = np.flatnonzero(misfit > half)
     nearest = float(np.abs(tried_s[above] - tried_s[best]).min()) if above.size else _WIDEST_S
     return min(max(nearest, 2.0 * STEP_S), _WIDEST_S)
 
 
-def placed(likeness: Likeness, near_s: FloatArray) -> tuple[float, float]:
-    """Top of a parabola through the mean likeness near the peak, and its scatter over runs of queries.
+def placed(correlations: Correlations, near_s: FloatArray) -> tuple[float, float]:
+    """Vertex of a parabola through the mean correlations near the peak, and its bootstrap standard error.
 
-    The top alone ripples with the frames that happen to be there. Runs, since neighbours share frames of
-    the other way.
+    A parabola, since the maximum itself ripples with the frames that happen to be there. Runs of queries are
+    resampled, since neighbours share frames of the other way.
     """
-    curves = np.array([likeness(float(each)) for each in near_s])
+    curves = np.array([correlations(float(each)) for each in near_s])
     curves = curves[:, np.isfinite(curves).all(axis=0)]
     middle = float(near_s.mean())
     runs = curves.shape[1] // _BLOCK

@@ -18,6 +18,7 @@ from calibration.detection.columns import DENSELY, Columns, lay_columns, without
 from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import consensus_line
 
@@ -324,15 +325,7 @@ def _level_sd(residual: FloatArray) -> float:
     """Standard error of the mean of residuals (NaN where missing) that may resemble their neighbours."""
     there = np.isfinite(residual)
     count = float(there.sum())
-    r = np.where(there, residual, 0.0)
-    energy = float(np.maximum(r @ r, count * _FINEST_ROWS**2))
-    likeness = 1.0
-    for lag in range(1, int(count) // 4):
-        pairs = max(1, int(np.count_nonzero(there[lag:] & there[:-lag])))
-        rho = float(r[lag:] @ r[:-lag]) * count / (energy * pairs)
-        if rho <= 0:
-            break
-        likeness += 2.0 * rho * (1 - lag / count)
-    likeness = float(np.minimum(likeness, count / 4))
+    energy = float(np.maximum(np.nansum(residual**2), count * _FINEST_ROWS**2))
+    likeness = float(np.minimum(autocorrelation_time(residual, energy), count / 4))
     # The line itself took two of as many free residuals as there are independent ones.
     return float(np.sqrt(energy / (count - 2.0 * likeness) * likeness / count))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from calibration.clock.pairing import covered
+from calibration.clock.offset import covered
 from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
 from calibration.job import Progress, Recording, Seen

@@ -1,7 +1,7 @@
-"""Whether two sweeps are angulated enough to show how the image sits on the sensor, before solving.
+"""Whether two sweeps are angulated enough to determine a calibration, judged by their poses before solving.
 
-A wrong calibration moves the same point of the object differently in two images. Where it moves both alike -
-along the beam, if the probe is never tilted - no comparison of images can tell.
+A wrong calibration moves the same point of the object differently in two images. An error that moves it alike
+in both, as a shift along the beam does if the probe is never tilted, cannot be seen by comparing images.
 
 References
 ----------
@@ -14,10 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
@@ -29,11 +28,12 @@ REFUSED = 0.05
 sweeps are refused: images that agree to 0.1 mm would leave 2 mm open. Along the beam, fans of 7 degrees."""
 
 WEAK = 0.15
-"""Below, the verdict says so; along the beam, fans of 21 degrees."""
+"""As `REFUSED`: below, the verdict says "weak"; along the beam, fans of 21 degrees."""
 
 _FRAMES, _POINTS = 12, 9
 _LEAST_OVERLAP = 0.25
-"""Below, the sweeps are judged as if their middles were in one place: a start off by 20 mm parts them."""
+"""Overlap below which the sweeps are judged with their middles put in one place: a start that is off by 20 mm
+puts sweeps of one place apart."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Angulation:
 
     @property
     def weakest(self) -> str:
-        """The parameter that shows least."""
+        """Name of the parameter with the least `strength`."""
         return PARAMETERS[int(np.argmin(self.strength))]
 
     @property
     def verdict(self) -> str:
-        """In words."""
+        """One line: sufficient, weak or insufficient, with the weakest parameter and what to do."""
         weakest = float(self.strength.min())
         if weakest >= WEAK:
             return "sufficient"
@@ -83,7 +83,7 @@ class Angulation:
         return f"{kind}: an error in {self.weakest} shows by {weakest:.2f} mm per mm; {_ADVICE}"
 
     def require(self) -> None:
-        """Refuse sweeps that cannot tell.
+        """Refuse sweeps that cannot determine every parameter.
 
         Raises
         ------
@@ -99,56 +99,6 @@ class Angulation:
 
 
 _ADVICE = "tilt the probe to and fro within each sweep, and turn it by about 90 degrees between them"
-
-
-def displacement_mm(
-    first: RigidTransform,
-    second: RigidTransform,
-    sensor_from_image: RigidTransform,
-    error: RigidTransform,
-    point_mm: npt.ArrayLike,
-) -> FloatArray:
-    """How far apart a wrong calibration puts one point that two images show, equation 5 of [1]_.
-
-    Parameters
-    ----------
-    first, second : RigidTransform
-        World from sensor for the two images.
-    sensor_from_image : RigidTransform
-        The right calibration; the wrong one is ``sensor_from_image * error``.
-    point_mm : array_like, shape (3,) or (n, 3)
-        In the first image's frame.
-
-    Returns
-    -------
-    ndarray, shape (3,) or (n, 3)
-
-    References
-    ----------
-    .. [1] Wein and Khamene, 2008.
-    """
-    point = np.asarray(point_mm, dtype=float)
-    one, other = first * sensor_from_image, second * sensor_from_image
-    seen = (other.inv() * one).apply(point)
-    return np.asarray((other * error).apply(seen) - (one * error).apply(point), dtype=float)
-
-
-def translation_errors_mm(shift_mm: npt.ArrayLike, alpha_rad: float, beta_rad: float) -> FloatArray:
-    """Equations 9 to 11 of [1]_: disagreement of a shift along x, y or z alone, for perpendicular fans.
-
-    Parameters
-    ----------
-    shift_mm : array_like, shape (3,)
-    alpha_rad, beta_rad : float
-        Tilt of the two images about the axis of their fans.
-
-    References
-    ----------
-    .. [1] Wein and Khamene, 2008.
-    """
-    cosines, sines = np.cos(alpha_rad) * np.cos(beta_rad), np.sin(alpha_rad) * np.sin(beta_rad)
-    factors = np.sqrt(2.0 * np.array([1.0, 1.0 - cosines, 1.0 - sines]))
-    return np.asarray(np.abs(np.asarray(shift_mm, dtype=float)) * factors)
 
 
 def angulation(
@@ -179,7 +129,7 @@ def angulation(
     centre, half = corners_mm.mean(axis=0), 0.5 * np.ptp(corners_mm, axis=0)
     blocks, overlap = _both_ways(one, other, corners_mm)
     if max(overlap) < _LEAST_OVERLAP:
-        # A bad start moves sweeps of one place apart; how they are angulated it changes little.
+        # A bad start puts sweeps of one place apart, but hardly changes the angles between them.
         blocks, _ = _both_ways(one, _moved_onto(other, one, centre), corners_mm)
     if not len(blocks):
         raise InsufficientDataError(
@@ -199,9 +149,14 @@ def angulation(
     )
 
 
+def point_motion(local_mm: FloatArray) -> FloatArray:
+    """How points of the image move with its turns and shifts, in its frame, shape (p, 3) to (p, 3, 6)."""
+    return np.concatenate([-skew(local_mm), np.broadcast_to(np.eye(3), (len(local_mm), 3, 3))], axis=2)
+
+
 def _grid(corners_mm: FloatArray) -> FloatArray:
     low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
-    # The middles of cells, so that each point stands for the same area.
+    # Centres of cells, so that each point stands for the same area.
     share = (np.arange(_POINTS) + 0.5) / _POINTS
     x, y = np.meshgrid(low[0] + share * (high - low)[0], low[1] + share * (high - low)[1])
     return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -240,27 +195,22 @@ def _disagreements(
         local = seen[nearest, np.arange(len(points))]
         there = other.as_matrix()[nearest][:, :3, :3]
         here = one[frame].rotation.as_matrix()
-        block = there @ _moves(local - centre) - here @ _moves(points - centre)
+        block = there @ point_motion(local - centre) - here @ point_motion(points - centre)
         block[~passes] = np.nan
         blocks.append(block)
         inside.append(passes & (np.abs(local - centre)[:, :2] <= half[:2] + 1e-9).all(axis=1))
     return np.concatenate(blocks), np.concatenate(inside)
 
 
-def _passing(distance_mm: FloatArray) -> tuple[npt.NDArray[np.int64], BoolArray]:
+def _passing(distance_mm: FloatArray) -> tuple[IntArray, BoolArray]:
     """The frame of a sweep whose plane is nearest to each point, and whether the sweep passes the point."""
     nearest = np.abs(distance_mm).argmin(axis=0)
     passes = (distance_mm.min(axis=0) <= 0.0) & (distance_mm.max(axis=0) >= 0.0)
     return nearest, np.asarray(passes)
 
 
-def _moves(local_mm: FloatArray) -> FloatArray:
-    """d(point)/d(turns, shifts) in the image's frame, shape (p, 3, 6)."""
-    return np.concatenate([-skew(local_mm), np.broadcast_to(np.eye(3), (len(local_mm), 3, 3))], axis=2)
-
-
 def _with_others_free(information: FloatArray) -> FloatArray:
-    """Square root of the Schur complement of each parameter, zero where others can hide it."""
+    """Square root of the Schur complement of each parameter; zero where others can make up for it."""
     found = np.zeros(len(information))
     for k in range(len(information)):
         rest = np.delete(np.arange(len(information)), k)

@@ -1,37 +1,72 @@
-"""Gauss-Newton on the correlation of patches, robust against those that differ from view to view.
+"""Gauss-Newton on the correlation of patches, Newton's last steps, and the covariance of the answer.
 
 The patch and its cut, both without their mean and of unit length, differ by a vector whose squared length is
 2 (1 - correlation); its derivative gives Gauss-Newton its matrix, and the exact derivative of the correlation
-its gradient. A patch that stays unlike counts less and less (Geman and McClure), one without structure too.
+its gradient. A patch that stays unlike, or has little structure, counts less (Geman and McClure).
+
+Gauss-Newton's matrix is made of the images' squared slopes, in which the slopes of speckle count in full
+although the similarity does not fall off by them: where speckle is strong it is several times too stiff, its
+steps too short, and errors made from it too small. Differences of the exact slopes are free of that, so they
+give the last steps and the covariance.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.similarity import Comparison, Likeness
-from speckle3d.core.arrays import FloatArray
+from calibration.images.angulation import PARAMETERS, point_motion
+from calibration.images.similarity import Comparison, Similarity
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
 ROBUST = 0.5
-"""1 - correlation at which a patch counts a quarter of what one that is alike does."""
+"""1 - correlation at which a patch has a quarter of the weight of one that correlates fully."""
 
 MAX_STEPS = 25
 
 LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
-"""What a turn, a displacement, and a relative change of pixel size move: the image's edge, in mm."""
+"""How far the image's edge moves per unit of each parameter, mm."""
 
 SETTLED = 2e-3
-"""Step of the image's edge, mm, at which to stop: a hundredth of what speckle lets be known."""
+"""Step of the image's edge, mm, at which the fit has converged: a hundredth of speckle's error."""
+
+APART_MM = 0.3
+"""Displacement of the image's edge, mm, for central differences of the slopes: less than speckle's blur."""
+
+LEAST_CURVATURE = 0.02
+"""Least curvature in any direction, as a share of Gauss-Newton's: where the similarity hardly falls, or
+rises, it makes the standard errors so large that the direction is seen to be undetermined. Scenes that
+determine all parameters have shares of 0.1 to 0.7."""
+
+_MOST_STEPS, _LONGEST_MM = 8, 1.0
+"""Steps, and how far one may move the image's edge, mm: over speckle's blur the curvature changes."""
+
+BLOCK_MM = 16.0
+"""Side of the blocks of tissue whose patches have correlated errors, in units of the images' size: a few
+patches, since neighbours show the same reflections."""
+
+STRETCH = 3
+"""Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
+
+SHARED_RAD = np.deg2rad(0.1)
+SHARED_MM = (0.03, 0.1, 0.04)
+"""Standard deviations of errors common to all of the tissue, which differences between its parts cannot show:
+turns, and displacements of the image's centre across, along the beam and out of plane. They are root mean
+squares of the errors in six simulated pairs of sweeps, whatever the start; a thick beam displays echoes from
+beside the image plane too deep."""
+
+NAMES = (*PARAMETERS, "lateral pixel size", "axial pixel size")
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A calibration under way.
+    """A calibration during the fit.
 
     Attributes
     ----------
@@ -52,11 +87,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Refined:
-    """What Gauss-Newton arrived at.
+    """Result of `refine`.
 
     Attributes
     ----------
-    likeness : Likeness
+    similarity : Similarity
         At the estimate, with derivatives.
     weight : ndarray, shape (p,)
         Of each patch.
@@ -69,7 +104,7 @@ class Refined:
     """
 
     estimate: Estimate
-    likeness: Likeness
+    similarity: Similarity
     weight: FloatArray
     comparison: Comparison
     pivot_mm: FloatArray
@@ -86,7 +121,7 @@ class Refined:
     def system(self) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton's matrix and the slope of the similarity, of the free parameters at the pivot."""
         chosen = np.array(self.free)
-        normal, gradient = _system(self.likeness, self.weight, about_pivot(self.pivot_mm))
+        normal, gradient = _system(self.similarity, self.weight, about_pivot(self.pivot_mm))
         return normal[np.ix_(chosen, chosen)], gradient[chosen]
 
 
@@ -102,7 +137,7 @@ def refine(
     base = about_pivot(pivot)
     chosen = np.array(free)
 
-    def look(estimate: Estimate) -> Likeness:
+    def look(estimate: Estimate) -> Similarity:
         return comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
 
     estimate, here = start, look(start)
@@ -130,36 +165,178 @@ def refine(
     return Refined(estimate, here, weight, comparison, pivot, free, evaluations, converged)
 
 
-def weights(likeness: Likeness) -> FloatArray:
-    """How much each patch counts, by its structure and by how unlike it is; zero where it does not."""
-    valid = likeness.valid
+def weights(similarity: Similarity) -> FloatArray:
+    """Weight of each patch: its contrast, reduced where it correlates badly; zero without support."""
+    valid = similarity.valid
     if not valid.any():
         return np.zeros(len(valid))
-    contrast = np.sqrt(likeness.energy[:, 0] * likeness.energy[:, 1])
+    contrast = np.sqrt(similarity.energy[:, 0] * similarity.energy[:, 1])
     usual = float(np.median(contrast[valid]))
-    unlike = 1.0 - np.where(valid, likeness.alike, 1.0)
+    unlike = 1.0 - np.where(valid, similarity.alike, 1.0)
     structure = contrast / (contrast + usual)
     return np.asarray(np.where(valid, structure * (ROBUST / (ROBUST + unlike)) ** 2, 0.0))
 
 
 def about_pivot(pivot_mm: FloatArray) -> FloatArray:
-    """Changes of turns and displacements at the image's origin by those at a pivot, shape (8, 8)."""
+    """Derivative of the parameters at the image's origin with respect to those at a pivot, shape (8, 8)."""
     base = np.eye(8)
     base[3:6, :3] = skew(pivot_mm)
     return base
 
 
-def _system(likeness: Likeness, weight: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
-    normal = base.T @ np.einsum("p,pij->ij", weight, likeness.normal) @ base
-    return normal, base.T @ (weight @ likeness.gradient)
+def _system(similarity: Similarity, weight: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
+    normal = base.T @ np.einsum("p,pij->ij", weight, similarity.normal) @ base
+    return normal, base.T @ (weight @ similarity.gradient)
 
 
-def better(here: Likeness, there: Likeness, weight: FloatArray) -> bool:
-    """Whether patches that count at both places are more alike; or the likeness would reward their loss."""
+def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
+    """Whether patches supported at both places correlate better; others would reward losing bad patches."""
     both = here.valid & there.valid
     if both.sum() < 0.5 * here.valid.sum():
         return False
     loss = [(1.0 - one.alike[both]) / (ROBUST + 1.0 - one.alike[both]) for one in (here, there)]
-    # The weight of structure alone: how unlike a patch is, is in the loss.
+    # The weight of contrast alone, since the loss accounts for the correlation.
     base = weight[both] * ((ROBUST + 1.0 - here.alike[both]) / ROBUST) ** 2
     return bool(base @ loss[1] < base @ loss[0])
+
+
+@dataclass(frozen=True)
+class Settled:
+    """An answer with the curvature of the similarity about it.
+
+    Attributes
+    ----------
+    curvature : ndarray, shape (f, f)
+        Of the weighted similarity, by the free parameters at the pivot; positive definite.
+    """
+
+    refined: Refined
+    curvature: FloatArray
+
+
+def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
+    """Take Newton steps from where Gauss-Newton stopped, all with the curvature there."""
+    bend = curvature(refined, pool)
+    now, converged = refined, False
+    for _ in range(_MOST_STEPS):
+        step = np.zeros(len(LEVERS_MM))
+        step[list(now.free)] = np.linalg.solve(bend, now.system[1])
+        size = float(np.abs(step * LEVERS_MM).max())
+        converged = size < SETTLED
+        if converged:
+            break
+        moved = _stepped(now, step * min(1.0, _LONGEST_MM / size), pool)
+        if not better(now.similarity, moved.similarity, now.weight):
+            converged = size < 10.0 * SETTLED  # no better within rounding
+            break
+        now = moved
+    return Settled(replace(now, converged=converged), bend)
+
+
+def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> FloatArray:
+    """Curvature of the similarity by central differences of its exact slope, shape (f, f)."""
+    chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
+    found = np.empty((len(chosen), len(chosen)))
+    for column, parameter in enumerate(chosen):
+        slopes = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(len(LEVERS_MM))
+            step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
+            there = refined.estimate.stepped(step, refined.pivot_mm)
+            seen = refined.comparison.at(there.sensor_from_image, there.scales, True, pool)
+            weight = np.where(seen.valid, refined.weight, 0.0)
+            slopes.append((base.T @ (weight @ seen.gradient))[chosen])
+        found[:, column] = (slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM)
+    return _positive(found, refined.system[0])
+
+
+def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None) -> Refined:
+    estimate = refined.estimate.stepped(step, refined.pivot_mm)
+    seen = refined.comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
+    count = refined.evaluations + 1
+    return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)
+
+
+def _positive(found: FloatArray, normal: FloatArray) -> FloatArray:
+    """Symmetrise, and raise to at least `LEAST_CURVATURE` of Gauss-Newton's matrix in every direction."""
+    firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
+    part, axes = eigh((found + found.T) / 2.0, firm)
+    back = firm @ axes
+    return np.asarray((back * np.maximum(part, LEAST_CURVATURE)) @ back.T)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Covariance of turns, displacements and relative pixel sizes at the image's origin, shape (8, 8)."""
+
+    covariance: FloatArray
+    condition_number: float
+    weakest: str
+
+
+def covariance_at_origin(settled: Settled, unit: float) -> Spread:
+    """Sandwich of the curvature and the slopes' scatter over blocks of tissue and stretches of images.
+
+    Errors that differ between blocks of tissue (speckle, reflections) and between images (poses) are summed.
+    Poses count twice: for the images compared, and for as many images cut. Errors common to all of the tissue
+    are added (`SHARED_MM`).
+
+    Parameters
+    ----------
+    unit : float
+        Size of the images relative to the usual.
+
+    References
+    ----------
+    .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 5th
+       Berkeley Symposium on Mathematical Statistics and Probability, 1967.
+    """
+    refined = settled.refined
+    chosen = np.array(refined.free)
+    base = about_pivot(refined.pivot_mm)[:, chosen]
+    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
+    norms = np.sqrt(np.diag(settled.curvature))
+    values, vectors = np.linalg.eigh(settled.curvature / np.outer(norms, norms))
+    condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
+    tissue = _scatter(slopes, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
+    poses = _scatter(slopes, _numbered(np.column_stack(_stretches(refined))))
+    moved = base @ np.linalg.inv(settled.curvature)
+    covariance = moved @ (tissue + 2.0 * poses) @ moved.T + _shared(refined.pivot_mm, unit)
+    return Spread(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]])
+
+
+def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
+    """Covariance at the origin of errors common to all of the tissue; none for pixel sizes."""
+    variance = np.concatenate([np.full(3, SHARED_RAD), unit * np.array(SHARED_MM), np.zeros(2)]) ** 2
+    base = about_pivot(pivot_mm)
+    return np.asarray(base @ np.diag(variance) @ base.T)
+
+
+def _scatter(slopes: FloatArray, cluster: IntArray) -> FloatArray:
+    """Covariance of the sum of patches' slopes that are correlated within clusters."""
+    count = int(cluster.max()) + 1
+    if count < 2:
+        raise InsufficientDataError(
+            "expected sweeps that share more tissue, got too little to compare its parts"
+        )
+    sums = np.zeros((count, slopes.shape[1]))
+    np.add.at(sums, cluster, slopes)
+    sums -= sums.mean(axis=0)
+    return np.asarray(count / (count - 1.0) * sums.T @ sums)
+
+
+def _numbered(cells: FloatArray) -> IntArray:
+    """Number of each patch's cell, from zero."""
+    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
+
+
+def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
+    """Sweep, and stretch of `STRETCH` images in it, of each patch."""
+    sweep, image = refined.comparison.images.T
+    return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
+
+
+def point_covariance(covariance: FloatArray, point_mm: FloatArray) -> FloatArray:
+    """Covariance of a point of the image from that of its pose at the image's origin, shape (3, 3)."""
+    moved = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
+    return np.asarray(moved @ covariance @ moved.T)

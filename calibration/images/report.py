@@ -1,26 +1,127 @@
-"""A calibration from two crossing sweeps in pictures: images beside reslices, before and after; curves."""
+"""Figures of a calibration from two crossing sweeps: images beside reslices, similarity about the answer.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging 6920, 2008.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from calibration.images.angulation import PARAMETERS, Angulation, displacement_mm
-from calibration.images.curves import AXES, SimilarityCurves, SimilarityMap
+from calibration.images.angulation import PARAMETERS, Angulation
+from calibration.images.fit import Estimate
+from calibration.images.search import incremented
+from calibration.images.similarity import CrossingSweeps
 from calibration.images.stacks import TrackedImages
-from speckle3d.core.arrays import FloatArray
-from speckle3d.imaging.images import ChosenImages, GreyArray
-from speckle3d.imaging.reslice import image_plane, reslice_frames
+from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.imaging.images import ChosenImages
+from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
 PIXEL_MM = 0.15
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _REACH_MM = 1.5
+
+IMAGES, SIGMA_MM = 10, 1.0
+"""Images of each sweep, and their blur, in the similarity curves."""
+
+
+@dataclass(frozen=True)
+class SimilarityCurves:
+    """Mean correlation of images with cuts of the other sweep, one parameter moved at a time.
+
+    Attributes
+    ----------
+    offset : ndarray, shape (k,)
+        Degrees for the first three axes, mm for the others.
+    similarity : ndarray, shape (6, k)
+        By `PARAMETERS`; NaN where no image overlaps the other sweep by three tenths.
+    """
+
+    offset: FloatArray
+    similarity: FloatArray
+
+
+@dataclass(frozen=True)
+class SimilarityMap:
+    """Mean correlation with two parameters moved at once, shape (k, k), the first along the first axis."""
+
+    axes: tuple[str, str]
+    offset: FloatArray
+    similarity: FloatArray
+
+
+def similarity_curves(
+    crossing: CrossingSweeps,
+    sensor_from_image: RigidTransform,
+    span: float = 10.0,
+    points: int = 21,
+    scales: FloatArray | None = None,
+    threads: int = 2,
+) -> SimilarityCurves:
+    """Similarity from -`span` to `span` mm or degrees about a calibration, along each of `PARAMETERS`.
+
+    Parameters move the image at its origin, not about its centre.
+    """
+    offset = _offsets(span, points)
+    steps = (step * np.eye(6)[axis] for axis in range(6) for step in offset)
+    found = _similarities(crossing, _estimate(sensor_from_image, scales), steps, threads)
+    return SimilarityCurves(offset, found.reshape(6, points))
+
+
+def similarity_map(
+    crossing: CrossingSweeps,
+    sensor_from_image: RigidTransform,
+    axes: tuple[str, str],
+    span: float = 10.0,
+    points: int = 21,
+    scales: FloatArray | None = None,
+    threads: int = 2,
+) -> SimilarityMap:
+    """Similarity over two parameters, named as in `PARAMETERS`."""
+    for name in axes:
+        if name not in PARAMETERS:
+            raise InvalidInputError(f"axes: expected two of {', '.join(PARAMETERS)}, got {name!r}")
+    offset = _offsets(span, points)
+    one, other = (np.eye(6)[PARAMETERS.index(name)] for name in axes)
+    steps = (a * one + b * other for a in offset for b in offset)
+    found = _similarities(crossing, _estimate(sensor_from_image, scales), steps, threads)
+    return SimilarityMap(axes, offset, found.reshape(points, points))
+
+
+def _similarities(
+    crossing: CrossingSweeps, about: Estimate, steps: Iterator[FloatArray], threads: int
+) -> FloatArray:
+    comparison = crossing.whole(SIGMA_MM, IMAGES, about.sensor_from_image)
+
+    def at(step: FloatArray) -> float:
+        moved = incremented(about, step)
+        return comparison.at(moved.sensor_from_image, moved.scales).mean
+
+    with ThreadPoolExecutor(threads) as pool:
+        return np.array(list(pool.map(at, steps)))
+
+
+def _offsets(span: float, points: int) -> FloatArray:
+    if not (np.isfinite(span) and span > 0 and points >= 2):
+        raise InvalidInputError(
+            f"expected a span above zero and at least two points, got {span:g} and {points}"
+        )
+    return np.linspace(-span, span, points)
+
+
+def _estimate(sensor_from_image: RigidTransform, scales: FloatArray | None) -> Estimate:
+    return Estimate(sensor_from_image, np.ones(2) if scales is None else scales)
 
 
 @dataclass(frozen=True)
@@ -35,9 +136,9 @@ class Pictures:
     title : str
     """
 
-    image: GreyArray
-    before: GreyArray
-    after: GreyArray
+    image: Float32Array
+    before: Float32Array
+    after: Float32Array
     width_mm: float
     height_mm: float
     title: str
@@ -55,8 +156,7 @@ def pictures(
         plane = image_plane(sensor * mounting, grid, PIXEL_MM)
         source = ChosenImages(other.images, frames)
         cuts.append(reslice_frames(source, other.grid, poses, plane, _reach_mm(poses)))
-    alone, flat = RigidTransform.identity(1), image_plane(RigidTransform.identity(), grid, PIXEL_MM)
-    own = reslice_frames(ChosenImages(shown.images, np.array([frame])), grid, alone, flat, 1.0)
+    own = resample_image(shown.images, frame, grid, PIXEL_MM)
     height = grid.depth_mm - grid.first_sample_depth_mm
     return Pictures(own, cuts[0], cuts[1], grid.width_mm, height, f"{shown.name}, frame {frame}")
 
@@ -68,7 +168,7 @@ def figure_images(
     maps: Sequence[SimilarityMap],
     title: str,
 ) -> Figure:
-    """One page: images beside reslices before and after, similarity about the answer, what errors do.
+    """One page: images beside reslices before and after, similarity curves and maps, strength of the sweeps.
 
     The maps are Figure 4 of [1]_.
 
@@ -90,7 +190,7 @@ def figure_images(
             _draw_image(axes, image, each, what)
     for axes, first, unit in ((panels[rows, 0], 3, "mm"), (panels[rows, 1], 0, "degrees")):
         for k, colour in zip(range(first, first + 3), _COLOURS, strict=True):
-            axes.plot(curves.offset, curves.similarity[k], color=colour, label=AXES[k])
+            axes.plot(curves.offset, curves.similarity[k], color=colour, label=PARAMETERS[k])
         _label(axes, f"off the answer / {unit}", "mean correlation")
         axes.legend(fontsize=8)
     _draw_strength(panels[rows, 2], angulation)
@@ -100,65 +200,13 @@ def figure_images(
     return figure
 
 
-def figure_reconstruction_error(
-    alpha_rad: float = -np.pi / 6,
-    point_mm: Sequence[float] = (40.0, 20.0, 0.0),
-    distance_mm: float = 100.0,
-    reach: float = 20.0,
-) -> Figure:
-    """Figure 2 of [1]_: how far apart two perpendicular fans put one point, against each calibration error.
-
-    Parameters
-    ----------
-    alpha_rad : float
-        Tilt of the first image; the second's follows from the point (equation 7).
-    point_mm : sequence of float
-        The point in the first image.
-    distance_mm : float
-        From the axis of the fans to the image's origin.
-    reach : float
-        Largest error, in mm and in degrees.
-
-    References
-    ----------
-    .. [1] Wein and Khamene, SPIE Medical Imaging 6920, 2008.
-    """
-    u, v, _ = point_mm
-    beta = -np.arctan(-u / ((v - distance_mm) * np.cos(alpha_rad)))
-    first = RigidTransform.from_rotation(Rotation.from_rotvec([alpha_rad, 0.0, 0.0]))
-    turned = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]) * Rotation.from_rotvec([beta, 0.0, 0.0])
-    second = RigidTransform.from_rotation(turned)
-    mounting = RigidTransform.from_translation([0.0, -distance_mm, 0.0])
-    values = np.linspace(-reach, reach, 81)
-    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, names, unit in zip(figure.subplots(1, 2), ("xyz", "θ"), ("mm", "degrees"), strict=True):
-        for k, colour in enumerate(_COLOURS):
-            errors = _errors(k, values, unit == "mm")
-            apart = [
-                np.linalg.norm(displacement_mm(first, second, mounting, e, list(point_mm))) for e in errors
-            ]
-            name = names[k] if unit == "mm" else f"{names}{'xyz'[k]}"
-            axes.plot(values, apart, color=colour, label=name)
-        _label(axes, f"calibration error / {unit}", "reconstruction error / mm")
-        axes.legend(fontsize=8)
-    return figure
-
-
-def _errors(axis: int, values: FloatArray, shift: bool) -> RigidTransform:
-    along = np.outer(values, np.eye(3)[axis])
-    if shift:
-        return RigidTransform.from_translation(along)
-    return RigidTransform.from_rotation(Rotation.from_rotvec(np.deg2rad(along)))
-
-
 def _reach_mm(poses: RigidTransform) -> float:
-    """A little more than the frames are apart, deep in a fan."""
+    """A little more than the distance between frames deep in a fan."""
     steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
     return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
 
 
-def _draw_image(axes: Axes, image: GreyArray, of: Pictures, title: str) -> None:
+def _draw_image(axes: Axes, image: Float32Array, of: Pictures, title: str) -> None:
     grey = of.image[np.isfinite(of.image)]
     low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
     extent = (0.0, of.width_mm, of.height_mm, 0.0)
@@ -181,7 +229,7 @@ def _unit_of(axis: str) -> str:
 
 
 def _draw_strength(axes: Axes, angulation: Angulation) -> None:
-    """How strongly each error shows, by itself and with the others free to hide it."""
+    """Disagreement caused by each error, by itself and with the other parameters free to make up for it."""
     place = np.arange(len(PARAMETERS))
     axes.bar(place - 0.2, angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
     axes.bar(place + 0.2, angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")

@@ -1,65 +1,33 @@
-"""From two crossing sweeps to a calibration that can be saved, with what shows whether it is right."""
+"""A calibration from two crossing sweeps in the form that is saved, with its notes, figure and verdict."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import Angulation
-from calibration.images.curves import similarity_curves, similarity_map
-from calibration.images.report import figure_images, pictures
-from calibration.images.solver import (
-    SPECKLED_SIMILARITY,
-    Crossing,
-    ImageCalibration,
-    ImageSettings,
-    Improvement,
-    Progress,
-    TrackedImages,
-    calibrate_crossing,
-    prepare,
-)
+from calibration.images.report import figure_images, pictures, similarity_curves, similarity_map
+from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration, Improvement
+from calibration.images.stacks import TrackedImages
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 
 CURVES_TO, CURVE_POINTS, MAP_POINTS = 6.0, 25, 13
 """Reach of the similarity curves and maps in mm and degrees, and how finely they are drawn."""
 
 WEAK_SCALE = 0.01
-"""Standard error of a pixel size above which it is better taken from the scanner, which knows it to that."""
+"""Relative standard error of an estimated pixel size above which the scanner's own value is better."""
 
 MAPS = (("x", "y"), ("z", "tilt"), ("yaw", "roll"))
 _WORSE = 0.02
-"""Correlation held-out frames may lose against a start that was right: twice what starts in one place do."""
+"""Most that the correlation of held-out frames may fall below that at the start: twice what it varies between
+answers from different starts."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """The answer, and the prepared sweeps that it came from."""
-
-    crossing: Crossing
-    result: ImageCalibration
-
-
-def solve(
-    first: TrackedImages,
-    second: TrackedImages,
-    start: RigidTransform,
-    settings: ImageSettings,
-    progress: Progress | None = None,
-) -> Found:
-    """Prepare the sweeps and calibrate; see `calibrate_images`."""
-    crossing = prepare(first, second, progress)
-    return Found(crossing, calibrate_crossing(crossing, start, settings, progress))
-
-
-def as_calibration(
-    found: Found, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
+def calibration_from_images(
+    result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
 ) -> Calibration:
-    """Put an answer into the form that is saved; the second sweep's frames follow the first's."""
-    result, counts = found.result, [len(each.frame_time_s) for each in sweeps]
+    """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
+    counts = [len(each.frame_time_s) for each in sweeps]
     first, second = result.frames_used
     pose = result.sensor_from_image
     return Calibration(
@@ -81,10 +49,9 @@ def as_calibration(
     )
 
 
-def notes_of(found: Found, angulation: Angulation) -> list[str]:
-    """What shows whether the answer is right, in lines."""
-    result = found.result
-    centre = np.sqrt(np.diag(result.covariance_of(found.crossing.centre_mm)))
+def notes_of(result: ImageCalibration, angulation: Angulation) -> list[str]:
+    """Lines for the report that show whether the answer is right."""
+    centre = np.sqrt(np.diag(result.covariance_of(result.sweeps.centre_mm)))
     used, held = result.similarity, result.held_out
     kept = sum(map(len, result.frames_held_out))
     return [
@@ -105,18 +72,19 @@ def _told(gained: Improvement) -> str:
     return f"{before} before, {gained.after:.3f} after"
 
 
-def figure_of(found: Found, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]) -> Figure:
+def figure_of(
+    result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
+) -> Figure:
     """One page: two images beside reslices before and after, similarity curves, what errors would do."""
-    result = found.result
     shown = []
     for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
         held = result.frames_held_out[k] or result.frames_used[k]
         frame = int(held[len(held) // 2])
         shown.append(pictures(one, other, frame, result.start, result.sensor_from_image))
     title = _verdict(result, angulation)
-    crossing, pose, scales = found.crossing, result.sensor_from_image, result.scales
-    curves = similarity_curves(crossing, pose, CURVES_TO, CURVE_POINTS, scales)
-    maps = [similarity_map(crossing, pose, axes, CURVES_TO, MAP_POINTS, scales) for axes in MAPS]
+    about = result.sweeps, result.sensor_from_image
+    curves = similarity_curves(*about, CURVES_TO, CURVE_POINTS, result.scales)
+    maps = [similarity_map(*about, axes, CURVES_TO, MAP_POINTS, result.scales) for axes in MAPS]
     return figure_images(shown, angulation, curves, maps, title)
 
 
@@ -135,7 +103,7 @@ def _parameters(result: ImageCalibration) -> tuple[Parameter, ...]:
 
 
 def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
-    """Frames that were neither used nor kept for the check."""
+    """Reasons of frames that were neither used nor held out, by number."""
     reasons: dict[int, str] = {}
     for k, before in enumerate((0, counts[0])):
         known = {*result.frames_used[k], *result.frames_held_out[k]}

@@ -1,16 +1,27 @@
-"""From a start far off into the reach of Gauss-Newton: many cheap looks, the best followed up."""
+"""Two ways from a rough start to a calibration: a search of a whole box, and the published Nelder-Mead.
+
+The search looks at many places at a coarse resolution, and follows the best of them up with Gauss-Newton at
+finer and finer ones.
+
+References
+----------
+.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
+   Imaging, 2008, section 2.2 (Nelder-Mead).
+"""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
-from calibration.images.crossing import Crossing, Level, Progress
 from calibration.images.fit import Estimate, Refined, refine
+from calibration.images.similarity import Comparison, CrossingSweeps, Level, Progress
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -20,14 +31,14 @@ COMPARED = Level(2.0, images=8)
 DECIDED = Level(1.2, images=8, overlap=0.25)
 
 _GLANCES = 1024
-"""Places looked at: about one in a thousand of +-20 mm and +-20 degrees lies within reach of the answer at
-once, but slopes that lead to it start much farther out."""
+"""Places compared first: about one in a thousand of +-20 mm and +-20 degrees lies in Gauss-Newton's reach,
+but slopes that lead there start much farther out."""
 
 _MORE_GLANCES = 4096
-"""Places looked at where nothing came of those: the right one may lie in a corner of the box."""
+"""Places compared if none of those led to an answer: the right one may lie in a corner of the box."""
 
 _BESIDE = 256
-"""Places looked at about each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
+"""Places compared around each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
 
 _FOLLOWED, _COMPARED, _HOPPED, _DECIDED = 20, 5, 3, 3
 
@@ -35,41 +46,46 @@ _STEPS = 12
 
 _SAME_MM = 1.5
 
+PUBLISHED_IMAGES = 8
+"""Images of each sweep that Nelder-Mead compares; published: 5 to 10."""
+
+MAX_EVALUATIONS = 1500
+"""Limit of Nelder-Mead."""
+
+_SIMPLEX_EDGE = 10.0
+"""Edges of the first simplex, mm and degrees: half of the displacements it is to recover from."""
+
 
 @dataclass(frozen=True)
-class Found:
-    """Where the search ended, and in how many comparisons."""
+class Located:
+    """Where the search or the simplex ended, and after how many comparisons."""
 
     estimate: Estimate
     evaluations: int
+    converged: bool = True
 
 
 def search(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     start: Estimate,
     capture_mm: float,
     capture_rad: float,
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
-) -> Found:
-    """Look all over a box of six parameters about the start.
+) -> Located:
+    """Search a box of six parameters about the start, from coarse to fine.
 
     Raises
     ------
     InsufficientDataError
         If the sweeps show nothing in common anywhere.
     """
-    say = progress or _silent
-    first = start.sensor_from_image
+    box = _Box(crossing, start, capture_mm, capture_rad, pool, progress or _silent)
     looks, followed = 0, []
     for glances in (_GLANCES, _MORE_GLANCES):
         looks += glances
-        best = _glanced(crossing, start, glances, capture_mm, capture_rad, pool, say)
-        followed = [
-            one
-            for one in (_refined(crossing, FOLLOWED, best, pool, say, "following up") if best else [])
-            if _within(first, one.estimate, capture_mm, capture_rad)
-        ]
+        best = box.best_of(glances)
+        followed = box.inside(box.refined(FOLLOWED, best, "following up"))
         if followed:
             break
     if not followed:
@@ -78,98 +94,126 @@ def search(
             f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
             f"of the start, got {got}"
         )
-    compared = _refined(crossing, COMPARED, _distinct(followed, crossing)[:_COMPARED], pool, say, "comparing")
-    # Where the tissue is layered, or repeats itself, the best place so far is often beside the right one.
-    hopped = _beside(crossing, compared[:_HOPPED], capture_mm, capture_rad, pool, say)
-    hopped = [one for one in hopped if _within(first, one.estimate, capture_mm, capture_rad)]
-    again = _refined(crossing, COMPARED, _distinct(hopped, crossing)[:_COMPARED], pool, say, "comparing")
-    best_first = sorted(compared + again, key=lambda one: -one.likeness.score)
-    left = _distinct(best_first, crossing)[:_DECIDED]
-    decided = _refined(crossing, DECIDED, left, pool, say, "deciding")
+    compared = box.refined(COMPARED, _distinct(followed, crossing)[:_COMPARED], "comparing")
+    # In layered or repetitive tissue the best place so far is often a neighbour of the right one.
+    hopped = box.inside(box.beside(compared[:_HOPPED]))
+    again = box.refined(COMPARED, _distinct(hopped, crossing)[:_COMPARED], "comparing")
+    best_first = sorted(compared + again, key=lambda one: -one.similarity.score)
+    decided = box.refined(DECIDED, _distinct(best_first, crossing)[:_DECIDED], "deciding")
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
-    return Found(decided[0].estimate, looks)
+    return Located(decided[0].estimate, looks)
 
 
-def _glanced(
-    crossing: Crossing,
+def climb(
+    crossing: CrossingSweeps,
     start: Estimate,
-    count: int,
-    capture_mm: float,
-    capture_rad: float,
+    scales: bool,
     pool: ThreadPoolExecutor,
-    say: Progress,
-) -> list[Estimate]:
-    """The best of many places all over the box."""
-    places = _spread(start.sensor_from_image, capture_mm, capture_rad, count)
-    glance = crossing.level(GLANCE, start.sensor_from_image)
-    scores = np.empty(len(places))
-    for n, score in enumerate(pool.map(lambda place: glance.at(place, start.scales).score, places)):
-        scores[n] = score
-        say("looking around", n + 1, len(places))
-    most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
-    return [Estimate(places[int(n)], start.scales) for n in np.argsort(-scores)[:most] if scores[n] > -1]
+    progress: Progress | None = None,
+) -> Located:
+    """Maximise the mean correlation by Nelder-Mead over increments of the start; see `incremented`."""
+    comparison = crossing.published(PUBLISHED_IMAGES)
+    count = 0
+
+    def unlike(increment: FloatArray) -> float:
+        nonlocal count
+        count += 1
+        if progress:
+            progress("simplex", count, MAX_EVALUATIONS)
+        at = incremented(start, increment)
+        mean = comparison.at(at.sensor_from_image, at.scales, pool=pool).mean
+        return 1.0 - mean if np.isfinite(mean) else 2.0
+
+    size = 8 if scales else 6
+    corners = np.vstack([np.zeros(size), np.diag([_SIMPLEX_EDGE] * 6 + [2.0] * (size - 6))])
+    found = minimize(
+        unlike,
+        np.zeros(size),
+        method="Nelder-Mead",
+        options={"initial_simplex": corners, "xatol": 0.02, "fatol": 1e-5, "maxfev": MAX_EVALUATIONS},
+    )
+    return Located(incremented(start, found.x), int(found.nfev), bool(found.success))
 
 
-def _beside(
-    crossing: Crossing,
-    about: list[Refined],
-    capture_mm: float,
-    capture_rad: float,
-    pool: ThreadPoolExecutor,
-    say: Progress,
-) -> list[Refined]:
-    """Look around the best places, in a box of half the capture, and follow up the best of what is there."""
-    best: list[Estimate] = []
-    for number, one in enumerate(about):
-        estimate = one.estimate
-        comparison = crossing.level(FOLLOWED, estimate.sensor_from_image)
-        places = _spread(estimate.sensor_from_image, 0.5 * capture_mm, 0.5 * capture_rad, _BESIDE)
-        found = list(
-            pool.map(lambda place, at=comparison, by=estimate: at.at(place, by.scales).score, places)
-        )
-        chosen = np.argsort(-np.array(found))[: _FOLLOWED // len(about)]
-        best += [Estimate(places[int(n)], estimate.scales) for n in chosen if found[int(n)] > -1]
-        say("looking beside", number + 1, len(about))
-    return _refined(crossing, FOLLOWED, best, pool, say, "following up") if best else []
+def incremented(start: Estimate, increment: FloatArray) -> Estimate:
+    """Right-multiply by Euler angles about x, y, z in degrees and mm; scale pixels by per cent, if given."""
+    turn = Rotation.from_euler("xyz", increment[:3], degrees=True)
+    moved = start.sensor_from_image * RigidTransform.from_components(increment[3:6], turn)
+    scales = start.scales * (1.0 + 0.01 * increment[6:8]) if len(increment) > 6 else start.scales
+    return Estimate(moved, scales)
 
 
-def _spread(first: RigidTransform, capture_mm: float, capture_rad: float, count: int) -> list[RigidTransform]:
-    """The start, and places spread evenly from which an increment within the box leads to it."""
-    places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
-    places[0] = 0.0
-    turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
-    away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
-    return list(first * away.inv())
+@dataclass(frozen=True)
+class _Box:
+    """A box of calibrations about a start, and how to compare and refine places in it."""
+
+    crossing: CrossingSweeps
+    start: Estimate
+    mm: float
+    rad: float
+    pool: ThreadPoolExecutor
+    say: Progress
+
+    def best_of(self, count: int) -> list[Estimate]:
+        """Compare many places all over the box, and return the best."""
+        places = self._spread(self.start, 1.0, count)
+        glance = self.crossing.level(GLANCE, self.start.sensor_from_image)
+        scores = np.empty(len(places))
+        for n, score in enumerate(self.pool.map(partial(_score, glance), places)):
+            scores[n] = score
+            self.say("looking around", n + 1, len(places))
+        most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
+        return [places[int(n)] for n in np.argsort(-scores)[:most] if scores[n] > -1]
+
+    def beside(self, about: list[Refined]) -> list[Refined]:
+        """Compare places around the best ones, in boxes of half the size, and refine the best found there."""
+        best: list[Estimate] = []
+        for number, one in enumerate(about):
+            comparison = self.crossing.level(FOLLOWED, one.estimate.sensor_from_image)
+            places = self._spread(one.estimate, 0.5, _BESIDE)
+            scores = np.array(list(self.pool.map(partial(_score, comparison), places)))
+            chosen = np.argsort(-scores)[: _FOLLOWED // len(about)]
+            best += [places[int(n)] for n in chosen if scores[n] > -1]
+            self.say("looking beside", number + 1, len(about))
+        return self.refined(FOLLOWED, best, "following up")
+
+    def refined(self, level: Level, starts: list[Estimate], stage: str) -> list[Refined]:
+        """Refine each start, best first."""
+        if not starts:
+            return []
+        comparison = self.crossing.level(level, starts[0].sensor_from_image)
+        done = []
+        for one in self.pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
+            done.append(one)
+            self.say(stage, len(done), len(starts))
+        return sorted(done, key=lambda one: -one.similarity.score)
+
+    def inside(self, found: list[Refined]) -> list[Refined]:
+        """Keep those within 1.2 times the distance of the box's corners from the start."""
+        far, kept = np.sqrt(3.0) * 1.2, []
+        for one in found:
+            step = one.estimate.sensor_from_image.inv() * self.start.sensor_from_image
+            length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
+            if length <= far * self.mm + 1.0 and angle <= far * self.rad + 0.02:
+                kept.append(one)
+        return kept
+
+    def _spread(self, about: Estimate, part: float, count: int) -> list[Estimate]:
+        """A place, and a Sobol sequence of those from which an increment in part of the box leads to it."""
+        places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
+        places[0] = 0.0
+        turn = Rotation.from_euler("xyz", part * self.rad * places[:, :3])
+        away = RigidTransform.from_components(part * self.mm * places[:, 3:], turn)
+        return [Estimate(place, about.scales) for place in about.sensor_from_image * away.inv()]
 
 
-def _refined(
-    crossing: Crossing,
-    level: Level,
-    starts: list[Estimate],
-    pool: ThreadPoolExecutor,
-    say: Progress,
-    stage: str,
-) -> list[Refined]:
-    """Refine each, best first."""
-    comparison = crossing.level(level, starts[0].sensor_from_image)
-    done = []
-    for one in pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
-        done.append(one)
-        say(stage, len(done), len(starts))
-    return sorted(done, key=lambda one: -one.likeness.score)
+def _score(comparison: Comparison, place: Estimate) -> float:
+    return comparison.at(place.sensor_from_image, place.scales).score
 
 
-def _within(first: RigidTransform, found: Estimate, capture_mm: float, capture_rad: float) -> bool:
-    """Whether a place is no farther from the start than a corner of the box, and a fifth."""
-    step = found.sensor_from_image.inv() * first
-    far = np.sqrt(3.0) * 1.2
-    length, angle = np.linalg.norm(step.translation), step.rotation.magnitude()
-    return bool(length <= far * capture_mm + 1.0 and angle <= far * capture_rad + 0.02)
-
-
-def _distinct(found: list[Refined], crossing: Crossing) -> list[Estimate]:
-    """Estimates, less those that came to the same place as a better one."""
+def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:
+    """Estimates without those within `_SAME_MM` of a better one."""
     kept: list[Estimate] = []
     for one in found:
         if all(_apart(one.estimate, other, crossing.centre_mm) > _SAME_MM for other in kept):
@@ -178,7 +222,7 @@ def _distinct(found: list[Refined], crossing: Crossing) -> list[Estimate]:
 
 
 def _apart(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
-    """Distance, mm: of the centre, and of what turns about it 20 mm away."""
+    """Distance between estimates, mm: of the image's centre and of points that turn 20 mm away from it."""
     step = other.sensor_from_image.inv() * one.sensor_from_image
     moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))
     return float(np.hypot(moved, 20.0 * step.rotation.magnitude()))

@@ -1,48 +1,45 @@
-"""How alike the images of two sweeps are for a given calibration, each compared with cuts of the other."""
+"""Similarity of two crossing sweeps for a given calibration: patches of one compared with cuts of the other.
+
+`prepare` reads the sweeps once; `CrossingSweeps` then makes a `Comparison` at any resolution.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.stacks import Stack
+from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, TrackedImages, read_stack
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.kernels.slicing import PARAMETERS, compare_patches
+from speckle3d.core.errors import MismatchError
+from speckle3d.kernels.slicing import PARAMETERS, PatchGrid, PatchScores, PlacedImages, compare_patches
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, the number of its steps that are done, and the number of all."""
+
+USUAL_EXTENT_MM = 40.0
+"""Geometric mean of width and depth of images whose `CrossingSweeps.unit` is one."""
+
+LEAST_OVERLAP = 0.3
+"""Part of an image that the other sweep must show for the image to count (Wein and Khamene 2008)."""
+
+_HELD_OUT_EVERY = 12
+_MOST_HELD_OUT = 8
 
 LEAST_SHARE = 0.5
 """Part of a patch that the other sweep must show."""
 
 FEWEST_PATCHES = 0.1
-"""Part of the patches that must have support; fewer say nothing of how well the sweeps fit."""
+"""Part of the patches that must have support for the score to mean anything."""
 
 
 @dataclass(frozen=True)
-class Patches:
-    """Squares of grid points on some of a sweep's images.
-
-    Attributes
-    ----------
-    where : ndarray of int, shape (p, 3)
-        Number of the image in its stack, and first pixel.
-    sides : tuple of int
-        Points along u and v.
-    stride : int
-        Pixels between them.
-    """
-
-    where: IntArray
-    sides: tuple[int, int]
-    stride: int
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """Correlation of patches with the other sweep, both ways, one after the other.
+class Similarity:
+    """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
 
     Attributes
     ----------
@@ -72,10 +69,10 @@ class Likeness:
 
     @property
     def score(self) -> float:
-        """Mean correlation by contrast, times the root of the share of patches that have support.
+        """Mean correlation weighted by contrast, times the root of the share of patches that have support.
 
-        For comparing places far apart: chance correlations fall with the root of the number of patches, so
-        that a few patches that happen to be alike do not win over many that are.
+        Made for comparing places far apart. Chance correlations fall with the root of the number of patches,
+        so the factor keeps a few patches that correlate by chance from winning over many that do rightly.
         """
         valid = self.valid
         if valid.sum() < max(3.0, FEWEST_PATCHES * len(valid)):
@@ -87,13 +84,13 @@ class Likeness:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two stacks, and patches on each that are looked for in the other.
+    """Two stacks, with patches on each that are compared with the other.
 
-    `sources` are the stacks that are cut, the other one's patches against each; by default the stacks.
+    `sources` are the stacks that are cut; by default the stacks themselves.
     """
 
     stacks: tuple[Stack, Stack]
-    patches: tuple[Patches, Patches]
+    patches: tuple[PatchGrid, PatchGrid]
     max_gap_mm: float
     sources: tuple[Stack, Stack] | None = None
     least_share: float = LEAST_SHARE
@@ -104,13 +101,13 @@ class Comparison:
         scales: FloatArray | None = None,
         derivatives: bool = False,
         pool: ThreadPoolExecutor | None = None,
-    ) -> Likeness:
+    ) -> Similarity:
         """Compare at a calibration; pixel sizes are multiplied by `scales`, shape (2,)."""
         matrix = sensor_from_image.as_matrix()
         factor = np.ones(2) if scales is None else scales
         run = pool.map if pool else map
         parts = list(run(lambda way: self._one_way(way, matrix, factor, derivatives), (0, 1)))
-        return Likeness(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     @property
     def images(self) -> IntArray:
@@ -131,40 +128,35 @@ class Comparison:
             rows.append(np.einsum("pij,pj->pi", poses, local)[:, :3])
         return np.concatenate(rows)
 
-    def _one_way(
-        self, way: int, matrix: FloatArray, factor: FloatArray, derivatives: bool
-    ) -> tuple[FloatArray, ...]:
+    def _one_way(self, way: int, matrix: FloatArray, factor: FloatArray, derivatives: bool) -> PatchScores:
         sample, patches = self.stacks[way], self.patches[way]
         source = (self.sources or self.stacks)[1 - way]
-        count = len(patches.where)
-        alike, share, energy = np.empty(count), np.empty(count), np.empty((count, 2))
+        count, pixels = len(patches.where), np.tile(factor, 2)
         size = count if derivatives else 0
-        normal, gradient = np.empty((size, PARAMETERS, PARAMETERS)), np.empty((size, PARAMETERS))
+        found = PatchScores(
+            np.empty(count),
+            np.empty((count, 2)),
+            np.empty(count),
+            np.empty((size, PARAMETERS, PARAMETERS)),
+            np.empty((size, PARAMETERS)),
+        )
+        world_from_sample = np.ascontiguousarray((sample.sensor_matrices @ matrix)[:, :3])
+        source_from_world = _inverted(source.sensor_matrices @ matrix)
         compare_patches(
-            sample.images,
-            np.ascontiguousarray((sample.sensor_matrices @ matrix)[:, :3]),
-            sample.pixels * np.tile(factor, 2),
-            source.images,
-            _inverted(source.sensor_matrices @ matrix),
-            source.pixels * np.tile(factor, 2),
-            patches.where,
-            patches.sides,
-            patches.stride,
+            PlacedImages(sample.images, world_from_sample, sample.pixels * pixels),
+            PlacedImages(source.images, source_from_world, source.pixels * pixels),
+            patches,
             self.max_gap_mm,
             self.least_share,
-            alike,
-            energy,
-            share,
-            normal,
-            gradient,
+            found,
         )
-        return alike, energy, share, normal, gradient
+        return found
 
 
 def spread_patches(
     stack: Stack, images: Sequence[int] | IntArray, side: int, spacing_mm: float, overlap: float = 0.5
-) -> Patches:
-    """Square patches all over some images, leaving out those that mostly show nothing.
+) -> PatchGrid:
+    """Square patches all over some images, without those that are mostly empty.
 
     Parameters
     ----------
@@ -185,15 +177,180 @@ def spread_patches(
         for a, b in product(starts[0].astype(int), starts[1].astype(int)):
             if there[a : a + reach + 1 : stride, b : b + reach + 1 : stride].mean() > LEAST_SHARE:
                 kept.append((image, a, b))
-    return Patches(np.array(kept, dtype=np.int64).reshape(-1, 3), (side, side), stride)
+    return PatchGrid(np.array(kept, dtype=np.int64).reshape(-1, 3), (side, side), stride)
 
 
-def whole_images(stack: Stack, images: IntArray, spacing_mm: float) -> Patches:
+def whole_images(stack: Stack, images: IntArray, spacing_mm: float) -> PatchGrid:
     """One patch over each of some images, its points about `spacing_mm` apart."""
     stride = max(1, round(spacing_mm / float(stack.pixels[:2].mean())))
     u, v = ((n - 1) // stride + 1 for n in stack.images.shape[1:])
     where = np.column_stack([images, np.zeros((len(images), 2), np.int64)]).astype(np.int64)
-    return Patches(where, (u, v), stride)
+    return PatchGrid(where, (u, v), stride)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution of comparison, in units of `CrossingSweeps.unit`.
+
+    Attributes
+    ----------
+    sigma_mm : float
+        Standard deviation of the blur.
+    images : int
+        How many of each sweep are compared.
+    side : int
+        Points along a patch's side, `sigma_mm` apart.
+    overlap : float
+        Of neighbouring patches.
+    least_weight : float
+        Share of the blur that must lie on the image.
+    """
+
+    sigma_mm: float
+    images: int = 12
+    side: int = 7
+    overlap: float = 0.5
+    least_weight: float = WHOLE
+
+
+@dataclass(frozen=True)
+class CrossingSweeps:
+    """Two sweeps' images, reduced, with some frames of each held out for a check.
+
+    Attributes
+    ----------
+    used, held_out : tuple of Stack
+    frames_used, frames_held_out : tuple of ndarray of int
+        Their frame numbers.
+    pixel_mm : ndarray, shape (2,)
+        Of the images as they were given, across and along the beams.
+    unit : float
+        Size of the images relative to the usual; lengths of comparison scale with it.
+    """
+
+    used: tuple[Stack, Stack]
+    held_out: tuple[Stack, Stack]
+    frames_used: tuple[IntArray, IntArray]
+    frames_held_out: tuple[IntArray, IntArray]
+    pixel_mm: FloatArray
+    unit: float
+    _kept: dict[tuple[int, float, float, bool], Stack] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    @property
+    def centre_mm(self) -> FloatArray:
+        """Centre of the first sweep's images, shape (3,)."""
+        return self.used[0].centre_mm
+
+    def level(self, level: Level, sensor_from_image: RigidTransform) -> Comparison:
+        """Comparison of patches all over some images, for calibrations near the given one."""
+        sigma = level.sigma_mm * self.unit
+        thin = self._thinned(sigma, sensor_from_image, level.least_weight)
+        patches = [
+            spread_patches(stack, evenly(len(stack), level.images), level.side, sigma, level.overlap)
+            for stack in thin
+        ]
+        return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
+
+    def whole(self, sigma_mm: float, images: int, sensor_from_image: RigidTransform) -> Comparison:
+        """Comparison of whole blurred images, as in the published method, near a calibration."""
+        sigma = sigma_mm * self.unit
+        thin = self._thinned(sigma, sensor_from_image)
+        a, b = (whole_images(stack, evenly(len(stack), images), sigma) for stack in thin)
+        gap = self._gap(sigma, thin, sensor_from_image)
+        return Comparison(thin, (a, b), gap, least_share=LEAST_OVERLAP)
+
+    def check(self, sigma_mm: float, sensor_from_image: RigidTransform) -> Comparison:
+        """Comparison of the held-out images with the other sweep's used ones, near a calibration."""
+        sigma = sigma_mm * self.unit
+        thin = self._thinned(sigma, sensor_from_image)
+        held = (
+            self._blurred(0, sigma, held_out=True),
+            self._blurred(1, sigma, held_out=True),
+        )
+        a, b = (whole_images(stack, np.arange(len(stack)), sigma) for stack in held)
+        gap = self._gap(sigma, thin, sensor_from_image)
+        return Comparison(held, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
+
+    def published(self, images: int) -> Comparison:
+        """Comparison of whole images, not thinned, with all of the other sweep's: the published method."""
+        fine = self._blurred(0, 0.5 * self.unit), self._blurred(1, 0.5 * self.unit)
+        a, b = (whole_images(stack, evenly(len(stack), images), 0.7 * self.unit) for stack in fine)
+        return Comparison(fine, (a, b), max(2.0 * self.unit, 2.0), least_share=LEAST_OVERLAP)
+
+    def _thinned(
+        self, sigma_mm: float, sensor_from_image: RigidTransform, least_weight: float = WHOLE
+    ) -> tuple[Stack, Stack]:
+        spacing = [frame_spacing(stack, sensor_from_image) for stack in self.used]
+        a, b = (
+            self._blurred(way, sigma_mm, least_weight).thinned(
+                sensor_from_image,
+                max(0.75 * sigma_mm, spacing[way]),
+                max(0.7 * sigma_mm, 0.5 * spacing[way]),
+            )
+            for way in (0, 1)
+        )
+        return a, b
+
+    def _blurred(
+        self, way: int, sigma_mm: float, least_weight: float = WHOLE, held_out: bool = False
+    ) -> Stack:
+        key = way, sigma_mm, least_weight, held_out
+        if key not in self._kept:
+            self._kept[key] = (self.held_out if held_out else self.used)[way].blurred(sigma_mm, least_weight)
+        return self._kept[key]
+
+    def _gap(self, sigma_mm: float, stacks: tuple[Stack, Stack], sensor_from_image: RigidTransform) -> float:
+        """Largest gap that is interpolated across: three times the usual distance between images."""
+        spacing = max(frame_spacing(stack, sensor_from_image) for stack in stacks)
+        return max(2.25 * sigma_mm, 3.0 * spacing, 2.0 * self.unit)
+
+
+def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | None = None) -> CrossingSweeps:
+    """Read two crossing sweeps and set some frames aside.
+
+    Raises
+    ------
+    InvalidInputError
+        If images do not fit their grid.
+    MismatchError
+        If the sweeps' images have different pixel sizes or depths: one calibration cannot serve both.
+    InsufficientDataError
+        If a sweep has too few frames with readings, or its images never change.
+    """
+    _require_one_scanner(first, second)
+    grid = first.grid
+    extent = float(np.sqrt(max(grid.width_mm, 1.0) * (grid.depth_mm - grid.first_sample_depth_mm)))
+    unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
+    stacks, numbers = [], []
+    for tracked in (first, second):
+        step = None if progress is None else _step_of(progress, f"reading {tracked.name}")
+        stack, frames = read_stack(tracked, BASE_PIXEL_MM * unit, step)
+        stacks.append(stack)
+        numbers.append(frames)
+    aside = [_set_aside(len(stack)) for stack in stacks]
+    kept = [np.setdiff1d(np.arange(len(s)), out) for s, out in zip(stacks, aside, strict=True)]
+    return CrossingSweeps(
+        (stacks[0][kept[0]], stacks[1][kept[1]]),
+        (stacks[0][aside[0]], stacks[1][aside[1]]),
+        (numbers[0][kept[0]], numbers[1][kept[1]]),
+        (numbers[0][aside[0]], numbers[1][aside[1]]),
+        np.array([grid.vector_pitch_mm, grid.sample_spacing_mm]),
+        unit,
+    )
+
+
+def evenly(count: int, wanted: int) -> IntArray:
+    """Numbers of `wanted` images spread evenly over `count`, without the two at the ends."""
+    spread = np.linspace(0.5, count - 1.5, min(wanted, count)).round()
+    return np.unique(np.clip(spread, 0, count - 1).astype(np.int64))
+
+
+def frame_spacing(stack: Stack, sensor_from_image: RigidTransform) -> float:
+    """Mean distance between neighbouring images along their normals, mm."""
+    way = stack.travelled(sensor_from_image)
+    return float(way[-1] / max(len(way) - 1, 1))
 
 
 def _inverted(matrices: FloatArray) -> FloatArray:
@@ -202,3 +359,24 @@ def _inverted(matrices: FloatArray) -> FloatArray:
     out[:, :, :3] = np.swapaxes(matrices[:, :3, :3], 1, 2)
     out[:, :, 3] = -np.einsum("nij,nj->ni", out[:, :, :3], matrices[:, :3, 3])
     return out
+
+
+def _set_aside(count: int) -> IntArray:
+    wanted = min(_MOST_HELD_OUT, max(1, count // _HELD_OUT_EVERY))
+    return np.unique((np.arange(1, 2 * wanted, 2) * count / (2.0 * wanted)).astype(np.int64))
+
+
+def _step_of(progress: Progress, stage: str) -> Callable[[int, int], None]:
+    return lambda done, total: progress(stage, done, total)
+
+
+def _require_one_scanner(first: TrackedImages, second: TrackedImages) -> None:
+    a, b = (
+        np.array([t.grid.vector_pitch_mm, t.grid.sample_spacing_mm, t.grid.first_sample_depth_mm])
+        for t in (first, second)
+    )
+    if not np.allclose(a, b, rtol=1e-3, atol=1e-6):
+        raise MismatchError(
+            f"{second.name}: expected the pixels of {first.name}, {a[0]:g} x {a[1]:g} mm from {a[2]:g} mm, "
+            f"got {b[0]:g} x {b[1]:g} mm from {b[2]:g} mm"
+        )

@@ -1,7 +1,7 @@
-"""Calibration without a phantom: two crossing sweeps of anything with structure must agree with each other.
+"""Calibration without a phantom, from two crossing sweeps of anything with structure.
 
-Images of each sweep are compared with what the other shows in their place, cut straight from its frames, and
-the calibration is moved until they are as alike as they can be.
+Images of each sweep are compared with cuts straight from the other's frames, and the calibration is changed
+until the correlation is largest.
 
 References
 ----------
@@ -12,40 +12,32 @@ References
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.covariance import covariance_at_origin, point_covariance
-from calibration.images.crossing import Crossing, Level, Progress, prepare
-from calibration.images.curvature import Settled, curvature, settle
-from calibration.images.fit import Estimate, Refined, refine
-from calibration.images.search import DECIDED, search
-from calibration.images.similarity import Comparison
-from calibration.images.simplex import climb
+from calibration.images.fit import (
+    Estimate,
+    Refined,
+    Settled,
+    covariance_at_origin,
+    curvature,
+    point_covariance,
+    refine,
+    settle,
+)
+from calibration.images.search import DECIDED, climb, search
+from calibration.images.similarity import Comparison, CrossingSweeps, Level, Progress, prepare
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
-__all__ = [
-    "Crossing",
-    "ImageCalibration",
-    "ImageSettings",
-    "Improvement",
-    "Progress",
-    "TrackedImages",
-    "calibrate_crossing",
-    "calibrate_images",
-    "prepare",
-]
-
-Method = Literal["gauss-newton", "nelder-mead"]
-
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
-"""Resolutions at which the answer of the search is refined. The last is still coarser than speckle; many
-images tell more there than patches that overlap, since every pose errs for itself."""
+"""Resolutions at which the search's answer is refined. The last is still coarser than speckle; there many
+images are worth more than overlapping patches, since the errors of their poses are independent."""
 
 SHOWN_SIGMA_MM = 1.0
 """Blur at which similarities are reported, in units of the crossing."""
@@ -56,12 +48,11 @@ below which sweeps are taken to show too little in common. Of sweeps of differen
 0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
 
 SPECKLED_SIMILARITY = 0.45
-"""Below, the verdict warns: shadows and reflections that the sweeps do not share displaced such answers by up
-to a millimetre and two degrees, more than the covariance says."""
+"""Correlation below which the verdict warns: shadows and reflections that the sweeps do not share
+displaced such answers by up to a millimetre and two degrees, more than the covariance says."""
 
 
-@dataclass(frozen=True)
-class ImageSettings:
+class ImageSettings(BaseModel):
     """How to calibrate from two crossing sweeps.
 
     Parameters
@@ -78,23 +69,13 @@ class ImageSettings:
     threads : int
     """
 
-    method: Method = "gauss-newton"
-    scales: bool = False
-    capture_mm: float = 20.0
-    capture_deg: float = 20.0
-    threads: int = 2
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-    def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise InvalidInputError(
-                f"method: expected one of {', '.join(get_args(Method))}, got {self.method!r}"
-            )
-        for name, most in (("capture_mm", 100.0), ("capture_deg", 90.0)):
-            value = getattr(self, name)
-            if not 0.0 <= value <= most:
-                raise InvalidInputError(f"{name}: expected 0 to {most:g}, got {value}")
-        if self.threads < 1:
-            raise InvalidInputError(f"threads: expected at least 1, got {self.threads}")
+    method: Literal["gauss-newton", "nelder-mead"] = "gauss-newton"
+    scales: bool = False
+    capture_mm: float = Field(20.0, ge=0, le=100)
+    capture_deg: float = Field(20.0, ge=0, le=90)
+    threads: int = Field(2, ge=1)
 
 
 @dataclass(frozen=True)
@@ -138,9 +119,11 @@ class ImageCalibration:
         Frame numbers in either sweep.
     evaluations : int
         How many times the sweeps were compared.
+    sweeps : CrossingSweeps
+        What was compared.
     """
 
-    method: Method
+    method: str
     start: RigidTransform
     sensor_from_image: RigidTransform
     scales: FloatArray
@@ -156,6 +139,7 @@ class ImageCalibration:
     frames_held_out: tuple[tuple[int, ...], tuple[int, ...]]
     evaluations: int
     converged: bool
+    sweeps: CrossingSweeps = field(repr=False)
 
     def covariance_of(self, point_mm: FloatArray) -> FloatArray:
         """Covariance of where a point of the image lies, along the image's axes, shape (3, 3), mm^2."""
@@ -185,16 +169,16 @@ def calibrate_images(
     InsufficientDataError
         If there are too few frames, or the sweeps do not overlap or have nothing in common.
     """
-    return calibrate_crossing(prepare(first, second, progress), start, settings, progress)
+    return calibrate_from_sweeps(prepare(first, second, progress), start, settings, progress)
 
 
-def calibrate_crossing(
-    crossing: Crossing,
+def calibrate_from_sweeps(
+    crossing: CrossingSweeps,
     start: RigidTransform,
     settings: ImageSettings | None = None,
     progress: Progress | None = None,
 ) -> ImageCalibration:
-    """Calibrate from sweeps that are prepared already: `calibrate_images` for many starts."""
+    """Calibrate as `calibrate_images`, from sweeps that are prepared already: for many starts."""
     if not start.single:
         raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageSettings()
@@ -217,7 +201,7 @@ def calibrate_crossing(
 
 
 def _within_reach(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     first: Estimate,
     settings: ImageSettings,
     pool: ThreadPoolExecutor,
@@ -231,7 +215,7 @@ def _within_reach(
 
 
 def _refined(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     found: Estimate,
     settings: ImageSettings,
     pool: ThreadPoolExecutor,
@@ -246,8 +230,10 @@ def _refined(
     return refined, evaluations
 
 
-def _look(crossing: Crossing, found: Estimate, settings: ImageSettings, pool: ThreadPoolExecutor) -> Refined:
-    """The derivatives at an answer that was found without them."""
+def _look(
+    crossing: CrossingSweeps, found: Estimate, settings: ImageSettings, pool: ThreadPoolExecutor
+) -> Refined:
+    """Compute the derivatives at an answer that was found without them."""
     comparison = crossing.level(FINE[-1], found.sensor_from_image)
     return refine(comparison, found, _free(settings), max_steps=1, pool=pool)
 
@@ -256,8 +242,8 @@ def _free(settings: ImageSettings) -> tuple[int, ...]:
     return tuple(range(8 if settings.scales else 6))
 
 
-def _require_alike(crossing: Crossing, found: Estimate, pool: ThreadPoolExecutor) -> float:
-    """How alike the sweeps are at an answer, where speckle is blurred away."""
+def _require_alike(crossing: CrossingSweeps, found: Estimate, pool: ThreadPoolExecutor) -> float:
+    """Score of the sweeps at an answer, with speckle blurred away; refuse one below `LEAST_SIMILARITY`."""
     seen = crossing.level(DECIDED, found.sensor_from_image)
     score = seen.at(found.sensor_from_image, found.scales, pool=pool).score
     if score < LEAST_SIMILARITY:
@@ -270,7 +256,7 @@ def _require_alike(crossing: Crossing, found: Estimate, pool: ThreadPoolExecutor
 
 
 def _result(
-    crossing: Crossing,
+    crossing: CrossingSweeps,
     settings: ImageSettings,
     first: Estimate,
     found: Estimate,
@@ -299,6 +285,7 @@ def _result(
         frames_held_out=_numbers(crossing.frames_held_out),
         evaluations=evaluations,
         converged=converged,
+        sweeps=crossing,
     )
 
 

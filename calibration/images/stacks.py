@@ -1,8 +1,8 @@
-"""Tracked images made ready for comparison: reduced, blurred alike in all directions, thinned.
+"""Tracked images made ready for comparison: reduced, blurred, thinned.
 
-Interpolation smooths, and a similarity rewards what is smooth alike. So both sides of every comparison are
-brought to one resolution first: blurred within the images, and across them by averaging neighbours, coarser
-than speckle and than the distance between images.
+Interpolation smooths, and smoothing alone changes a similarity. So both sides of every comparison are first
+brought to one resolution, coarser than speckle and than the distance between images: blurred within the
+images, and averaged with their neighbours across them.
 """
 
 from __future__ import annotations
@@ -12,29 +12,28 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import GreyArray, Images, PosedImages
+from speckle3d.imaging.images import Images, PosedImages
 
 BASE_PIXEL_MM = 0.35
-"""Images are reduced to about this: half the finest blur that comparisons use."""
+"""Pixel size to which images are reduced: half the finest blur that comparisons use."""
 
 FEWEST_FRAMES = 10
 
 WHOLE = 0.93
-"""Share of a Gaussian that lies on an image from one and a half standard deviations within its border on."""
+"""Share of a Gaussian that lies on the image if its centre is 1.5 standard deviations or more inside."""
 
 _PIXELS_PER_BLUR = 2.0
-"""Pixels to a standard deviation of the blur: linear interpolation then loses under 2 % of any wave left."""
+"""Pixels per standard deviation of the blur, so that linear interpolation loses under 2 % of any wave."""
 
 _SMOOTHED_FRAMES = 3.0
-"""Over how many frames a tracker's jitter is averaged before the way it travelled is measured."""
+"""Standard deviation, in frames, of the smoothing of positions before the distance travelled is measured."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class Stack:
     world_from_sensor : RigidTransform, length n
     """
 
-    images: GreyArray
+    images: Float32Array
     pixels: FloatArray
     world_from_sensor: RigidTransform
 
@@ -113,14 +112,14 @@ class Stack:
         return np.column_stack([self.pixels[2:] + share * last * self.pixels[:2], np.zeros(4)])
 
     def blurred(self, sigma_mm: float, least_weight: float = WHOLE) -> Stack:
-        """The same images with a Gaussian over them, on as few pixels as it needs.
+        """Blur the images by a Gaussian and reduce them to the pixels it needs.
 
         Parameters
         ----------
         least_weight : float
-            Share of the Gaussian that must lie on the image. At a border it shows what lies farther in, in
-            all images alike, which pulls a calibration along the beams: half a millimetre at a blur of
-            2 mm, if a half of it is enough.
+            Share of the Gaussian that must lie on the image. At a border a truncated Gaussian shows what
+            lies farther in, alike in all images, which biases a calibration along the beams: by half a
+            millimetre at a blur of 2 mm with a share of a half.
         """
         sigma = np.append(0.0, sigma_mm / self.pixels[:2])
         there = np.isfinite(self.images)
@@ -135,9 +134,9 @@ class Stack:
         return replace(self, images=few, pixels=pixels)
 
     def travelled(self, sensor_from_image: RigidTransform) -> FloatArray:
-        """Distance along the normals up to each image, mm, mean of the corners; a tracker's jitter taken out.
+        """Distance travelled along the normals up to each image, mm: mean of the corners, smoothed.
 
-        The corners, since the centre of a fan stays where it is if the start puts it on the fan's axis.
+        Corners are used since the centre of a fan does not move if the start puts it on the fan's axis.
         """
         poses = self.world_from_sensor * sensor_from_image
         normal = poses.rotation.apply([0.0, 0.0, 1.0])[1:]
@@ -148,12 +147,12 @@ class Stack:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def thinned(self, sensor_from_image: RigidTransform, spacing_mm: float, sigma_mm: float) -> Stack:
-        """Gaussian means of neighbouring images and their poses, at equal distances along the sweep.
+        """Average neighbouring images and their poses by a Gaussian, at equal distances along the sweep.
 
         Parameters
         ----------
         sensor_from_image : RigidTransform
-            About right: says how far the images are apart, and where their centres are held.
+            Roughly: for the distance between images, and for the centres that averaging keeps in place.
         """
         to_centre = sensor_from_image * RigidTransform.from_translation(self.centre_mm)
         centre = self.world_from_sensor * to_centre
@@ -161,7 +160,7 @@ class Stack:
         count = max(2, int(way[-1] / spacing_mm) + 1)
         knots = np.linspace(way[0], way[-1], count)
         weight = np.exp(-0.5 * ((way - knots[:, None]) / sigma_mm) ** 2) + 1e-12
-        # A pause is not more of an image: frames count by the way they stand for.
+        # Frames count by the distance they stand for, so that a pause does not outweigh its neighbours.
         weight *= np.maximum(np.gradient(way), 1e-3 * way[-1] / len(way))
         weight /= weight.sum(axis=1, keepdims=True)
         turn = Rotation.concatenate([centre.rotation.mean(row) for row in weight])
@@ -200,7 +199,7 @@ def read_stack(
         )
     images = np.empty(shape, np.float32)
     for n, frame in enumerate(frames):
-        images[n] = _binned(source.read(int(frame)), bins, shape[1:])
+        images[n] = block_means(source.read(int(frame)), (int(bins[0]), int(bins[1])))
         if progress:
             progress(n + 1, len(frames))
     still = ~(np.ptp(images, axis=0) > 0)
@@ -214,7 +213,7 @@ def read_stack(
 
 
 def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
-    """One pose to each image, as the reader asks for; frames without a reading are not read."""
+    """One placeholder pose per image, which `PosedImages` requires; images are read here, not placed."""
     known = getattr(tracked.images, "shape", (len(tracked.frame_time_s),))[0]
     if known != len(tracked.frame_time_s):
         raise MismatchError(
@@ -224,14 +223,16 @@ def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
     return RigidTransform.identity(len(tracked.frame_time_s))
 
 
-def _binned(image: GreyArray, bins: npt.NDArray[np.int_], shape: tuple[int, int]) -> GreyArray:
-    """Means over blocks of pixels; NaN where any of them is."""
-    whole = image[: shape[0] * bins[0], : shape[1] * bins[1]]
-    blocks = whole.reshape(shape[0], bins[0], shape[1], bins[1])
-    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
+def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:
+    """Means over whole blocks of `by` pixels, those left over at the far edges dropped; NaN where any is."""
+    from skimage.transform import downscale_local_mean
+
+    across, down = by
+    whole = image[: image.shape[0] // across * across, : image.shape[1] // down * down]
+    return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)  # type: ignore[no-untyped-call]
 
 
-def _weighted(images: GreyArray, weight: FloatArray) -> GreyArray:
+def _weighted(images: Float32Array, weight: FloatArray) -> Float32Array:
     """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
     flat = images.reshape(len(images), -1)
     there = np.isfinite(flat)

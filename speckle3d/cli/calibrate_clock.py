@@ -26,7 +26,7 @@ from speckle3d.cli.common import (
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
-    from calibration.clock.line import Delay
+    from calibration.clock.offset import ClockOffset
     from speckle3d.core.calibration import Calibration
 
 
@@ -116,7 +116,7 @@ def _by_line(
     sensor: str,
     region: str | None,
     search_s: float,
-) -> tuple[Delay, int]:
+) -> tuple[ClockOffset, int]:
     """Find the delay from a plane's line; returns it and the number of frames with a line."""
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from speckle3d.cli.recordings import open_recording, require_unsized
@@ -142,7 +142,7 @@ def _by_images(
     pixel_mm: tuple[float, float] | None,
     known: Calibration | None,
     search_s: float,
-) -> tuple[Delay, int]:
+) -> tuple[ClockOffset, int]:
     """Find the delay from images of a sweep forward and back; returns it and the number of frames."""
     from calibration.clock.images import delay_from_images
     from speckle3d.cli.recordings import open_tracked, require_unsized

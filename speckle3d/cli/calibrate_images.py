@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.calibrations import require_free, write_with_report
-from speckle3d.cli.common import CalibrationOut, Json, PixelMm, calibrate, note, progress_bar
+from speckle3d.cli.common import CalibrationOut, Json, PixelMm, calibrate, naming_options, note, progress_bar
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
-    from calibration.clock.line import Delay
+    from calibration.clock.offset import ClockOffset
     from calibration.images.angulation import Angulation
-    from calibration.images.results import Found
-    from calibration.images.solver import ImageSettings
+    from calibration.images.solver import ImageCalibration, ImageSettings
     from calibration.images.stacks import TrackedImages
     from speckle3d.core.calibration import Calibration
 
@@ -92,7 +91,10 @@ def calibrate_images(
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
-    settings = ImageSettings(method.value, scales, capture_mm, capture_deg)
+    with naming_options():
+        settings = ImageSettings(
+            method=method.value, scales=scales, capture_mm=capture_mm, capture_deg=capture_deg
+        )
     given = _open(first, second, readings, pixel_mm, time_offset_s, clock, start, start_mm, start_deg)
     if (far := math.hypot(*given.start.translation)) > _FAR_MM:
         note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")
@@ -101,13 +103,13 @@ def calibrate_images(
     found = _solve(given.sweeps, given.start, settings)
     delay = None
     if given.clock is not None:
-        delay = _clock(clock, given.clock, found.result.sensor_from_image)
+        delay = _clock(clock, given.clock, found.sensor_from_image)
         note(f"sensor clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s; solving again")
         sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
         given = replace(given, sweeps=(sweeps[0], sweeps[1]))
-        found = _solve(given.sweeps, found.result.sensor_from_image, settings)
+        found = _solve(given.sweeps, found.sensor_from_image, settings)
     # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
-    enough = _angulation(given.sweeps, found.result.sensor_from_image)
+    enough = _angulation(given.sweeps, found.sensor_from_image)
     _finish((first, second), out, given, found, enough, delay, as_json)
 
 
@@ -186,16 +188,14 @@ def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransfo
 
 def _solve(
     sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageSettings
-) -> Found:
-    from calibration.images.results import solve
+) -> ImageCalibration:
+    from calibration.images.solver import calibrate_images as solve
 
     with progress_bar("comparing sweeps") as bar:
-        return solve(
-            *sweeps, start, settings, None if bar is None else lambda _stage, done, of: bar(done, of)
-        )
+        return solve(*sweeps, start, settings, lambda _stage, done, of: bar(done, of))
 
 
-def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> Delay:
+def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> ClockOffset:
     from calibration.clock.images import delay_from_images
 
     with progress_bar("trying delays") as progress, naming(str(path)):
@@ -206,19 +206,19 @@ def _finish(
     paths: tuple[Path, Path],
     out: Path,
     given: _Inputs,
-    found: Found,
+    found: ImageCalibration,
     enough: Angulation,
-    delay: Delay | None,
+    delay: ClockOffset | None,
     as_json: bool,
 ) -> None:
     """Write the calibration with its report."""
-    from calibration.images.results import as_calibration, figure_of, notes_of
+    from calibration.images.results import calibration_from_images, figure_of, notes_of
 
     told = notes_of(found, enough)
     if delay is not None:
         told.append(f"clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s, from images")
     write_with_report(
-        as_calibration(found, enough, given.sweeps),
+        calibration_from_images(found, enough, given.sweeps),
         paths,
         out,
         lambda _: figure_of(found, enough, given.sweeps),

@@ -292,6 +292,31 @@ def correlated_lags(residuals: FloatArray, cluster: IntArray) -> int:
     return most
 
 
+def autocorrelation_time(residuals: FloatArray, least_energy: float = 0.0) -> float:
+    """How many neighbouring residuals count as one: m / this many of m residuals are independent.
+
+    One plus twice the correlations with neighbours, up to the first lag at which there is none.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (m,)
+        In order, about zero; NaN where missing.
+    least_energy : float
+        What their squares are taken to sum to at least.
+    """
+    there = np.isfinite(residuals)
+    count = int(there.sum())
+    r = np.where(there, residuals, 0.0)
+    energy, time = max(float(r @ r), least_energy), 1.0
+    for lag in range(1, count // 4):
+        pairs = max(1, int(np.count_nonzero(there[lag:] & there[:-lag])))
+        rho = float(r[lag:] @ r[:-lag]) / energy * (count - lag) / pairs if energy > 0 else 0.0
+        if rho <= 0:
+            break
+        time += 2.0 * rho
+    return time
+
+
 def _diagnose(
     x: FloatArray,
     r: FloatArray,

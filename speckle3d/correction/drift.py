@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -27,8 +28,7 @@ from speckle3d.correction.curves import (
 )
 
 
-@dataclass(frozen=True)
-class DriftSettings:
+class DriftSettings(BaseModel):
     """How drift is corrected.
 
     Attributes
@@ -50,27 +50,15 @@ class DriftSettings:
         Relative change of cost and coefficients at which the optimisation stops.
     """
 
-    curves: Curves = "time"
-    loss_epsilon_mm: float = 0.01
-    minimum_frames: int = 10
-    minimum_coverage: float = 0.8
-    maximum_end_gap: float = 0.1
-    minimum_travel_mm: float = 0.1
-    tolerance: float = 1e-6
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-    def __post_init__(self) -> None:
-        if self.curves not in ("time", "distance"):
-            raise InvalidInputError(f"curves: expected 'time' or 'distance', got {self.curves!r}")
-        for name in ("loss_epsilon_mm", "minimum_travel_mm", "tolerance"):
-            if not getattr(self, name) > 0:
-                raise InvalidInputError(f"{name}: expected a value above zero, got {getattr(self, name)}")
-        for name in ("minimum_coverage", "maximum_end_gap"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InvalidInputError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
-        if self.minimum_frames < COEFFICIENTS:
-            raise InvalidInputError(
-                f"minimum_frames: expected at least {COEFFICIENTS}, got {self.minimum_frames}"
-            )
+    curves: Curves = "time"
+    loss_epsilon_mm: float = Field(0.01, gt=0)
+    minimum_frames: int = Field(10, ge=COEFFICIENTS)
+    minimum_coverage: float = Field(0.8, ge=0, le=1)
+    maximum_end_gap: float = Field(0.1, ge=0, le=1)
+    minimum_travel_mm: float = Field(0.1, gt=0)
+    tolerance: float = Field(1e-6, gt=0)
 
 
 @dataclass(frozen=True)
@@ -166,20 +154,17 @@ def correct_orientation(
 
     Parameters
     ----------
-    world_from_image : RigidTransform, length n
-        Image-based poses, in any world, mm.
+    world_from_image, covered, settings
+        As for `correct_pose`.
     reference : Rotation, length n or the number of covered frames
         The sensor's ``world_from_image``; where not covered its values are ignored.
-    covered : array_like of bool, shape (n,)
     centre_mm : array_like, shape (3,)
         Image centre in the image frame.
 
     Raises
     ------
-    InsufficientDataError
-        If the sweep is too short, its coverage too small, or "distance" curves lack travel.
-    MismatchError
-        If the lengths do not belong together.
+    InsufficientDataError, MismatchError
+        As for `correct_pose`.
 
     References
     ----------
@@ -194,7 +179,7 @@ def correct_orientation(
     measured = reference[_reading_index(len(reference), used)]
     sensor_from_start = (measured * world_from_image[used].rotation.inv()).mean()
     target = (sensor_from_start.inv() * measured).as_matrix()
-    # With the frame's origin moved to the centre, a turn about the centre is a turn and nothing else.
+    # With the frame's origin moved to the centre, a turn about the centre has no translation.
     image_from_centred = RigidTransform.from_translation(centre)
     chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
     fit = _solve(_OrientationProblem(chain, used, target), chain, settings)

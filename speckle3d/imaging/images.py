@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
-
-GreyArray = npt.NDArray[np.float32]
 
 
 class IndexedImages(Protocol):
@@ -64,7 +62,7 @@ class PosedImages:
     def __len__(self) -> int:
         return len(self.world_from_image)
 
-    def read(self, index: int) -> GreyArray:
+    def read(self, index: int) -> Float32Array:
         """Image number `index`, shape (vector, sample), contiguous.
 
         Raises
@@ -103,7 +101,7 @@ class ChosenImages:
     """
 
     images: Images
-    frames: npt.NDArray[np.int64]
+    frames: IntArray
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """Read one image, shape (vector, sample)."""

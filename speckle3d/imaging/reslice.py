@@ -1,4 +1,4 @@
-"""Any plane through a sweep, straight from its frames or from voxels.
+"""Reslices: any plane through a sweep, straight from its frames or from voxels.
 
 Resliced from the frames, each pixel blends the two images nearest to it, one on either side, sampled
 bilinearly where the pixel projects onto them: no voxels, no hole filling, and the images' own resolution.
@@ -14,21 +14,21 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses
+from speckle3d.imaging.images import ChosenImages, Images, PosedImages, require_poses
 
 MAX_PIXELS = 100_000_000
-"""Largest reslice made: above it a unit is wrong somewhere (at 0.01 mm this is 100 mm x 100 mm)."""
+"""Largest reslice, to catch wrong units: 100 mm x 100 mm at 0.01 mm."""
 
 DEFAULT_PIXEL_MM = 0.2
 """Between the axial and the lateral resolution of a 5-10 MHz probe."""
 
 _THREADS = 2
 _BATCH = 16
-"""Images read at a time, so that a thread has milliseconds to do; memory for them does not grow."""
+"""Images read at a time: enough for milliseconds of work per thread, few enough for memory."""
 
 
 class _Band:
@@ -96,7 +96,7 @@ def reslice_frames(
     world_from_image: RigidTransform,
     plane: ReslicePlane,
     max_distance_mm: float,
-) -> GreyArray:
+) -> Float32Array:
     """Cut a plane through a sweep's images.
 
     One pass over the images, in any order, with memory for the plane and a few images; images too far from
@@ -128,7 +128,7 @@ def reslice_frames(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    from speckle3d.kernels.reslicing import keep_nearest
+    from speckle3d.kernels.slicing import keep_nearest
 
     if not (np.isfinite(max_distance_mm) and max_distance_mm > 0):
         raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {max_distance_mm}")
@@ -152,7 +152,19 @@ def reslice_frames(
     return np.concatenate([_blend(band.distance_mm, band.grey) for band in bands])
 
 
-def reslice_volume(volume: Volume, plane: ReslicePlane) -> GreyArray:
+def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
+    """One image on square pixels, as a reslice through its own plane shows it.
+
+    Returns
+    -------
+    ndarray of float32, shape (rows, columns)
+    """
+    plane = image_plane(RigidTransform.identity(), grid, pixel_mm)
+    alone = ChosenImages(images, np.array([frame]))
+    return reslice_frames(alone, grid, RigidTransform.identity(1), plane, 1.0)
+
+
+def reslice_volume(volume: Volume, plane: ReslicePlane) -> Float32Array:
     """Cut a plane through voxels, linear between them.
 
     Parameters
@@ -269,8 +281,8 @@ def _touches(maps: FloatArray, grid: ImageGrid, plane: ReslicePlane, max_distanc
     return np.asarray(near[0] & near[1] & near[2])
 
 
-def _blend(distance_mm: GreyArray, grey: GreyArray) -> GreyArray:
-    """Interpolate between the two sides' nearest images; take the one there is where the other is missing."""
+def _blend(distance_mm: Float32Array, grey: Float32Array) -> Float32Array:
+    """Interpolate between the nearest images of either side, or take the only one there is."""
     gap = distance_mm.sum(axis=0)
     share = np.divide(distance_mm[0], gap, out=np.zeros_like(gap), where=gap > 0)
     between = grey[0] + share * (grey[1] - grey[0])
@@ -295,7 +307,7 @@ def _plane_along(world_from_image: RigidTransform, line_mm: FloatArray, pixel_mm
 
 
 def _mean_travel(points_mm: FloatArray, world_from_image: RigidTransform) -> FloatArray:
-    """Regress position on elevational position: travel per mm forward, whatever the order of the images."""
+    """Mean travel per mm forward, by regressing position on elevational position; order does not matter."""
     normal = world_from_image.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
     forward = _unit(normal, "elevational")
     moved = points_mm - points_mm.mean(axis=0)

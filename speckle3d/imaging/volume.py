@@ -10,21 +10,20 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import distance_transform_cdt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import GreyArray, Images, PosedImages, require_poses
+from speckle3d.imaging.images import Images, PosedImages, require_poses
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
 
 MAX_MEMORY_GB = 4.0
-"""What compounding may take: more is a wrong unit more often than a large sweep."""
+"""Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
 
 BYTES_PER_VOXEL = 16
 """Sum, count and hole distance at four bytes each, and as much again of passing masks and copies."""
@@ -52,7 +51,7 @@ class VoxelGrid:
 
     @property
     def memory_gb(self) -> float:
-        """What compounding on this grid takes."""
+        """Memory that compounding on this grid takes, GB."""
         return float(np.prod(np.asarray(self.shape, dtype=float)) * BYTES_PER_VOXEL / 1e9)
 
 
@@ -103,6 +102,9 @@ def compound(
 ) -> Volume:
     """Compound a sweep's images into cubic voxels that hold all of it.
 
+    Each voxel is the mean of all samples in it. An empty voxel is then the mean of those that are not in
+    the smallest cube around it that holds any; filled voxels stay as they are.
+
     Parameters
     ----------
     images : indexable or callable
@@ -110,62 +112,14 @@ def compound(
     grid : ImageGrid
     world_from_image : RigidTransform, length n
     voxel_mm : float
-    fill_radius, voxel_type, max_memory_gb
-        As for `compound_on`.
-    world_from_axes : Rotation, optional
-        Directions of the voxel axes; without it, the world's.
-
-    Returns
-    -------
-    Volume
-
-    Raises
-    ------
-    InvalidInputError
-        If the volume would take more than `max_memory_gb`, or an input is not what it must be.
-    InsufficientDataError
-        If no sample has a value.
-    """
-    voxel_grid = grid_around(grid, world_from_image, voxel_mm, world_from_axes)
-    return compound_on(
-        voxel_grid,
-        images,
-        grid,
-        world_from_image,
-        fill_radius=fill_radius,
-        voxel_type=voxel_type,
-        max_memory_gb=max_memory_gb,
-    )
-
-
-def compound_on(
-    voxel_grid: VoxelGrid,
-    images: Images,
-    grid: ImageGrid,
-    world_from_image: RigidTransform,
-    *,
-    fill_radius: int = DEFAULT_FILL_RADIUS,
-    voxel_type: VoxelType = "float32",
-    max_memory_gb: float = MAX_MEMORY_GB,
-) -> Volume:
-    """Compound a sweep's images on a given grid; samples outside it are left out.
-
-    Each voxel is the mean of all samples in it. An empty voxel is then the mean of those that are not in
-    the smallest cube around it that holds any; filled voxels stay as they are.
-
-    Parameters
-    ----------
-    voxel_grid : VoxelGrid
-    images : indexable or callable
-        Grey images by frame number, shape (vector, sample), read one at a time.
-    grid : ImageGrid
-    world_from_image : RigidTransform, length n
     fill_radius : int
         Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
         stay empty. The volume also grows by so many voxels beyond the first and the last frame.
     voxel_type : {"float32", "uint8"}
         With "float32" empty voxels are NaN. With "uint8" levels are rounded and clipped to 0-255, and empty
         voxels are 0.
+    world_from_axes : Rotation, optional
+        Directions of the voxel axes; without it, the world's.
     max_memory_gb : float
 
     Returns
@@ -177,13 +131,27 @@ def compound_on(
     InvalidInputError
         If the volume would take more than `max_memory_gb`, or an input is not what it must be.
     InsufficientDataError
-        If no sample with a value lies in the grid.
+        If no sample has a value.
 
     References
     ----------
     .. [1] R. Rohling, A. Gee and L. Berman, "A comparison of freehand three-dimensional ultrasound
        reconstruction techniques", Medical Image Analysis, 1999.
+
+    Examples
+    --------
+    Four images, 1 mm apart, of four vectors and five samples:
+
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import RigidTransform
+    >>> from speckle3d.core.sweep import ImageGrid
+    >>> grid = ImageGrid(vectors=4, samples=5, vector_pitch_mm=1.0, sample_spacing_mm=1.0)
+    >>> poses = RigidTransform.from_translation([[0.0, 0.0, z] for z in range(4)])
+    >>> volume = compound([np.full((4, 5), level) for level in range(4)], grid, poses, voxel_mm=1.0)
+    >>> volume.shape, volume.voxels[0, 0].tolist()
+    ((4, 5, 4), [0.0, 1.0, 2.0, 3.0])
     """
+    voxel_grid = grid_around(grid, world_from_image, voxel_mm, world_from_axes)
     _require_options(voxel_grid, fill_radius, voxel_type, max_memory_gb)
     mean = _bin_mean(voxel_grid, PosedImages(images, grid, world_from_image))
     _fill_holes(mean, fill_radius)
@@ -205,7 +173,7 @@ def _require_options(voxel_grid: VoxelGrid, fill_radius: int, voxel_type: str, m
         )
 
 
-def _bin_mean(voxel_grid: VoxelGrid, source: PosedImages) -> GreyArray:
+def _bin_mean(voxel_grid: VoxelGrid, source: PosedImages) -> Float32Array:
     """Mean of the samples in each voxel; NaN where there is none."""
     from speckle3d.kernels.compounding import add_samples
 
@@ -230,7 +198,7 @@ def _index_from_sample(voxel_grid: VoxelGrid, source: PosedImages) -> FloatArray
     return np.ascontiguousarray(maps)
 
 
-def _fill_holes(voxels: GreyArray, fill_radius: int) -> None:
+def _fill_holes(voxels: Float32Array, fill_radius: int) -> None:
     from speckle3d.kernels.compounding import fill_from_shell
 
     empty = np.isnan(voxels)
@@ -239,6 +207,6 @@ def _fill_holes(voxels: GreyArray, fill_radius: int) -> None:
         fill_from_shell(voxels, np.asarray(distance, dtype=np.int32), fill_radius)
 
 
-def _as_uint8(voxels: GreyArray) -> npt.NDArray[np.uint8]:
+def _as_uint8(voxels: Float32Array) -> ByteArray:
     rounded = np.nan_to_num(np.rint(voxels), nan=0.0)
     return np.clip(rounded, 0.0, 255.0, out=rounded).astype(np.uint8)

@@ -62,7 +62,7 @@ def fill_from_shell(voxels: Float32Array, distance: npt.NDArray[np.int32], cap: 
         for j in range(voxels.shape[1]):
             for k in range(voxels.shape[2]):
                 if 0 < distance[i, j, k] <= cap:
-                    # Only filled voxels are read and only empty ones written, so threads do not meet.
+                    # Threads read only filled voxels and write only empty ones.
                     voxels[i, j, k] = _mean_of_filled(voxels, distance, i, j, k)
 
 
@@ -72,7 +72,7 @@ def _mean_of_filled(voxels: Float32Array, distance: npt.NDArray[np.int32], i: in
     total, count = 0.0, 0
     for a in range(max(i - r, 0), min(i + r + 1, voxels.shape[0])):
         for b in range(max(j - r, 0), min(j + r + 1, voxels.shape[1])):
-            # Inside the cube's shell nothing is filled, so of an inner line only both ends are looked at.
+            # Nothing is filled inside the cube's shell, so only the ends of inner lines are read.
             stride = 1 if abs(a - i) == r or abs(b - j) == r else 2 * r
             for c in range(k - r, k + r + 1, stride):
                 if 0 <= c < voxels.shape[2] and distance[a, b, c] == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -13,6 +13,66 @@ _BINS_PER_MM = 16.0
 _TURNS = 8192
 _TWO_PI = 2.0 * np.pi
 _PHASORS = np.exp(-1j * _TWO_PI * np.arange(_TURNS) / _TURNS).astype(np.complex64)
+
+
+class CellOrder(NamedTuple):
+    """Scatterers in the image frame, sorted by lateral cell.
+
+    Attributes
+    ----------
+    position_mm, strength : ndarray, shape (n, 3) and (n,)
+    start : ndarray, shape (cells + 1,)
+        First scatterer of each lateral cell.
+    """
+
+    position_mm: FloatArray
+    strength: Float32Array
+    start: IntArray
+
+
+class Vectors(NamedTuple):
+    """Lateral position of each vector, shape (v,), and its cells: `first` up to, not including, `last`."""
+
+    lateral_mm: FloatArray
+    first: IntArray
+    last: IntArray
+
+
+class FieldTable(NamedTuple):
+    """The two-way beam.
+
+    Attributes
+    ----------
+    field : ndarray, shape (y, x, z, nodes)
+        Two-way residual amplitude.
+    reach : ndarray, shape (y, x)
+        How many elevational steps the beam reaches; beyond that the field is left out.
+    curvature_per_mm : ndarray, shape (y, 2)
+        Path curvature, lateral and elevational: the echo comes from depth ``y + kx x^2 + kz z^2``.
+    grid : ndarray, shape (4,)
+        First depth, depth step, lateral step, elevational step, mm.
+    """
+
+    field: Complex64Array
+    reach: IntArray
+    curvature_per_mm: FloatArray
+    grid: FloatArray
+
+
+class BeamLimits(NamedTuple):
+    """How far from the image the beam reaches.
+
+    Attributes
+    ----------
+    lateral_mm : ndarray, shape (2,)
+    depth_mm : ndarray, shape (2,)
+        First depth and step of `thickness_mm`.
+    thickness_mm : ndarray, shape (y,)
+    """
+
+    lateral_mm: FloatArray
+    depth_mm: FloatArray
+    thickness_mm: FloatArray
 
 
 @njit(cache=True, inline="always")
@@ -26,16 +86,9 @@ def _unit_phasor(cycles: float) -> Any:
 
 @njit(cache=True, parallel=True, fastmath=True)
 def scatter_echoes(
-    position_mm: FloatArray,
-    amplitude: Float32Array,
-    cell_start: IntArray,
-    first_cell: IntArray,
-    last_cell: IntArray,
-    vector_mm: FloatArray,
-    field: Complex64Array,
-    reach: IntArray,
-    curvature_per_mm: FloatArray,
-    grid: FloatArray,
+    scatterers: CellOrder,
+    vectors: Vectors,
+    table: FieldTable,
     first_depth_mm: float,
     sample_mm: float,
     cycles_per_mm: float,
@@ -45,26 +98,17 @@ def scatter_echoes(
 
     Parameters
     ----------
-    position_mm, amplitude : ndarray, shape (n, 3) and (n,)
-        In the image frame, sorted by lateral cell.
-    cell_start : ndarray, shape (cells + 1,)
-        First scatterer of each lateral cell; vector ``v`` looks at cells ``first_cell[v]`` up to, not
-        including, ``last_cell[v]``.
-    field : ndarray, shape (y, x, z, nodes)
-        Two-way residual amplitude; `grid` is (first depth, depth step, lateral step, elevational step).
-    reach : ndarray, shape (y, x)
-        How many elevational steps the beam reaches; beyond that the field is left out.
-    curvature_per_mm : ndarray, shape (y, 2)
-        Path curvature, lateral and elevational: the echo comes from depth ``y + kx x^2 + kz z^2``.
-    sample_mm, cycles_per_mm : float
-        Depth per sample of `out`, and carrier cycles per mm of depth.
+    first_depth_mm, sample_mm, cycles_per_mm : float
+        Depth of the first sample of `out`, depth per sample, and carrier cycles per mm of depth.
     """
+    position_mm, amplitude, cell_start = scatterers
+    field, reach, curvature_per_mm, grid = table
     ny, nx, _, nodes = field.shape
     samples = out.shape[1]
-    for v in prange(vector_mm.shape[0]):
+    for v in prange(vectors.lateral_mm.shape[0]):
         value = np.empty(nodes, dtype=np.complex64)
-        for j in range(cell_start[first_cell[v]], cell_start[last_cell[v]]):
-            fx = abs(position_mm[j, 0] - vector_mm[v]) / grid[2]
+        for j in range(cell_start[vectors.first[v]], cell_start[vectors.last[v]]):
+            fx = abs(position_mm[j, 0] - vectors.lateral_mm[v]) / grid[2]
             ix = int(fx)
             fy = (position_mm[j, 1] - grid[0]) / grid[1]
             iy = int(np.floor(fy))
@@ -114,20 +158,19 @@ def scatter_echoes(
 
 @njit(cache=True)
 def gather_near(
-    position_mm: FloatArray,
-    strength: Float32Array,
+    scatterers: tuple[FloatArray, Float32Array],
     image_from_medium: FloatArray,
-    lateral_mm: FloatArray,
-    depth_mm: FloatArray,
-    thickness_mm: FloatArray,
-    out_position_mm: FloatArray,
-    out_strength: Float32Array,
+    limits: BeamLimits,
+    out: tuple[FloatArray, Float32Array],
     filled: int,
 ) -> int:
     """Append the scatterers within the beam's reach, moved into the image frame; return how many there are.
 
-    ``lateral_mm`` holds the two lateral limits, ``depth_mm`` first depth and step of ``thickness_mm``.
+    Scatterers, and `out`, are positions, shape (n, 3), and strengths, shape (n,).
     """
+    position_mm, strength = scatterers
+    out_position_mm, out_strength = out
+    lateral_mm, depth_mm, thickness_mm = limits
     m = image_from_medium
     last = thickness_mm.shape[0] - 1
     for j in range(position_mm.shape[0]):
@@ -155,17 +198,14 @@ def sort_into_cells(
     left_mm: float,
     cell_mm: float,
     deep_mm: float,
-    cell_start: IntArray,
-    out_position_mm: FloatArray,
-    out_strength: Float32Array,
+    out: CellOrder,
 ) -> None:
     """Sort by lateral cell and, within it, by depth bin, so that table and vector stay in cache.
 
-    Fills ``cell_start``, shape (cells + 1,), with the first scatterer of each lateral cell. All scatterers
-    must lie inside the cells and between zero and ``deep_mm``.
+    All scatterers must lie inside the cells and between zero and ``deep_mm``. Fills `out`.
     """
     bins = int(deep_mm * _BINS_PER_MM) + 1
-    cells = cell_start.shape[0] - 1
+    cells = out.start.shape[0] - 1
     count = np.zeros(cells * bins + 1, dtype=np.int64)
     n = position_mm.shape[0]
     cell = np.empty(n, dtype=np.int64)
@@ -176,9 +216,9 @@ def sort_into_cells(
     for i in range(1, count.shape[0]):
         count[i] += count[i - 1]
     for i in range(cells + 1):
-        cell_start[i] = count[i * bins]
+        out.start[i] = count[i * bins]
     for j in range(n):
         at = count[cell[j]]
         count[cell[j]] += 1
-        out_position_mm[at] = position_mm[j]
-        out_strength[at] = strength[j]
+        out.position_mm[at] = position_mm[j]
+        out.strength[at] = strength[j]

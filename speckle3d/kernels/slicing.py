@@ -1,13 +1,14 @@
-"""Patches of one sweep's images against the other sweep, cut straight from its images.
+"""Reading posed images where other planes meet them: bilinear samples, reslices, patches of crossing sweeps.
 
-A patch is a rectangle of grid points on one image. Where each point lies in the other sweep, the two images
-nearest to it, one on either side, are sampled and blended by their distances, and the patch and what was cut
-are compared by their correlation, so that neither brightness nor contrast counts.
+A reslice's pixel, and a patch's point, is blended from the two images nearest to it, one on either side.
+A patch is a rectangle of grid points on one sweep's image; it and what the other sweep shows there are
+compared by their correlation, so that neither brightness nor contrast counts.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,16 +21,73 @@ PARAMETERS = 8
 LEAST_GAP = 0.1
 """Distance between two images, as part of the largest, from which their difference is taken for a slope."""
 
+EDGE_TOLERANCE = 1e-6
+"""Fraction of a pixel by which a reslice's point may miss the image's border: rounding of poses."""
+
+
+class PlacedImages(NamedTuple):
+    """Images, where they are, and how large their pixels are.
+
+    Attributes
+    ----------
+    images : float32, shape (n, u, v)
+        NaN where they show nothing.
+    poses : float64, shape (n, 3, 4)
+        World from image for images whose points are looked up, image from world for those that are cut.
+    pixels : float64, shape (4,)
+        Pixel size along u and v, and where the first pixel lies, mm.
+    """
+
+    images: Float32Array
+    poses: FloatArray
+    pixels: FloatArray
+
+
+class PatchGrid(NamedTuple):
+    """Rectangles of grid points on images.
+
+    Attributes
+    ----------
+    where : int64, shape (p, 3)
+        Image number and first u, v of each.
+    sides : tuple of int
+        Points along u and v.
+    stride : int
+        Pixels between points.
+    """
+
+    where: IntArray
+    sides: tuple[int, int]
+    stride: int
+
+
+class PatchScores(NamedTuple):
+    """What `compare_patches` fills.
+
+    Attributes
+    ----------
+    alike : float64, shape (p,)
+        Correlation; NaN where a patch does not count.
+    energy : float64, shape (p, 2)
+        Standard deviations of the patch and of what was cut.
+    share : float64, shape (p,)
+        Share of points supported.
+    normal, gradient : float64, shape (p, 8, 8) and (p, 8), or empty
+        Gauss-Newton matrix of the patches' normalised difference, whose squared length is twice
+        (1 - correlation), and the change of the correlation with the parameters. Not computed when empty.
+    """
+
+    alike: FloatArray
+    energy: FloatArray
+    share: FloatArray
+    normal: FloatArray
+    gradient: FloatArray
+
 
 @njit(cache=True, inline="always")
-def _inside(image, u, v):  # type: ignore[no-untyped-def]
-    """Whether a point lies between four pixels."""
-    return 0.0 <= u <= image.shape[0] - 1.0 and 0.0 <= v <= image.shape[1] - 1.0
-
-
-@njit(cache=True, inline="always")
-def _sample(image, u, v):  # type: ignore[no-untyped-def]
-    """Grey level between four pixels and its change with either coordinate; NaN beside a NaN."""
+def bilinear(image, u, v):  # type: ignore[no-untyped-def]
+    """Grey level at a point of the image and its change with either coordinate; NaN beside a NaN."""
+    # In an image one pixel wide the lower neighbour is number -1, which is that pixel too.
     i = min(int(u), image.shape[0] - 2)
     j = min(int(v), image.shape[1] - 2)
     a, b = u - i, v - j
@@ -40,160 +98,111 @@ def _sample(image, u, v):  # type: ignore[no-untyped-def]
     return near + a * (far - near), far - near, right - left
 
 
-# Sums may be taken in any order, and so several terms at once; NaN must stay what it is.
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
+@njit(cache=True, inline="always")
+def _clip(first: float, last: float, start: float, step: float, low: float, high: float):  # type: ignore[no-untyped-def]
+    """Shrink [first, last] to where ``low <= start + step * k <= high``, rounding aside."""
+    if abs(step) < 1e-12:
+        inside = low - 1e-6 <= start <= high + 1e-6
+        return (first, last) if inside else (1.0, 0.0)
+    a, b = (low - start) / step, (high - start) / step
+    return max(first, min(a, b)), min(last, max(a, b))
+
+
+# One thread: an image takes a fraction of a millisecond, and a team of threads gathered anew for each image
+# waits far longer than that as soon as another process wants a core.
+@njit(cache=True, nogil=True)
+def keep_nearest(
+    image: Float32Array,
+    index_from_pixel: FloatArray,
+    max_distance_mm: float,
+    distance_mm: Float32Array,
+    grey: Float32Array,
+) -> None:
+    """Let one image replace, on either of its sides, farther images in the pixels of a plane.
+
+    Parameters
+    ----------
+    image : ndarray, shape (vector, sample)
+    index_from_pixel : ndarray, shape (3, 3)
+        From (column, row, 1) to (vector, sample, signed distance from the image's plane in mm).
+    distance_mm, grey : ndarray, shape (2, rows, columns), changed in place
+        Of the nearest image so far behind ([0], distance >= 0) and in front ([1]) of each pixel. Where there
+        is none yet, `distance_mm` holds `max_distance_mm`.
+    """
+    rows, columns = grey.shape[1:]
+    du, dv, dq = index_from_pixel[0, 0], index_from_pixel[1, 0], index_from_pixel[2, 0]
+    for row in range(rows):
+        u = index_from_pixel[0, 1] * row + index_from_pixel[0, 2]
+        v = index_from_pixel[1, 1] * row + index_from_pixel[1, 2]
+        q = index_from_pixel[2, 1] * row + index_from_pixel[2, 2]
+        # Coordinates are linear along a row, so the columns an image can reach are one interval.
+        first, last = _clip(0.0, columns - 1.0, q, dq, -max_distance_mm, max_distance_mm)
+        first, last = _clip(first, last, u, du, 0.0, image.shape[0] - 1.0)
+        first, last = _clip(first, last, v, dv, 0.0, image.shape[1] - 1.0)
+        if first > last + 2.0:
+            continue
+        for column in range(max(int(first) - 1, 0), min(int(last) + 2, columns)):
+            signed = q + dq * column
+            side = 0 if signed >= 0.0 else 1
+            away = np.float32(abs(signed))
+            if away < distance_mm[side, row, column]:
+                at_u, at_v = u + du * column, v + dv * column
+                if not (-EDGE_TOLERANCE <= at_u <= image.shape[0] - 1 + EDGE_TOLERANCE):
+                    continue
+                if not (-EDGE_TOLERANCE <= at_v <= image.shape[1] - 1 + EDGE_TOLERANCE):
+                    continue
+                at_u = min(max(at_u, 0.0), image.shape[0] - 1.0)
+                at_v = min(max(at_v, 0.0), image.shape[1] - 1.0)
+                level, _, _ = bilinear(image, at_u, at_v)
+                if not math.isnan(level):
+                    distance_mm[side, row, column] = away
+                    grey[side, row, column] = level
+
+
+_SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
+"""Lets the compiler sum several terms at once; NaN keeps its meaning."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
 def compare_patches(
-    sample: Float32Array,
-    world_from_sample: FloatArray,
-    sample_pixels: FloatArray,
-    source: Float32Array,
-    source_from_world: FloatArray,
-    source_pixels: FloatArray,
-    patches: IntArray,
-    sides: tuple[int, int],
-    stride: int,
+    sample: PlacedImages,
+    source: PlacedImages,
+    patches: PatchGrid,
     max_gap_mm: float,
     least_share: float,
-    alike: FloatArray,
-    energy: FloatArray,
-    share: FloatArray,
-    normal: FloatArray,
-    gradient: FloatArray,
+    out: PatchScores,
 ) -> None:
     """Correlate each patch with what the other sweep shows there.
 
     Parameters
     ----------
-    sample, source : float32, shape (m, u, v) and (n, s, t)
-        Images; NaN where they show nothing.
-    world_from_sample, source_from_world : float64, shape (m, 3, 4) and (n, 3, 4)
-    sample_pixels, source_pixels : float64, shape (4,)
-        Pixel size along u and v, and where the first pixel lies, mm.
-    patches : int64, shape (p, 3)
-        Image number and first u, v of each.
-    sides : tuple of int
-        Points of a patch along u and v.
-    stride : int
-        Pixels between them.
+    sample, source : PlacedImages
+        The sweep with the patches, by world from image, and the one that is cut, by image from world.
+    patches : PatchGrid
+        On images of `sample`.
     max_gap_mm : float
         Largest distance between two images on either side of a point.
     least_share : float
         Share of a patch's points that must be supported for it to count; points without a level aside.
-    alike : float64, shape (p,)
-        Receives the correlations; NaN where a patch does not count.
-    energy : float64, shape (p, 2)
-        Receives the standard deviations of the patch and of what was cut.
-    share : float64, shape (p,)
-        Receives the share of points supported.
-    normal, gradient : float64, shape (p, 8, 8) and (p, 8), or empty
-        Receive the Gauss-Newton matrix of the patches' normalised difference, whose squared length is twice
-        (1 - correlation), and the change of the correlation with the parameters. Not computed when empty.
+    out : PatchScores
+        Filled.
     """
-    derivatives = normal.shape[0] > 0
-    count = sides[0] * sides[1]
-    f, g = np.empty(count), np.empty(count)
-    rows = np.zeros((PARAMETERS, count if derivatives else 1))
-    ghat = np.empty(count)
-    near = np.empty(source.shape[0], np.int64)
-    slope = np.empty((2, 3))
-    place = np.empty((2, 3))
-    frame = np.empty(2, np.int64)
-    distance = np.empty(2)
-    level = np.empty(2)
-    half_u = 0.5 * (sides[0] - 1) * stride * sample_pixels[0]
-    half_v = 0.5 * (sides[1] - 1) * stride * sample_pixels[1]
-    reach = math.sqrt(half_u * half_u + half_v * half_v) + max_gap_mm
-    for p in range(patches.shape[0]):
-        alike[p] = math.nan
-        energy[p, 0] = energy[p, 1] = share[p] = 0.0
+    derivatives = out.normal.shape[0] > 0
+    size = patches.sides[0] * patches.sides[1]
+    f, g = np.empty(size), np.empty(size)
+    rows = np.zeros((PARAMETERS, size if derivatives else 1))
+    near = np.empty(source.images.shape[0], np.int64)
+    for p in range(patches.where.shape[0]):
+        out.alike[p] = math.nan
+        out.energy[p, 0] = out.energy[p, 1] = out.share[p] = 0.0
         if derivatives:
-            normal[p] = 0.0
-            gradient[p] = 0.0
-        k, u0, v0 = patches[p]
-        pose = world_from_sample[k]
-        x = sample_pixels[2] + u0 * sample_pixels[0] + half_u
-        y = sample_pixels[3] + v0 * sample_pixels[1] + half_v
-        wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
-        wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
-        wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
-        # Only images that pass near the patch can pass near its points.
-        n_near = 0
-        for j in range(source.shape[0]):
-            t = source_from_world[j]
-            if abs(t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]) <= reach:
-                near[n_near] = j
-                n_near += 1
+            out.normal[p] = 0.0
+            out.gradient[p] = 0.0
+        n_near = _images_near(sample, source, patches, p, max_gap_mm, near)
         if n_near < 2:
             continue
-        n = 0
-        wanted = 0
-        for a in range(sides[0]):
-            for b in range(sides[1]):
-                u, v = u0 + a * stride, v0 + b * stride
-                value = sample[k, u, v]
-                if math.isnan(value):
-                    continue
-                wanted += 1
-                x = sample_pixels[2] + u * sample_pixels[0]
-                y = sample_pixels[3] + v * sample_pixels[1]
-                wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
-                wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
-                wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
-                distance[0] = distance[1] = max_gap_mm
-                frame[0] = frame[1] = -1
-                for index in range(n_near):
-                    j = near[index]
-                    t = source_from_world[j]
-                    q = t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]
-                    s = 0 if q >= 0.0 else 1
-                    if abs(q) < distance[s]:
-                        px = t[0, 0] * wx + t[0, 1] * wy + t[0, 2] * wz + t[0, 3]
-                        py = t[1, 0] * wx + t[1, 1] * wy + t[1, 2] * wz + t[1, 3]
-                        su = (px - source_pixels[2]) / source_pixels[0]
-                        sv = (py - source_pixels[3]) / source_pixels[1]
-                        if _inside(source[j], su, sv):
-                            found, du, dv = _sample(source[j], su, sv)
-                            if not math.isnan(found):
-                                distance[s], frame[s], level[s] = abs(q), j, found
-                                slope[s, 0], slope[s, 1] = du / source_pixels[0], dv / source_pixels[1]
-                                place[s, 0], place[s, 1], place[s, 2] = px, py, q
-                if frame[0] < 0 or frame[1] < 0:
-                    continue
-                gap = distance[0] + distance[1]
-                if gap > max_gap_mm:
-                    continue
-                part = distance[0] / gap
-                f[n] = value
-                g[n] = level[0] + part * (level[1] - level[0])
-                if derivatives:
-                    # Between images that all but touch, noise is no slope.
-                    rise = (level[1] - level[0]) / (gap * max(gap, LEAST_GAP * max_gap_mm))
-                    slope[0, 2] = rise * distance[1]
-                    slope[1, 2] = rise * distance[0]
-                    for c in range(PARAMETERS):
-                        rows[c, n] = 0.0
-                    for s in range(2):
-                        amount = part if s == 1 else 1.0 - part
-                        ax, ay, az = amount * slope[s, 0], amount * slope[s, 1], slope[s, 2]
-                        t = source_from_world[frame[s]]
-                        # The same slope along the axes of the world, then of the sample's image.
-                        gx = t[0, 0] * ax + t[1, 0] * ay + t[2, 0] * az
-                        gy = t[0, 1] * ax + t[1, 1] * ay + t[2, 1] * az
-                        gz = t[0, 2] * ax + t[1, 2] * ay + t[2, 2] * az
-                        bx = pose[0, 0] * gx + pose[1, 0] * gy + pose[2, 0] * gz
-                        by = pose[0, 1] * gx + pose[1, 1] * gy + pose[2, 1] * gz
-                        bz = pose[0, 2] * gx + pose[1, 2] * gy + pose[2, 2] * gz
-                        px, py, pz = place[s]
-                        rows[0, n] += y * bz - (py * az - pz * ay)
-                        rows[1, n] += -x * bz - (pz * ax - px * az)
-                        rows[2, n] += x * by - y * bx - (px * ay - py * ax)
-                        rows[3, n] += bx - ax
-                        rows[4, n] += by - ay
-                        rows[5, n] += bz - az
-                        rows[6, n] += x * bx - px * ax
-                        rows[7, n] += y * by - py * ay
-                n += 1
-        share[p] = n / max(wanted, 1)
+        n, wanted = _cut_patch(sample, source, patches, p, max_gap_mm, near[:n_near], f, g, rows, derivatives)
+        out.share[p] = n / max(wanted, 1)
         if n < 6 or n < least_share * wanted:
             continue
         mean_f = mean_g = 0.0
@@ -204,36 +213,169 @@ def compare_patches(
         mean_g /= n
         ff = gg = fg = 0.0
         for i in range(n):
-            df, dg = f[i] - mean_f, g[i] - mean_g
-            ff += df * df
-            gg += dg * dg
-            fg += df * dg
+            f[i] -= mean_f
+            g[i] -= mean_g
+            ff += f[i] * f[i]
+            gg += g[i] * g[i]
+            fg += f[i] * g[i]
         if ff <= 1e-12 or gg <= 1e-12:
             continue
-        rho = fg / math.sqrt(ff * gg)
-        alike[p] = rho
-        energy[p, 0], energy[p, 1] = math.sqrt(ff / n), math.sqrt(gg / n)
-        if not derivatives:
-            continue
-        norm_f, norm_g = math.sqrt(ff), math.sqrt(gg)
+        out.alike[p] = fg / math.sqrt(ff * gg)
+        out.energy[p, 0], out.energy[p, 1] = math.sqrt(ff / n), math.sqrt(gg / n)
+        if derivatives:
+            _differentiate(f[:n], g[:n], math.sqrt(ff), math.sqrt(gg), rows, out.normal[p], out.gradient[p])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _images_near(
+    sample: PlacedImages,
+    source: PlacedImages,
+    patches: PatchGrid,
+    p: int,
+    max_gap_mm: float,
+    near: IntArray,
+) -> int:
+    """Fill `near` with the numbers of images that pass near patch `p`; return how many."""
+    pixels = sample.pixels
+    half_u = 0.5 * (patches.sides[0] - 1) * patches.stride * pixels[0]
+    half_v = 0.5 * (patches.sides[1] - 1) * patches.stride * pixels[1]
+    reach = math.sqrt(half_u * half_u + half_v * half_v) + max_gap_mm
+    k, u0, v0 = patches.where[p]
+    pose = sample.poses[k]
+    x = pixels[2] + u0 * pixels[0] + half_u
+    y = pixels[3] + v0 * pixels[1] + half_v
+    wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
+    wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
+    wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
+    count = 0
+    for j in range(source.poses.shape[0]):
+        t = source.poses[j]
+        if abs(t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]) <= reach:
+            near[count] = j
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _cut_patch(
+    sample: PlacedImages,
+    source: PlacedImages,
+    patches: PatchGrid,
+    p: int,
+    max_gap_mm: float,
+    near: IntArray,
+    f: FloatArray,
+    g: FloatArray,
+    rows: FloatArray,
+    derivatives: bool,
+) -> tuple[int, int]:
+    """Fill levels of a patch (`f`), of its cut (`g`) and derivatives; return points found and wanted."""
+    slope, place = np.empty((2, 3)), np.empty((2, 3))
+    frame, distance, level = np.empty(2, np.int64), np.empty(2), np.empty(2)
+    k, u0, v0 = patches.where[p]
+    pose, image, pixels, cut_pixels = sample.poses[k], sample.images[k], sample.pixels, source.pixels
+    last_u, last_v = source.images.shape[1] - 1.0, source.images.shape[2] - 1.0
+    n = 0
+    wanted = 0
+    for a in range(patches.sides[0]):
+        for b in range(patches.sides[1]):
+            u, v = u0 + a * patches.stride, v0 + b * patches.stride
+            value = image[u, v]
+            if math.isnan(value):
+                continue
+            wanted += 1
+            x = pixels[2] + u * pixels[0]
+            y = pixels[3] + v * pixels[1]
+            wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
+            wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
+            wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
+            distance[0] = distance[1] = max_gap_mm
+            frame[0] = frame[1] = -1
+            for index in range(near.shape[0]):
+                j = near[index]
+                t = source.poses[j]
+                q = t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]
+                s = 0 if q >= 0.0 else 1
+                if abs(q) < distance[s]:
+                    px = t[0, 0] * wx + t[0, 1] * wy + t[0, 2] * wz + t[0, 3]
+                    py = t[1, 0] * wx + t[1, 1] * wy + t[1, 2] * wz + t[1, 3]
+                    su = (px - cut_pixels[2]) / cut_pixels[0]
+                    sv = (py - cut_pixels[3]) / cut_pixels[1]
+                    if 0.0 <= su <= last_u and 0.0 <= sv <= last_v:
+                        found, du, dv = bilinear(source.images[j], su, sv)
+                        if not math.isnan(found):
+                            distance[s], frame[s], level[s] = abs(q), j, found
+                            slope[s, 0], slope[s, 1] = du / cut_pixels[0], dv / cut_pixels[1]
+                            place[s, 0], place[s, 1], place[s, 2] = px, py, q
+            if frame[0] < 0 or frame[1] < 0:
+                continue
+            gap = distance[0] + distance[1]
+            if gap > max_gap_mm:
+                continue
+            part = distance[0] / gap
+            f[n] = value
+            g[n] = level[0] + part * (level[1] - level[0])
+            if derivatives:
+                # Between images that nearly touch, the difference is mostly noise.
+                rise = (level[1] - level[0]) / (gap * max(gap, LEAST_GAP * max_gap_mm))
+                slope[0, 2] = rise * distance[1]
+                slope[1, 2] = rise * distance[0]
+                for c in range(PARAMETERS):
+                    rows[c, n] = 0.0
+                for s in range(2):
+                    amount = part if s == 1 else 1.0 - part
+                    ax, ay, az = amount * slope[s, 0], amount * slope[s, 1], slope[s, 2]
+                    t = source.poses[frame[s]]
+                    # The same slope along the axes of the world, then of the sample's image.
+                    gx = t[0, 0] * ax + t[1, 0] * ay + t[2, 0] * az
+                    gy = t[0, 1] * ax + t[1, 1] * ay + t[2, 1] * az
+                    gz = t[0, 2] * ax + t[1, 2] * ay + t[2, 2] * az
+                    bx = pose[0, 0] * gx + pose[1, 0] * gy + pose[2, 0] * gz
+                    by = pose[0, 1] * gx + pose[1, 1] * gy + pose[2, 1] * gz
+                    bz = pose[0, 2] * gx + pose[1, 2] * gy + pose[2, 2] * gz
+                    px, py, pz = place[s]
+                    rows[0, n] += y * bz - (py * az - pz * ay)
+                    rows[1, n] += -x * bz - (pz * ax - px * az)
+                    rows[2, n] += x * by - y * bx - (px * ay - py * ax)
+                    rows[3, n] += bx - ax
+                    rows[4, n] += by - ay
+                    rows[5, n] += bz - az
+                    rows[6, n] += x * bx - px * ax
+                    rows[7, n] += y * by - py * ay
+            n += 1
+    return n, wanted
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _differentiate(
+    f: FloatArray,
+    g: FloatArray,
+    norm_f: float,
+    norm_g: float,
+    rows: FloatArray,
+    normal: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Gauss-Newton matrix and gradient of one patch, from levels less their means; `g` is normalised."""
+    n = f.shape[0]
+    for i in range(n):
+        g[i] /= norm_g
+    for c in range(PARAMETERS):
+        mean = along = 0.0
         for i in range(n):
-            ghat[i] = (g[i] - mean_g) / norm_g
-        for c in range(PARAMETERS):
-            mean = along = 0.0
+            mean += rows[c, i]
+        mean /= n
+        for i in range(n):
+            rows[c, i] = (rows[c, i] - mean) / norm_g
+            along += rows[c, i] * g[i]
+        change = 0.0
+        for i in range(n):
+            rows[c, i] -= along * g[i]
+            change += rows[c, i] * f[i] / norm_f
+        gradient[c] = change
+    for c in range(PARAMETERS):
+        for d in range(c + 1):
+            total = 0.0
             for i in range(n):
-                mean += rows[c, i]
-            mean /= n
-            for i in range(n):
-                rows[c, i] = (rows[c, i] - mean) / norm_g
-                along += rows[c, i] * ghat[i]
-            change = 0.0
-            for i in range(n):
-                rows[c, i] -= along * ghat[i]
-                change += rows[c, i] * (f[i] - mean_f) / norm_f
-            gradient[p, c] = change
-        for c in range(PARAMETERS):
-            for d in range(c + 1):
-                total = 0.0
-                for i in range(n):
-                    total += rows[c, i] * rows[d, i]
-                normal[p, c, d] = normal[p, d, c] = total
+                total += rows[c, i] * rows[d, i]
+            normal[c, d] = normal[d, c] = total

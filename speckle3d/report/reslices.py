@@ -8,9 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import GreyArray
 from speckle3d.imaging.reslice import ReslicePlane, along_sweep_plane, reslice_frames
 from speckle3d.report.data import SweepView
 from speckle3d.study.images import GreyImages, grey_images
@@ -41,9 +40,9 @@ class Cut:
         Top left of the detail, along the sweep and in depth from the reslice's own top left, and its sides.
     """
 
-    image: GreyArray
+    image: Float32Array
     extent_mm: tuple[float, float]
-    detail: GreyArray
+    detail: Float32Array
     corner_mm: FloatArray
     size_mm: FloatArray
 
@@ -54,7 +53,7 @@ class Cuts:
 
     by_mode: dict[str, Cut]
     depth_mm: float
-    middle: GreyArray
+    middle: Float32Array
     grid: ImageGrid
 
 
@@ -72,7 +71,7 @@ class _Strip:
         self._images = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(images.shape[0])]
         self.shape = (len(self._images), *self._images[0].shape)
 
-    def __getitem__(self, index: int) -> GreyArray:
+    def __getitem__(self, index: int) -> Float32Array:
         return self._images[index].astype(np.float32)
 
 
@@ -115,14 +114,14 @@ def _window(plane: ReslicePlane, corner_mm: FloatArray, size_mm: FloatArray) -> 
     return ReslicePlane(plane.world_from_plane * shift, float(size_mm[0]), float(size_mm[1]), DETAIL_PIXEL_MM)
 
 
-def _reslice(strip: _Strip, poses: RigidTransform, plane: ReslicePlane) -> GreyArray:
+def _reslice(strip: _Strip, poses: RigidTransform, plane: ReslicePlane) -> Float32Array:
     steps = np.abs(np.diff((poses[0].inv() * poses).translation[:, 2]))
     reach = max(0.3, 2.0 * float(np.percentile(steps, 99)))
     return reslice_frames(strip, strip.grid, poses, plane, reach)
 
 
 def _detail_place(
-    poses: RigidTransform, plane: ReslicePlane, image: GreyArray, grid: ImageGrid, size_mm: FloatArray
+    poses: RigidTransform, plane: ReslicePlane, image: Float32Array, grid: ImageGrid, size_mm: FloatArray
 ) -> tuple[int, float]:
     """Frame and depth of the place with most contrast between its parts, speckle smoothed away."""
     seen = np.isfinite(image)

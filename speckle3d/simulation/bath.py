@@ -1,20 +1,20 @@
-"""A water bath: its floor, or a bar in the middle of the beam, under water that is nearly empty.
+"""A water bath: its floor, or a bar in the middle of the beam, under water with a little dust.
 
 The medium's y axis points down and the floor is its plane y = 0, so that the probe is at negative y.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.simulation.medium import Layer, Scatterers, TiledMedium, Waves, bounds_in_medium
+from speckle3d.simulation.medium import Layer, Scatterers, TiledMedium, Waves, bounds_in_medium, tile_seed
 
 Reflector = Literal["wall", "bar"]
 
@@ -22,7 +22,7 @@ _KEPT_TILES = 200
 """An image meets the floor in about 40 tiles; the rest serve the frames around it."""
 
 _STEEPEST = np.cos(np.deg2rad(35.0))
-"""Reverberations off surfaces that seem turned further than this never come back to the aperture."""
+"""Reverberations off virtual surfaces turned further than this miss the aperture."""
 
 
 @dataclass(frozen=True)
@@ -48,22 +48,14 @@ class RoughSheet:
     spacing_mm: float = 0.0625
     roughness_mm: float = 0.01
     tile_mm: float = 4.0
-    _tiles: OrderedDict[tuple[int, int], FloatArray] = field(
-        default_factory=OrderedDict, repr=False, compare=False
-    )
 
-    def tile(self, i: int, j: int) -> FloatArray:
+    @cached_property
+    def tile(self) -> Callable[[int, int], FloatArray]:
         """Positions of the scatterers on the tile whose first corner is at i, j tiles, shape (n, 3)."""
-        if (i, j) not in self._tiles:
-            while len(self._tiles) >= _KEPT_TILES:
-                self._tiles.popitem(last=False)
-            self._tiles[i, j] = self._make(i, j)
-        self._tiles.move_to_end((i, j))
-        return self._tiles[i, j]
+        return lru_cache(_KEPT_TILES)(self._make)
 
     def _make(self, i: int, j: int) -> FloatArray:
-        # Seeds take no negative numbers; tiles on either side of the origin need distinct ones.
-        rng = np.random.default_rng([self.entropy, i % 2**32, j % 2**32])
+        rng = np.random.default_rng([self.entropy, *tile_seed(i, j)])
         along = (np.arange(round(self.tile_mm / self.spacing_mm)) + 0.5) * self.spacing_mm
         x, z = np.meshgrid(i * self.tile_mm + along, j * self.tile_mm + along)
         return np.stack([x.ravel(), rng.normal(0.0, self.roughness_mm, x.size), z.ravel()], axis=1)
@@ -177,7 +169,7 @@ class WaterBath:
         self, line: Level, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
     ) -> Scatterers:
         image_from_line = line.image_from_sheet
-        # The bar does not go along with the probe: other parts of it are seen as the probe slides over it.
+        # The bar stays where it is: the probe sees other parts of it as it slides over it.
         place = medium_from_image * image_from_line
         slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
         image_from_bar = image_from_line * RigidTransform.from_translation([-slid, 0.0, 0.0])
@@ -191,7 +183,7 @@ class WaterBath:
         return position[np.abs(position[:, 2]) <= self.bar_mm / 2.0]
 
     def _reverberations(self, floor: Level) -> Iterator[tuple[Level, float]]:
-        """Virtual reflectors that sound meets on its second way down, its third and so on.
+        """Virtual reflectors of the second and later round trips, with their amplitudes.
 
         Unfolding the path, the probe's face is mirrored in the floor, the floor in that, and so on: from
         straight above these lie at twice and three times the depth; elsewhere they seem turned further too.
@@ -211,7 +203,7 @@ class WaterBath:
 
 
 _BEAM_MM = 0.8
-"""About the thickness of the focused beam: what a wall has more of in it than a bar."""
+"""Thickness of the focused beam: it covers this much of a wall, but only `bar_mm` of a bar."""
 
 
 def water_bath(entropy: int, reflector: Reflector) -> WaterBath:

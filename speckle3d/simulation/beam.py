@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import Complex64Array, FloatArray
+from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.field import line_field, two_way_field
@@ -77,7 +76,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class BeamGrid:
-    """Where the beam is tabulated. Lateral positions are `per_pitch` to the element pitch.
+    """Grid on which the beam is tabulated, with `per_pitch` lateral positions per element pitch.
 
     The field is computed at the frequencies `node_hz` and kept as its `components` main components over
     frequency, which is what makes a short sum broadband.
@@ -122,21 +121,21 @@ class BeamTable:
     lateral_mm: FloatArray
     elevation_mm: FloatArray
     residual: Complex64Array
-    components: npt.NDArray[np.complex128]
-    reach: npt.NDArray[np.int64]
+    components: ComplexArray
+    reach: IntArray
     curvature_per_mm: FloatArray
 
     @property
     def lateral_extent_mm(self) -> float:
-        """How far from a vector the field is anywhere above the floor."""
+        """Largest lateral distance from a vector at which the field is above the floor."""
         return float(self.lateral_mm[np.flatnonzero(self.reach.any(axis=0))[-1]])
 
     @property
     def elevation_extent_mm(self) -> FloatArray:
-        """How far from the image plane the field is above the floor, per depth."""
+        """Largest distance from the image plane at which the field is above the floor, at each depth."""
         return np.asarray(self.reach.max(axis=1) * self.grid.elevation_step_mm)
 
-    def spectra(self, frequency_hz: FloatArray) -> npt.NDArray[np.complex128]:
+    def spectra(self, frequency_hz: FloatArray) -> ComplexArray:
         """Two-way pulse spectrum of each component, shape (component, frequency)."""
         nodes = np.asarray(self.grid.node_hz)
         hats = np.stack([np.interp(frequency_hz, nodes, row) for row in np.eye(nodes.size)])
@@ -158,24 +157,6 @@ class BeamTable:
         cell_mm2 = self.lateral_mm[1] * self.elevation_mm[1]
         power = np.einsum("yxzk,kl,yxzl,xz->y", field, gram, field.conj(), sides, optimize=True).real
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
-
-    def elevational_width_mm(self, level_db: float = -6.0) -> FloatArray:
-        """Full two-way thickness of the beam at each depth of `depth_mm`.
-
-        The power is that of the whole pulse, summed over the lateral positions, as a rough surface across the
-        image sends it back. Where the profile has two peaks (nearer than half the lens's focus) its outermost
-        crossings of `level_db`, relative to its maximum, count.
-        """
-        frequency = np.linspace(0.0, self.probe.sampling_rate_hz / 2.0, 513)
-        spectra = self.spectra(frequency)
-        gram = spectra @ spectra.conj().T
-        sides = _sides(self.lateral_mm)
-        power = np.einsum(
-            "yxzk,kl,yxzl,x->yz", self.residual, gram, self.residual.conj(), sides, optimize=True
-        ).real
-        level = power.max(axis=1) * 10.0 ** (level_db / 10.0)
-        pairs = zip(power, level, strict=True)
-        return 2.0 * np.array([_last_crossing(self.elevation_mm, row, at) for row, at in pairs])
 
 
 @lru_cache(maxsize=2)
@@ -225,18 +206,9 @@ def _sides(coordinate: FloatArray) -> FloatArray:
     return np.where(coordinate > 0.0, 2.0, 1.0)
 
 
-def _last_crossing(coordinate: FloatArray, profile: FloatArray, level: float) -> float:
-    """Where a profile falls through `level` for good; the last coordinate if it never does."""
-    last = int(np.flatnonzero(profile >= level)[-1])
-    if last + 1 == profile.size:
-        return float(coordinate[-1])
-    part = (profile[last] - level) / (profile[last] - profile[last + 1])
-    return float(coordinate[last] + part * (coordinate[last + 1] - coordinate[last]))
-
-
 def _sum_sources(
     probe: Probe, grid: BeamGrid, depth: FloatArray, lateral: FloatArray, elevation: FloatArray
-) -> npt.NDArray[np.complex128]:
+) -> ComplexArray:
     wavenumbers = _wavenumbers(probe, np.asarray(grid.node_hz))
     step = probe.pitch_mm / grid.per_pitch
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
@@ -258,8 +230,8 @@ def _line_sources(
     distance: FloatArray,
     elevation: FloatArray,
     wavenumbers: FloatArray,
-) -> npt.NDArray[np.complex128]:
-    """Field of elevational line sources: translation along the array makes one table serve all elements."""
+) -> ComplexArray:
+    """Field of elevational line sources; all elements share one table, shifted along the array."""
     strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
     strip = strip - probe.elevation_aperture_mm / 2.0
     lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
@@ -270,7 +242,7 @@ def _line_sources(
 
 def _apertures(
     probe: Probe, element: FloatArray, depth: FloatArray, wavenumbers: FloatArray
-) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
+) -> tuple[ComplexArray, ComplexArray]:
     """Weights and focusing phases of the sources, shape (depth, source, node), transmit and receive."""
     half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
     focus = np.full(depth.size, probe.transmit_focus_mm)
@@ -281,7 +253,7 @@ def _apertures(
 
 def _focused(
     probe: Probe, element: FloatArray, half_width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
-) -> npt.NDArray[np.complex128]:
+) -> ComplexArray:
     across = element / half_width[:, None]
     raised = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
     weight = np.where(np.abs(across) <= 1.0, raised, 0.0)
@@ -290,7 +262,7 @@ def _focused(
 
 
 def _fit_curvature(
-    field: npt.NDArray[np.complex128],
+    field: ComplexArray,
     depth: FloatArray,
     lateral: FloatArray,
     elevation: FloatArray,
@@ -304,8 +276,8 @@ def _fit_curvature(
     return np.stack([lateral_fit, elevation_fit], axis=1)
 
 
-def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumber: float) -> float:
-    """Least-squares `a` of path = a x^2 over the main lobe (above a third of the axis), by its energy."""
+def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> float:
+    """Least-squares `a` of path = a x^2 over the main lobe (a third of the axis), by energy."""
     fallen = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
     lobe = slice(0, max(int(fallen[0]) if fallen.size else profile.size, 3))
     path = -np.unwrap(np.angle(profile[lobe] * np.conj(profile[0]))) / wavenumber
@@ -313,10 +285,8 @@ def _parabola(profile: npt.NDArray[np.complex128], across: FloatArray, wavenumbe
     return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())
 
 
-def _compress(
-    field: npt.NDArray[np.complex128], pulse: FloatArray, count: int
-) -> tuple[Complex64Array, npt.NDArray[np.complex128]]:
-    """Principal components of the field over frequency, every depth and the pulse's band counting alike."""
+def _compress(field: ComplexArray, pulse: FloatArray, count: int) -> tuple[Complex64Array, ComplexArray]:
+    """Principal components of the field over frequency, with depths and the pulse's band equally weighted."""
     weight = np.maximum(pulse, 0.1 * pulse.max())
     depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3)))
     rows = (field * weight / depth_rms[:, None, None, None]).reshape(-1, pulse.size)
@@ -326,7 +296,7 @@ def _compress(
     return residual.astype(np.complex64), main.conj().T / weight
 
 
-def _reach(amplitude: FloatArray, floor: float) -> npt.NDArray[np.int64]:
+def _reach(amplitude: FloatArray, floor: float) -> IntArray:
     """Elevational steps beyond which the field stays below `floor` of that depth's peak."""
     nz = amplitude.shape[2]
     above = amplitude > floor * amplitude.max(axis=(1, 2), keepdims=True)

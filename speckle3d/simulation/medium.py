@@ -1,21 +1,21 @@
-"""What is scanned: point scatterers in a medium frame whose axes are lateral, depth and along the sweep.
+"""Media of point scatterers, in a frame whose axes are lateral, depth and along the sweep.
 
 Media are made tile by tile as the beam reaches them, each tile from its own seed, so that a sweep of any
-length needs the memory of its neighbourhood only and the same seed always gives the same scatterers.
+length needs the memory of its neighbourhood only and the same seed always gives the same scatterers. The
+media that presets name are at the end: a uniform phantom, a phantom with inclusions, tissue.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 
 Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
@@ -25,7 +25,7 @@ _KEPT_TILES = 160
 
 
 _CELL_MM = 0.5
-"""Sides, lateral and elevational, of cells that hold one background scatterer each: as the focused beam."""
+"""Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
 
 
 class Medium(Protocol):
@@ -38,7 +38,7 @@ class Medium(Protocol):
     def seen(
         self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
     ) -> list[Scatterers]:
-        """Blocks of scatterers, in the medium, with all those in a box of the image and perhaps more."""
+        """Blocks of scatterers, in the medium, that include all those in a box of the image."""
 
 
 def bounds_in_medium(
@@ -49,6 +49,11 @@ def bounds_in_medium(
     corners = np.stack(np.meshgrid(x, y, z), axis=-1)
     seen = medium_from_image.apply(corners.reshape(-1, 3))
     return seen.min(axis=0), seen.max(axis=0)
+
+
+def tile_seed(i: int, j: int) -> tuple[int, int]:
+    """Tile indices as non-negative numbers, which seeds require, distinct on either side of the origin."""
+    return i % 2**32, j % 2**32
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class PointMedium:
     def seen(
         self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
     ) -> list[Scatterers]:
-        """All of them: there are few."""
+        """Return all scatterers, whatever the box."""
         return [(self.position_mm, self.strength)]
 
 
@@ -81,7 +86,7 @@ class Waves:
 
     @property
     def largest(self) -> float:
-        """No value is further from zero than this."""
+        """Bound on the absolute value."""
         return float(np.abs(self.rows[:, 0]).sum())
 
     @staticmethod
@@ -127,10 +132,10 @@ class Layer:
         """Depth of the boundary above or below positions, shape (n, 3)."""
         return np.asarray(self.top_mm + self.undulation.at(position_mm * [1.0, 0.0, 1.0]))
 
-    def covers(self, position_mm: FloatArray) -> npt.NDArray[np.bool_]:
+    def covers(self, position_mm: FloatArray) -> BoolArray:
         """Whether positions, shape (n, 3), lie below the boundary."""
         below = position_mm[:, 1] - self.top_mm
-        # Waves are dear; only positions that they may lift over the boundary need them.
+        # Waves are slow to evaluate, so only near the boundary, where they can change the answer.
         near = np.flatnonzero(np.abs(below) <= self.undulation.largest)
         below[near] -= self.undulation.at(position_mm[near] * [1.0, 0.0, 1.0])
         return np.asarray(below >= 0.0)
@@ -213,9 +218,6 @@ class TiledMedium:
     depth_mm: tuple[float, float] = (-3.0, 50.0)
     tile_mm: float = 4.0
     fascia_per_mm2: float = 60.0
-    _tiles: OrderedDict[tuple[int, int], Scatterers] = field(
-        default_factory=OrderedDict, repr=False, compare=False
-    )
 
     def seen(
         self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
@@ -230,13 +232,9 @@ class TiledMedium:
         columns = range(first[0], last[0] + 1), range(first[1], last[1] + 1)
         return [self._tile(i, j) for i in columns[0] for j in columns[1]]
 
-    def _tile(self, i: int, j: int) -> Scatterers:
-        if (i, j) not in self._tiles:
-            while len(self._tiles) >= _KEPT_TILES:
-                self._tiles.popitem(last=False)
-            self._tiles[i, j] = self._make(i, j)
-        self._tiles.move_to_end((i, j))
-        return self._tiles[i, j]
+    @cached_property
+    def _tile(self) -> Callable[[int, int], Scatterers]:
+        return lru_cache(_KEPT_TILES)(self._make)
 
     def _make(self, i: int, j: int) -> Scatterers:
         parts = [self._background(i, j)]
@@ -253,8 +251,7 @@ class TiledMedium:
         return position[kept], strength[kept]
 
     def _rng(self, part: int, i: int, j: int) -> np.random.Generator:
-        # Seeds take no negative numbers; tiles on either side of the origin need distinct ones.
-        return np.random.default_rng([self.entropy, part, i % 2**32, j % 2**32])
+        return np.random.default_rng([self.entropy, part, *tile_seed(i, j)])
 
     def _background(self, i: int, j: int) -> Scatterers:
         rng = self._rng(0, i, j)
@@ -312,3 +309,70 @@ class TiledMedium:
         strength = np.concatenate([s for _, s in drawn])
         mine = (np.floor(position[:, [0, 2]] / self.tile_mm) == [i, j]).all(axis=1)
         return position[mine], strength[mine]
+
+
+def fully_developed(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
+    """Make a uniform speckle phantom."""
+    return TiledMedium(entropy, per_mm3, 0.3)
+
+
+def phantom(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
+    """Make a speckle phantom with spherical inclusions, brighter and darker by 6 to 12 dB."""
+    rng = np.random.default_rng([entropy, 1])
+    factors = (2.0, 0.5, 0.25, 3.0, 0.5)
+    return TiledMedium(
+        entropy, per_mm3, 0.3, spheres=[_sphere(rng, length_mm, (1.5, 4.0), f) for f in factors]
+    )
+
+
+def tissue(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
+    """Make layered tissue: skin, fat, muscles between fascias, cysts, and a poorly filled depth.
+
+    Fibres run mostly along the sweep and are longer than the beam is thick, more of them in some muscles
+    than in others: there speckle is partly coherent and decorrelates too slowly.
+    """
+    rng = np.random.default_rng([entropy, 1])
+    tops = np.array([-3.0, 1.5, 6.5, 7.5, 15.0, 16.2, 23.0, 30.0])
+    tops[2:] += rng.uniform(-0.5, 0.5)
+    strengths = (0.9, 0.35, 0.7, 0.55, 0.9, 0.7, 0.45, 0.2)
+    fills = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2)
+    fascias = (0.0, 1.0, 1.6, 0.8, 2.0, 1.0, 1.6, 1.2)
+    layers = [
+        Layer(float(top), Waves.random(rng, 0.25, (0.25, 0.0, 0.2)), *rest)
+        for top, *rest in zip(tops, strengths, fills, fascias, strict=True)
+    ]
+    texture = Waves.random(rng, 0.25, (2.0, 2.0, 2.0), 12)
+    cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]
+    return TiledMedium(
+        entropy, per_mm3, 0.4, layers, texture, _tissue_clusters(rng, tops.tolist()), spheres=cysts
+    )
+
+
+def _sphere(
+    rng: np.random.Generator, length_mm: float, radius_mm: tuple[float, float], factor: float
+) -> Sphere:
+    centre = rng.uniform([3.0, 8.0, 0.0], [35.0, 34.0, length_mm])
+    x, y, z = (float(c) for c in centre)
+    return Sphere((x, y, z), float(rng.uniform(*radius_mm)), factor)
+
+
+def _tissue_clusters(rng: np.random.Generator, tops: Sequence[float]) -> list[Clusters]:
+    """Fibres in three muscles, in ever larger numbers with depth, crossing septa, and round clusters."""
+    heading, dip = rng.normal(0.0, 0.1), rng.normal(0.0, 0.02)
+    along = (float(np.sin(heading)), float(np.sin(dip)), float(np.cos(heading)))
+    muscles = [(tops[3], tops[4]), (tops[5], tops[6]), (tops[6], tops[7])]
+    fibres = [
+        Clusters(density, 24, 0.05, depth, length_mm=6.0, spread_mm=0.02, direction=along)
+        for density, depth in zip((0.5, 0.9, 1.3), muscles, strict=True)
+    ]
+    septa = Clusters(0.12, 24, 0.06, (tops[1], tops[7]), 5.0, 0.02, (1.0, 0.05, 0.1), 0.1)
+    round_ones = Clusters(0.25, 12, 0.09, (tops[1], 42.0), spread_mm=0.12, coherent=False)
+    return [*fibres, septa, round_ones]
+
+
+MEDIA: dict[str, Callable[[int, float], TiledMedium]] = {
+    "fully_developed": fully_developed,
+    "phantom": phantom,
+    "tissue": tissue,
+}
+"""Media by the name that presets use; each takes a seed and the length of the sweep."""

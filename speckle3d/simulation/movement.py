@@ -1,4 +1,10 @@
-"""How the probe moves: hand-like trajectories that can be asked for a pose at any time."""
+"""Motion of the probe: hand-like trajectories with a pose at any time.
+
+References
+----------
+.. [1] Prager et al., "Automatic calibration for 3-D free-hand ultrasound", CUED/F-INFENG/TR 303, 1997:
+   figures 4 and 7 (the motions over a floor that its calibration needs).
+"""
 
 from __future__ import annotations
 
@@ -12,12 +18,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import rotation_from_fixed_angles
+from speckle3d.simulation.settings import SimulationSettings
 
 _KNOT_RATE_HZ = 100.0
 """Knots of the trajectory: eight per period of the fastest tremor."""
 
 _LEAD_S = 0.5
 """The trajectory starts and ends this much beyond the frames, for sensors on their own clocks."""
+
+_SWINGS = np.array([2.3, 3.7, 2.9, 6.5, 1.6, 4.3])
+"""Swings during the scan of each column of `FloorScan`: incommensurate, so that all combinations occur."""
+
+_ROAMING_MM = 15.0
+"""How far either way the probe wanders over the floor."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +165,42 @@ def hand_sweep(
     return Trajectory(time, columns, pivot, medium_from_start, world_from_medium)
 
 
+@dataclass(frozen=True)
+class FloorScan(Trajectory):
+    """A motion over a floor at y = 0 of the medium.
+
+    The columns of `knots` are x (mm) of the point of the floor that the image's middle vector meets, its
+    depth in the image, its z; then tilt, yaw, roll (rad). Yaw is about the floor's normal and comes first,
+    then tilt and roll about the image's own axes, so that the angle to the floor is theirs alone.
+    """
+
+    def _start_from_image(self, columns: FloatArray) -> RigidTransform:
+        x, depth, z, tilt, yaw, roll = np.moveaxis(columns, -1, 0)
+        rotation = Rotation.from_euler("YXZ", np.stack([yaw, tilt, roll], axis=-1))
+        below = self.pivot_mm + np.multiply.outer(depth, [0.0, 1.0, 0.0])
+        met = np.stack([x, np.zeros_like(x), z], axis=-1)
+        return RigidTransform.from_components(met - rotation.apply(below), rotation)
+
+
+def scan_floor(
+    settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
+) -> FloorScan:
+    """Turn and lift the probe over the ranges in `settings`, all axes at once, as a hand would."""
+    duration, tremor = settings.duration_s, HandMotion()
+    time = hand_knots(duration)
+    nearest, farthest = settings.depth_range_mm
+    turns = np.deg2rad([settings.tilt_range_deg, settings.yaw_range_deg, settings.roll_range_deg])
+    reach = np.array([_ROAMING_MM, (farthest - nearest) / 2.0, _ROAMING_MM, *turns])
+    columns = np.empty((time.size, 6))
+    for axis in range(6):
+        fast = tremor.tremor_mm if axis < 3 else tremor.tremor_rad
+        columns[:, axis] = reach[axis] * _swings(time / duration, _SWINGS[axis], rng)
+        columns[:, axis] += fast * band_noise(time, tremor.tremor_band_hz, rng)
+    columns[:, 1] += (nearest + farthest) / 2.0
+    pivot = np.array([face_mm / 2.0, 0.0, 0.0])
+    return FloorScan(time, columns, pivot, RigidTransform.identity(), world)
+
+
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
     """Exact elevational steps, in blocks far enough apart to show independent speckle, in the medium."""
     z = np.arange(steps) * step_mm + np.arange(blocks)[:, None] * ((steps - 1) * step_mm + gap_mm)
@@ -191,7 +240,7 @@ def _progress(
 
 
 def _smoothed(speed: FloatArray) -> FloatArray:
-    """Take the corners off starts and stops: a hand accelerates over about a tenth of a second."""
+    """Smooth starts and stops: a hand accelerates over about a tenth of a second."""
     kernel = np.hanning(13)[1:-1]
     return np.convolve(speed, kernel / kernel.sum(), mode="same")
 
@@ -211,3 +260,11 @@ def band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Ge
     phase = rng.uniform(0.0, 2.0 * np.pi, 12)
     wave = np.sin(2.0 * np.pi * np.multiply.outer(time, frequency) + phase)
     return np.asarray(wave.sum(axis=1) / np.sqrt(6.0))
+
+
+def _swings(phase: FloatArray, count: float, rng: np.random.Generator) -> FloatArray:
+    """Nearly triangular wave between -1 and 1, about `count` periods per unit of phase, with rounded ends."""
+    # The speed varies slowly against a swing.
+    angle = count * rng.uniform(0.95, 1.05) * phase + 0.05 * band_noise(phase, (0.0, 0.5 * count), rng)
+    sine = np.sin(2.0 * np.pi * (angle + rng.random()))
+    return np.asarray(np.arcsin(0.95 * sine) / np.arcsin(0.95))

@@ -1,4 +1,4 @@
-"""Frames of RF from a beam, a medium and poses; computed when read, the same each time."""
+"""RF frames from a beam, a medium and poses, computed when read and the same each time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.kernels.scatter import gather_near, scatter_echoes, sort_into_cells
+from speckle3d.kernels.scatter import (
+    BeamLimits,
+    CellOrder,
+    FieldTable,
+    Vectors,
+    gather_near,
+    scatter_echoes,
+    sort_into_cells,
+)
 from speckle3d.simulation.beam import BeamTable
 from speckle3d.simulation.medium import Medium
 
@@ -98,17 +106,10 @@ class SimulatedFrames:
         probe, image, beam = self.beam.probe, self.image, self.beam
         out = np.zeros((image.vectors, self._spectra.length, beam.grid.components), np.complex64)
         vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
-        position, strength, cells = self._near(self.medium_from_image[index])
         scatter_echoes(
-            position,
-            strength,
-            cells,
-            *_cells_of(vector_mm, beam.lateral_extent_mm),
-            vector_mm,
-            beam.residual,
-            beam.reach,
-            beam.curvature_per_mm,
-            self._table_steps,
+            self._near(self.medium_from_image[index]),
+            Vectors(vector_mm, *_cells_of(vector_mm, beam.lateral_extent_mm)),
+            FieldTable(beam.residual, beam.reach, beam.curvature_per_mm, self._table_steps),
             image.first_sample_depth_mm,
             image.sample_spacing_mm,
             2e-3 * self._spectra.carrier_hz / probe.speed_of_sound_m_s,
@@ -156,28 +157,29 @@ class SimulatedFrames:
         noise[:, band] = scale * white.view(np.complex64)[..., 0]
         return noise
 
-    def _near(self, medium_from_image: RigidTransform) -> tuple[FloatArray, Float32Array, IntArray]:
-        """Scatterers within the beam's reach in the image frame by lateral cell, and the cells' starts."""
+    def _near(self, medium_from_image: RigidTransform) -> CellOrder:
+        """Scatterers within the beam's reach."""
         margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm
         lateral = np.array([-margin, self.image.width_mm + margin])
         depth = self.beam.depth_mm
         low = np.array([lateral[0], depth[0], -thick.max()])
         high = np.array([lateral[1], depth[-1], thick.max()])
         blocks = self.medium.seen(medium_from_image, low, high)
-        position = np.empty((sum(s.size for _, s in blocks), 3))
-        strength = np.empty(position.shape[0], np.float32)
-        matrix, steps, n = medium_from_image.inv().as_matrix(), self._table_steps[:2], 0
+        total = sum(strength.size for _, strength in blocks)
+        near = np.empty((total, 3)), np.empty(total, np.float32)
+        matrix, n = medium_from_image.inv().as_matrix(), 0
+        limits = BeamLimits(lateral, self._table_steps[:2], thick)
         for block in blocks:
-            n = gather_near(*block, matrix, lateral, steps, thick, position, strength, n)
-        by_cell = np.empty((n, 3)), np.empty(n, np.float32)
+            n = gather_near(block, matrix, limits, near, n)
         # One spare cell: rounding may put the rightmost scatterer past the last one that a vector looks at.
         cells = np.zeros(int(np.ptp(lateral) / _CELL_MM + 1e-6) + 3, np.int64)
-        sort_into_cells(position[:n], strength[:n], lateral[0], _CELL_MM, depth[-1], cells, *by_cell)
-        return *by_cell, cells
+        ordered = CellOrder(np.empty((n, 3)), np.empty(n, np.float32), cells)
+        sort_into_cells(near[0][:n], near[1][:n], lateral[0], _CELL_MM, depth[-1], ordered)
+        return ordered
 
 
 class _Spectra:
-    """Pulse spectra of the beam's components on the FFT's bins, and the way from baseband echoes to RF."""
+    """Pulse spectra of the beam's components on the FFT's bins; turns baseband echoes into RF."""
 
     def __init__(self, beam: BeamTable, samples: int) -> None:
         rate = beam.probe.sampling_rate_hz
@@ -190,13 +192,13 @@ class _Spectra:
         self._band = np.flatnonzero(spectra.any(axis=0))
         self._pulse = np.ascontiguousarray(spectra[:, self._band].T).astype(np.complex64)
 
-    def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> npt.NDArray[np.float32]:
+    def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> Float32Array:
         """RF, shape (vector, sample): each component's echoes through its pulse, and the noise, summed."""
         # The band holds less than half of the bins: baseband bins wrap, so negative ones are in place.
         baseband = fft(echoes, axis=1, workers=2)[:, self._band - self._carrier_bin]
         spectrum = noise
         spectrum[:, self._band] += np.einsum("vfk,fk->vf", baseband, self._pulse)
-        wave: npt.NDArray[np.float32] = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
+        wave: Float32Array = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
         return wave
 
 

@@ -1,4 +1,4 @@
-"""What to simulate, as people and files say it."""
+"""Settings of a simulation, as given on the command line and kept in files."""
 
 from __future__ import annotations
 

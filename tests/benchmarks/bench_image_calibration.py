@@ -17,7 +17,9 @@ import numpy as np
 from cache import simulated_pair
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.solver import ImageSettings, TrackedImages, calibrate_crossing, prepare
+from calibration.images.similarity import prepare
+from calibration.images.solver import ImageSettings, calibrate_from_sweeps
+from calibration.images.stacks import TrackedImages
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings
@@ -49,7 +51,7 @@ def study(crossing, method, starts):
     for number in range(starts):
         start, wall, cpu = displaced(rng), time.perf_counter(), time.process_time()
         try:
-            found = calibrate_crossing(crossing, start, ImageSettings(method=method)).sensor_from_image
+            found = calibrate_from_sweeps(crossing, start, ImageSettings(method=method)).sensor_from_image
             error = (TRUTH.inv() * found).apply(crossing.centre_mm) - crossing.centre_mm
         except InsufficientDataError:
             error = np.full(3, np.inf)

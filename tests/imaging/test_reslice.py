@@ -198,19 +198,19 @@ def test_travel_follows_a_probe_that_drifts_sideways():
 def test_wrong_inputs_say_what_was_expected():
     one = RigidTransform.identity(2)
     plane = ReslicePlane(RigidTransform.identity(), 1.0, 1.0, 0.5)
-    with pytest.raises(MismatchError, match="expected 3 poses for 3 images, got 2"):
+    with pytest.raises(MismatchError, match=r"world_from_image.* 3 .* 2"):
         reslice_frames(np.ones((3, 9, 14)), GRID, one, plane, 1.0)
-    with pytest.raises(MismatchError, match=r"images\[0\]: expected shape \(9, 14\), got \(9, 13\)"):
+    with pytest.raises(MismatchError, match=r"images\[0\].*\(9, 14\).*\(9, 13\)"):
         reslice_frames(lambda _: np.ones((9, 13)), GRID, one, plane, 1.0)
     with pytest.raises(InvalidInputError, match="complex64"):
         reslice_frames(np.ones((2, 9, 14), dtype=np.complex64), GRID, one, plane, 1.0)
     with pytest.raises(InvalidInputError, match="max_distance_mm"):
         reslice_frames(np.ones((2, 9, 14)), GRID, one, plane, 0.0)
-    with pytest.raises(InvalidInputError, match="row of poses"):
+    with pytest.raises(InvalidInputError, match="world_from_image"):
         reslice_frames(np.ones((2, 9, 14)), GRID, one[0], plane, 1.0)
-    with pytest.raises(InvalidInputError, match="at most 100000000 pixels"):
+    with pytest.raises(InvalidInputError, match="100000000"):
         ReslicePlane(RigidTransform.identity(), 1e4, 1e4, 0.01)
-    with pytest.raises(InvalidInputError, match="lateral_mm: expected a value inside the image, 0 to 4"):
+    with pytest.raises(InvalidInputError, match=r"lateral_mm.* 0 to 4"):
         along_sweep_plane(one, GRID, 4.5)
     opposed = RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [0, np.pi, 0]]))
     with pytest.raises(InsufficientDataError, match="elevational"):

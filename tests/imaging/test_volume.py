@@ -14,7 +14,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.reslice import ReslicePlane, reslice_volume
-from speckle3d.imaging.volume import compound, compound_on, grid_around
+from speckle3d.imaging.volume import compound, grid_around
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -125,23 +125,12 @@ def test_uint8_rounds_clips_and_marks_empty_as_zero():
     np.testing.assert_array_equal(volume.voxels[2, 2], [13, 0, 0, 0, 255])
 
 
-def test_samples_outside_a_given_grid_are_left_out():
-    poses = RigidTransform.from_translation(np.outer(np.arange(4.0), [0, 0, 1]))
-    images = [np.full((9, 14), level) for level in range(4)]
-    whole = compound(images, GRID, poses, 1.0, fill_radius=0)
-    part = grid_around(GRID, poses[1:3], 1.0)
-    cropped = compound_on(part, images, GRID, poses, fill_radius=0)
-    np.testing.assert_array_equal(cropped.voxels, whole.voxels[:, :, 1:3])
-
-
 def test_absurd_sizes_are_refused_before_a_frame_is_read():
     def read(index):
         raise AssertionError("read a frame")
 
     poses = RigidTransform.from_translation([[0.0, 0, 0], [0, 0, 5e4]])
-    with pytest.raises(
-        InvalidInputError, match=r"at most 4 GB of memory, got .* GB for 41 x 40 x 500001 vox"
-    ):
+    with pytest.raises(InvalidInputError, match=r"4 GB .* 41 x 40 x 500001"):
         compound(read, GRID, poses, 0.1)
     with pytest.raises(InvalidInputError, match="voxel_mm"):
         compound(read, GRID, poses, 0.0)
@@ -152,7 +141,7 @@ def test_absurd_sizes_are_refused_before_a_frame_is_read():
 
 
 def test_no_values_is_an_error():
-    with pytest.raises(InsufficientDataError, match="got none"):
+    with pytest.raises(InsufficientDataError):
         compound(np.full((1, 9, 14), np.nan), GRID, RigidTransform.identity(1), 0.5)
 
 

@@ -1,7 +1,6 @@
 """Compounding of a real tracked sweep against the volume PLUS made of it (nearest voxel, mean)."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +8,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from speckle3d.kernels.compounding import add_samples, fill_from_shell
 
-FOLDER = Path(__file__).parents[3] / "shared" / "realdata" / "plus"
-CONFIG = FOLDER / "PlusDeviceSet_VolumeReconstructionOnly_SpinePhantom_NN_MEAN.xml"
-
-pytestmark = [
-    pytest.mark.realdata,
-    pytest.mark.skipif(not CONFIG.exists(), reason="the folder of third-party recordings is not there"),
-]
+pytestmark = pytest.mark.realdata
 
 
 def matrix(text):
@@ -23,12 +16,13 @@ def matrix(text):
 
 
 @pytest.fixture(scope="module")
-def volumes():
+def volumes(realdata):
     """Our sums and counts on PLUS's grid, and PLUS's voxels, all indexed [i, j, k]."""
-    sitk = pytest.importorskip("SimpleITK")
-    sweep = sitk.ReadImage(FOLDER / "SpinePhantomFreehand.igs.mha")
-    plus = sitk.ReadImage(FOLDER / "vtkVolumeReconstructorTestNNMEANvolumeRef.mha")
-    probe_from_image = matrix(re.search(r'From="Image" To="Probe"\s+Matrix="([^"]*)"', CONFIG.read_text())[1])
+    sitk, folder = pytest.importorskip("SimpleITK"), realdata / "plus"
+    config = (folder / "PlusDeviceSet_VolumeReconstructionOnly_SpinePhantom_NN_MEAN.xml").read_text()
+    sweep = sitk.ReadImage(folder / "SpinePhantomFreehand.igs.mha")
+    plus = sitk.ReadImage(folder / "vtkVolumeReconstructorTestNNMEANvolumeRef.mha")
+    probe_from_image = matrix(re.search(r'From="Image" To="Probe"\s+Matrix="([^"]*)"', config)[1])
     total, count = np.zeros(plus.GetSize(), np.float32), np.zeros(plus.GetSize(), np.uint32)
     for index, rows in enumerate(sitk.GetArrayFromImage(sweep)):
         pose = {

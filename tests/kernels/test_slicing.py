@@ -4,8 +4,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.similarity import Comparison, Patches
+from calibration.images.similarity import Comparison
 from calibration.images.stacks import Stack
+from speckle3d.kernels.slicing import PatchGrid
 
 PIXELS = np.array([0.5, 0.4, 0.2, 1.0])
 CALIBRATION = RigidTransform.from_components([3.0, -20.0, 5.0], Rotation.from_rotvec([0.2, -0.4, 0.9]))
@@ -26,8 +27,8 @@ def stack(seed, turn_deg):
 @pytest.fixture(scope="module")
 def comparison():
     patches = [
-        Patches(np.array([[3, 2, 4], [7, 9, 11], [10, 5, 12]]), (6, 5), 2),
-        Patches(np.array([[6, 8, 6]]), (5, 5), 2),
+        PatchGrid(np.array([[3, 2, 4], [7, 9, 11], [10, 5, 12]]), (6, 5), 2),
+        PatchGrid(np.array([[6, 8, 6]]), (5, 5), 2),
     ]
     return Comparison((stack(1, 0.0), stack(2, 80.0)), tuple(patches), GAP_MM)
 

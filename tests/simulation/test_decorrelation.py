@@ -8,9 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import Probe, tabulate_beam
-from speckle3d.simulation.medium import TiledMedium
+from speckle3d.simulation.medium import TiledMedium, tissue
 from speckle3d.simulation.movement import stepped_poses
-from speckle3d.simulation.recipes import tissue
 from speckle3d.simulation.scan import Receiver, SimulatedFrames
 
 STEP_MM, STEPS, BLOCKS, VECTORS = 0.1, 5, 5, 48
@@ -82,6 +81,7 @@ def test_speckle_decorrelates_fastest_off_focus_where_the_beam_is_widest(measure
     assert rho[0][2] < min(rho[1][2], rho[2][2]) - 0.1
 
 
+@pytest.mark.slow
 def test_fibres_make_tissue_decorrelate_more_slowly(measured):
     medium = tissue(5, 40.0)
     beam = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)

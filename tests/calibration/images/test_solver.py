@@ -3,10 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
+from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.curves import AXES, similarity_curves, similarity_map
-from calibration.images.solver import ImageSettings, calibrate_crossing, calibrate_images, prepare
+from calibration.images.angulation import PARAMETERS
+from calibration.images.report import similarity_curves, similarity_map
+from calibration.images.similarity import prepare
+from calibration.images.solver import ImageSettings, calibrate_from_sweeps, calibrate_images
+from calibration.images.stacks import read_stack
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
@@ -20,14 +24,20 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def crossing(scene):
-    return prepare(*scene[:2])
+def told():
+    """What was told of the progress of `crossing` and `found`."""
+    return []
 
 
 @pytest.fixture(scope="module")
-def found(scene, crossing):
+def crossing(scene, told):
+    return prepare(*scene[:2], lambda *step: told.append(step))
+
+
+@pytest.fixture(scope="module")
+def found(scene, crossing, told):
     start = displaced(scene[2], np.random.default_rng(0))
-    return calibrate_crossing(crossing, start)
+    return calibrate_from_sweeps(crossing, start, progress=lambda *step: told.append(step))
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +46,10 @@ def others():
     return crossing_sweeps(1, frames=20)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     start = displaced(scene[2], np.random.default_rng(seed))
-    result = found if seed == 0 else calibrate_crossing(crossing, start)
+    result = found if seed == 0 else calibrate_from_sweeps(crossing, start)
     error = centre_error_mm(result.sensor_from_image, scene[2], scene[0].grid)
     # Of it, 0.1 mm along the beams comes from the tracker: 0.1 mm and 0.05 degrees of jitter.
     assert np.linalg.norm(error) < 0.5
@@ -78,17 +88,19 @@ def test_covariance_of_a_point_is_that_of_its_place(found):
     np.testing.assert_allclose(np.diag(found.covariance_of(point)), moved.var(axis=0), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_held_out_frames_have_no_say(scene, crossing):
     first, second, truth = scene
     spoilt = first.images.copy()
     spoilt[crossing.frames_held_out[0]] = 255 - spoilt[crossing.frames_held_out[0]]
     start = displaced(truth, np.random.default_rng(3), 2.0, 2.0)
-    plain = calibrate_crossing(crossing, start, REFINE)
+    plain = calibrate_from_sweeps(crossing, start, REFINE)
     other = calibrate_images(dataclasses.replace(first, images=spoilt), second, start, REFINE)
     np.testing.assert_array_equal(other.sensor_from_image.as_matrix(), plain.sensor_from_image.as_matrix())
     assert other.held_out.after < plain.held_out.after - 0.3
 
 
+@pytest.mark.slow
 def test_pixel_sizes_are_found():
     # Two that fan alike turn about one point, and about it everything could be larger.
     first, second, truth = crossing_sweeps(0, frames=30, fan_deg=(0.0, 40.0))
@@ -96,7 +108,7 @@ def test_pixel_sizes_are_found():
     wrong = ImageGrid(grid.vectors, grid.samples, grid.vector_pitch_mm / 1.03, grid.sample_spacing_mm / 0.98)
     views = [dataclasses.replace(view, grid=wrong) for view in (first, second)]
     start = displaced(truth, np.random.default_rng(4), 2.0, 2.0)
-    result = calibrate_images(*views, start, dataclasses.replace(REFINE, scales=True))
+    result = calibrate_images(*views, start, REFINE.model_copy(update={"scales": True}))
     assert (result.scale_errors > 0).all()
     # The size across the beams, three per cent off at first; that along them stays uncertain.
     assert abs(result.scales[0] - 1.03) < min(0.01, 4.0 * result.scale_errors[0])
@@ -120,6 +132,7 @@ def test_published_method_reaches_the_same_from_nearby(others):
     assert np.isfinite(result.covariance).all()
 
 
+@pytest.mark.slow
 def test_what_never_changes_is_not_compared(scene):
     first, second, truth = scene
     start = displaced(truth, np.random.default_rng(6), 3.0, 3.0)
@@ -136,6 +149,15 @@ def test_what_never_changes_is_not_compared(scene):
     assert np.trace(masked.covariance) > np.trace(plain.covariance)
 
 
+def test_pixels_that_never_change_show_nothing(scene):
+    images = scene[0].images.copy()
+    images[:, :20] = 7
+    stack, _ = read_stack(dataclasses.replace(scene[0], images=images))
+    columns = np.arange(stack.images.shape[1]) * stack.pixels[0] / scene[0].grid.vector_pitch_mm
+    dark = np.isnan(stack.images).all(axis=(0, 2))
+    np.testing.assert_array_equal(dark, columns < 19.5)
+
+
 def test_frames_without_readings_are_left_out(scene):
     first, second, truth = scene
     kept = slice(6, None)
@@ -147,15 +169,11 @@ def test_frames_without_readings_are_left_out(scene):
 
 
 def test_delay_of_the_sensor_counts(scene):
-    first, second, truth = scene
-    views = []
-    for view in (first, second):
-        late = TimedPoses(view.readings.time_s + 0.06, view.readings.world_from_sensor)
-        views.append(dataclasses.replace(view, readings=late, time_offset_s=-0.06))
-    start = displaced(truth, np.random.default_rng(8), 3.0, 3.0)
-    one, other = calibrate_images(*views, start, REFINE), calibrate_images(first, second, start, REFINE)
+    view, frames = scene[0], np.arange(3, 30)
+    late = TimedPoses(view.readings.time_s + 0.06, view.readings.world_from_sensor)
+    shifted = dataclasses.replace(view, readings=late, time_offset_s=-0.06)
     np.testing.assert_allclose(
-        one.sensor_from_image.as_matrix(), other.sensor_from_image.as_matrix(), atol=1e-3
+        shifted.world_from_sensor(frames).as_matrix(), view.world_from_sensor(frames).as_matrix(), atol=1e-9
     )
 
 
@@ -170,7 +188,7 @@ def test_parallel_sweeps_leave_translation_undetermined():
 
 def test_similarity_falls_from_the_answer_whichever_parameter_moves(crossing, found):
     curves = similarity_curves(crossing, found.sensor_from_image, span=6.0, points=13)
-    assert curves.similarity.shape == (len(AXES), 13)
+    assert curves.similarity.shape == (len(PARAMETERS), 13)
     best = curves.offset[np.nanargmax(curves.similarity, axis=1)]
     assert (np.abs(best) <= 0.5).all()
     assert (curves.similarity[:, 6] - np.nanmin(curves.similarity, axis=1) > 0.05).all()
@@ -179,16 +197,13 @@ def test_similarity_falls_from_the_answer_whichever_parameter_moves(crossing, fo
 def test_similarity_map_contains_the_curves(crossing, found):
     curves = similarity_curves(crossing, found.sensor_from_image, span=4.0, points=5)
     surface = similarity_map(crossing, found.sensor_from_image, ("x", "yaw"), span=4.0, points=5)
-    np.testing.assert_allclose(surface.similarity[:, 2], curves.similarity[AXES.index("x")])
-    np.testing.assert_allclose(surface.similarity[2], curves.similarity[AXES.index("yaw")])
-    with pytest.raises(InvalidInputError, match="expected two of tilt, yaw"):
+    np.testing.assert_allclose(surface.similarity[:, 2], curves.similarity[PARAMETERS.index("x")])
+    np.testing.assert_allclose(surface.similarity[2], curves.similarity[PARAMETERS.index("yaw")])
+    with pytest.raises(InvalidInputError, match=r"axes.*sideways"):
         similarity_map(crossing, found.sensor_from_image, ("x", "sideways"))
 
 
-def test_progress_is_told(scene, others):
-    told = []
-    start = displaced(others[2], np.random.default_rng(10), 1.0, 1.0)
-    calibrate_images(*others[:2], start, progress=lambda *step: told.append(step))
+def test_progress_is_told(found, told):
     stages = [stage for stage, *_ in told]
     order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
     order += ["looking beside", "deciding", "refining"]
@@ -196,10 +211,9 @@ def test_progress_is_told(scene, others):
     assert all(1 <= done <= total for _, done, total in told)
 
 
+@pytest.mark.slow
 def test_sweeps_of_different_things_are_refused(scene, others):
-    with pytest.raises(
-        InsufficientDataError, match=r"expected sweeps that (show the same structure|agree within)"
-    ):
+    with pytest.raises(InsufficientDataError):
         calibrate_images(scene[0], others[1], scene[2])
 
 
@@ -207,35 +221,38 @@ def test_sweeps_apart_are_refused(scene):
     first, second, truth = scene
     away = RigidTransform.from_translation([500.0, 0.0, 0.0]) * second.readings.world_from_sensor
     apart = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, away))
-    with pytest.raises(InsufficientDataError, match="got no overlap anywhere"):
+    with pytest.raises(InsufficientDataError, match="no overlap"):
         calibrate_images(first, apart, truth)
-    with pytest.raises(InsufficientDataError, match="got no overlap"):
+    with pytest.raises(InsufficientDataError, match="no overlap"):
         calibrate_images(first, apart, truth, REFINE)
 
 
 def test_bad_input_is_named(scene):
     first, second, truth = scene
     still = dataclasses.replace(second, images=np.zeros_like(second.images))
-    with pytest.raises(InsufficientDataError, match="sweep 2: expected images that change"):
+    with pytest.raises(InsufficientDataError, match="sweep 2"):
         calibrate_images(first, still, truth)
     short = TimedPoses(second.readings.time_s[:4], second.readings.world_from_sensor[:4])
-    with pytest.raises(InsufficientDataError, match="sweep 2: expected at least 10 frames"):
+    with pytest.raises(InsufficientDataError, match=r"sweep 2: .*10 .* 4"):
         calibrate_images(first, dataclasses.replace(second, readings=short), truth)
     coarse = dataclasses.replace(second, grid=dataclasses.replace(second.grid, vector_pitch_mm=0.5))
-    with pytest.raises(MismatchError, match="expected the pixels of sweep 1"):
+    with pytest.raises(MismatchError, match=r"sweep 2: .*sweep 1"):
         calibrate_images(first, coarse, truth)
-    with pytest.raises(MismatchError, match="expected 30 frame times for 30 images, got 36"):
+    with pytest.raises(MismatchError, match=r"sweep 2: .*30 .* 36"):
         calibrate_images(first, dataclasses.replace(second, images=second.images[:30]), truth)
-    with pytest.raises(InvalidInputError, match="start: expected a single transform"):
+    with pytest.raises(InvalidInputError, match="start"):
         calibrate_images(first, second, RigidTransform.concatenate([truth, truth]))
-    with pytest.raises(InvalidInputError, match="method: expected one of"):
-        ImageSettings(method="amoeba")
-    with pytest.raises(InvalidInputError, match="capture_mm: expected 0 to 100"):
-        ImageSettings(capture_mm=-1.0)
-    with pytest.raises(InvalidInputError, match="threads"):
-        ImageSettings(threads=0)
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"method": "amoeba"}, {"capture_mm": -1.0}, {"capture_deg": 91}, {"threads": 0}]
+)
+def test_settings_are_checked(wrong):
+    with pytest.raises(ValidationError, match=next(iter(wrong))):
+        ImageSettings(**wrong)
+
+
+@pytest.mark.slow
 def test_no_bias_along_the_beams():
     errors = []
     for seed in range(4):
@@ -243,5 +260,5 @@ def test_no_bias_along_the_beams():
         start = displaced(truth, np.random.default_rng(seed), 0.5, 0.5)
         result = calibrate_images(first, second, start, REFINE)
         errors.append(centre_error_mm(result.sensor_from_image, truth, first.grid)[1])
-    # Published: 2 mm. The issue's bound; of a scene's own reflections 0.1 mm remain, half as much of four.
+    # Published: 2 mm. A scene's own reflections leave 0.1 mm, half as much of four.
     assert abs(np.mean(errors)) < 0.15

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import ImagePoints
-from calibration.clock.pairing import covered, estimate_offset
+from calibration.clock.offset import covered, estimate_offset
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from speckle3d.core.errors import InsufficientDataError
@@ -70,7 +70,12 @@ def orientation_solver(frame_s, pixels, readings):
 
 @pytest.mark.parametrize(
     ("solver", "seed"),
-    [(tracker_solver, 0), (tracker_solver, 1), (orientation_solver, 0), (orientation_solver, 1)],
+    [
+        (tracker_solver, 0),
+        pytest.param(tracker_solver, 1, marks=pytest.mark.slow),
+        (orientation_solver, 0),
+        pytest.param(orientation_solver, 1, marks=pytest.mark.slow),
+    ],
 )
 def test_a_clock_that_is_off_is_found_within_the_claimed_error(solver, seed):
     found = estimate_offset(solver(*record(seed)), search_s=SEARCH_S)
@@ -121,7 +126,7 @@ def test_the_ends_of_the_range_are_refused(truth_s):
         tried.append(offset_s)
         return residuals_at(offset_s)
 
-    with pytest.raises(InsufficientDataError, match="at its end"):
+    with pytest.raises(InsufficientDataError, match=r"0.4 s of 0 s"):
         estimate_offset(stub(residuals))
     # Nothing outside the range is asked for: there may be no readings.
     assert np.abs(tried).max() <= 0.4 + 1e-12
@@ -145,7 +150,7 @@ def test_a_clock_is_looked_for_around_what_is_known_of_it():
     assert estimate_offset(stub(residuals_at), around_s=0.8, search_s=0.2).seconds == pytest.approx(
         0.9, abs=0.01
     )
-    with pytest.raises(InsufficientDataError, match=r"within 0.1 s of 1.1 s, got the best at its end"):
+    with pytest.raises(InsufficientDataError, match=r"0.1 s of 1.1 s"):
         estimate_offset(stub(residuals_at), around_s=1.1, search_s=0.1)
 
 
@@ -153,7 +158,7 @@ def test_offsets_without_a_calibration_do_not_count():
     _, residuals_at = linear(np.random.default_rng(0), 0.1, (100, 1))
     found = estimate_offset(stub(residuals_at, refused=lambda offset_s: abs(offset_s - 0.1) > 0.15))
     assert found.seconds == pytest.approx(0.1, abs=0.01)
-    with pytest.raises(InsufficientDataError, match="gives a calibration, got none"):
+    with pytest.raises(InsufficientDataError, match=r"0.4 s"):
         estimate_offset(stub(residuals_at, refused=lambda offset_s: True))
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from crossing_scenes import crossing_sweeps, displaced
 
-from calibration.images.crossing import Level, prepare
-from calibration.images.curvature import APART_MM, curvature, settle
-from calibration.images.fit import LEVERS_MM, SETTLED, Estimate, refine
+from calibration.images.fit import APART_MM, LEVERS_MM, SETTLED, Estimate, curvature, refine, settle
+from calibration.images.similarity import Level, prepare
 
 FREE = tuple(range(6))
 
@@ -22,9 +21,13 @@ def refined():
     return refine(crossing.level(Level(0.7, images=10), truth), start, FREE, max_steps=6)
 
 
-def test_the_similarity_falls_as_its_curvature_says(refined):
-    settled = settle(refined)
-    held = dataclasses.replace(settled.refined, weight=refined.weight)
+@pytest.fixture(scope="module")
+def settled(refined):
+    return settle(refined).refined
+
+
+def test_the_similarity_falls_as_its_curvature_says(refined, settled):
+    held = dataclasses.replace(settled, weight=refined.weight)
     bend = curvature(held)
     for parameter in FREE:
         step = np.zeros(8)
@@ -49,12 +52,11 @@ def test_gauss_newtons_matrix_is_stiffer(refined):
     assert (part < 0.9).all()
 
 
-def test_what_is_settled_cannot_be_bettered(refined):
-    settled = settle(refined).refined
+def test_what_is_settled_cannot_be_bettered(refined, settled):
     assert settled.converged
     base = np.diag(LEVERS_MM[:6])
     left = np.linalg.solve(curvature(settled), settled.system[1])
     # Ten times where steps stop: the curvature here is not quite that of where the steps began.
     assert np.abs(base @ left).max() < 10.0 * SETTLED
     # What is raised is a weighted mean; the plain one may lose a little by it.
-    assert settled.likeness.mean >= refined.likeness.mean - 1e-3
+    assert settled.similarity.mean >= refined.similarity.mean - 1e-3

@@ -1,0 +1,174 @@
+"""A sensor's clock offset: the result, which frames have readings, and a search by calibrating anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from calibration.solution import Solution
+from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.streams import TimedPoses, TimedRotations
+
+SEARCH_S = 0.5
+"""How far to either side of the known delay others are tried."""
+
+_STEP_S = 0.02
+"""Coarse steps of the offset: half a frame at 25 frames/s, in which no hand reverses."""
+
+_TOLERANCE_S = 1e-4
+
+_AMBIGUOUS = 0.1
+"""Another delay counts as a rival if it is worse by less than this share of what the best delay gains."""
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """A sensor's clock offset: a reading at t belongs to image time t + `seconds`.
+
+    Attributes
+    ----------
+    standard_error_s : float
+    followed : float
+        How well images and sensor agree at this offset: the share of a line's variance that the sensor's
+        motion explains, or the mean correlation of images with reslices. NaN where neither was measured.
+    """
+
+    seconds: float
+    standard_error_s: float
+    followed: float = float("nan")
+
+
+def covered(
+    readings: TimedPoses | TimedRotations, frame_time_s: FloatArray, offset_s: float, slack_s: float = 0.0
+) -> BoolArray:
+    """Which frames have a reading, for any offset within `slack_s` of `offset_s`."""
+    asked, sampled = np.asarray(frame_time_s) - offset_s, readings.time_s
+    inside = (asked - slack_s >= sampled[0]) & (asked + slack_s <= sampled[-1])
+    gaps = np.flatnonzero(np.diff(sampled) > readings.max_gap_s)
+    first, last = asked[:, None] - slack_s, asked[:, None] + slack_s
+    in_gap = (last > sampled[gaps]) & (first < sampled[gaps + 1])
+    return np.asarray(inside & ~in_gap.any(axis=1))
+
+
+def delays_around(around_s: float, search_s: float, step_s: float) -> FloatArray:
+    """Delays from `around_s` - `search_s` to `around_s` + `search_s`, a step apart."""
+    steps = np.arange(-round(search_s / step_s), round(search_s / step_s) + 1)
+    return np.asarray(around_s + steps * step_s, dtype=np.float64)
+
+
+def estimate_offset(
+    calibrate: Callable[[float], Solution], around_s: float = 0.0, search_s: float = 0.4
+) -> ClockOffset:
+    """Find the clock offset with which a calibration explains its lines best.
+
+    Parameters
+    ----------
+    calibrate : callable
+        Calibrates with the sensor read at a given offset; may raise `InsufficientDataError`.
+    around_s, search_s : float
+        Offsets from `around_s` - `search_s` to `around_s` + `search_s` are tried.
+
+    Raises
+    ------
+    InsufficientDataError
+        If no offset gives a calibration, or the best is at the end of the range.
+    """
+    tried = delays_around(around_s, search_s, _STEP_S)
+    sigmas = np.array([_sigma(calibrate, float(offset)) for offset in tried])
+    best = int(np.argmin(sigmas))
+    if not np.isfinite(sigmas[best]):
+        raise InsufficientDataError(
+            f"expected a clock offset within {search_s:g} s that gives a calibration, got none"
+        )
+    # The curvature is measured a step further on, so the last step but one is refused too.
+    if not 1 < best < len(tried) - 2:
+        raise InsufficientDataError(
+            f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its end"
+        )
+    nearest = calibrate(float(tried[best]))
+    used, count = nearest.used, nearest.residuals[nearest.used].size
+
+    def cost(offset: float) -> float:
+        return float(np.sum(calibrate(offset).residuals[used] ** 2))
+
+    seconds, _ = minimum_between(cost, tried, best, _TOLERANCE_S)
+    return ClockOffset(seconds, curvature_error(cost, seconds, _STEP_S, count))
+
+
+def _sigma(calibrate: Callable[[float], Solution], offset: float) -> float:
+    try:
+        return calibrate(offset).sigma
+    except InsufficientDataError:
+        return float("inf")
+
+
+def minimum_between(
+    cost: Callable[[float], float], tried_s: FloatArray, best: int, tolerance_s: float
+) -> tuple[float, float]:
+    """Delay of the least cost between the neighbours of the best one tried, and that cost."""
+    bounds = tried_s[best - 1], tried_s[best + 1]
+    found = minimize_scalar(
+        lambda delay: cost(float(delay)), bounds=bounds, method="bounded", options={"xatol": tolerance_s}
+    )
+    return float(found.x), float(found.fun)
+
+
+def curvature_error(cost: Callable[[float], float], at: float, step: float, free: float) -> float:
+    """Standard error of one parameter of least squares, from the curvature of the cost at its minimum.
+
+    Parameters
+    ----------
+    cost : callable
+        Sum of squares, in any unit.
+    step : float
+        To either side, for the curvature.
+    free : float
+        Independent residuals less fitted parameters.
+
+    Returns
+    -------
+    float
+        Infinite where the cost does not rise to both sides.
+    """
+    below, middle, above = (cost(at + shift) for shift in (-step, 0.0, step))
+    curvature = (below - 2.0 * middle + above) / step**2
+    return float(np.sqrt(2.0 * middle / free / curvature)) if curvature > 0 else float("inf")
+
+
+def require_peak(
+    tried_s: FloatArray,
+    misfit: FloatArray,
+    best: int,
+    why: str = "the motion repeats itself; move irregularly",
+) -> None:
+    """Refuse a best delay that lies at the end of the range, or that has a rival.
+
+    Parameters
+    ----------
+    why : str
+        Reason of a rival, for the message.
+
+    Raises
+    ------
+    InsufficientDataError
+    """
+    if best in (0, len(tried_s) - 1):
+        raise InsufficientDataError(
+            f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's "
+            "end: the delay may lie outside the range searched: --search-s"
+        )
+    from scipy.signal import find_peaks
+
+    gain = float(np.median(misfit) - misfit[best])
+    good = find_peaks(-misfit, height=-(misfit[best] + _AMBIGUOUS * gain))[0]
+    # Not by find_peaks' prominence: the range may end before the misfit rises beyond a rival.
+    rivals = [
+        i for i in good[good != best] if misfit[min(i, best) : max(i, best)].max() - misfit[best] > 0.5 * gain
+    ]
+    if rivals:
+        pair = f"{tried_s[best]:+.3f} and {tried_s[rivals[0]]:+.3f} s"
+        raise InsufficientDataError(f"expected one delay, got {pair} nearly as good: {why}")
