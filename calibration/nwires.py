@@ -27,6 +27,7 @@ from calibration.detection.labelling import LabelledDots, LabelSettings, label_b
 from calibration.wirefit import rigid_fits
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
@@ -294,9 +295,7 @@ def _robust(rows: FloatArray, wanted: FloatArray, pixels: FloatArray) -> FloatAr
 
 def _chain(affine: FloatArray, target_from_world: RigidTransform) -> Chain:
     lengths = np.linalg.norm(affine[1:], axis=1)
-    left, _, right = np.linalg.svd((affine[1:] / lengths[:, None]).T, full_matrices=False)
-    x, y = (left @ right).T
-    turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)]))
+    turn = Rotation.from_matrix(nearest_rotation((affine[1:] / lengths[:, None]).T))
     return Chain(lengths, RigidTransform.from_components(affine[0], turn), target_from_world)
 
 
@@ -330,14 +329,9 @@ def _shared_pose(phantom_from_image: RigidTransform, world_from_sensor: RigidTra
     left, singular, _ = np.linalg.svd(kron)
     if 1.0 - singular[1] / singular[0] < _LEAST_TURN**2:
         raise InsufficientDataError("the sensor turned too little to find where the phantom is")
-    turn = _nearest_rotation(left[:, 0].reshape(3, 3))
+    matrix = left[:, 0].reshape(3, 3)
+    turn = nearest_rotation(matrix * np.sign(np.linalg.det(matrix)))
     matrix = np.concatenate([np.tile(np.eye(3), (len(seen), 1, 1)), -held], axis=2).reshape(-1, 6)
     wanted = world_from_sensor.translation - phantom_from_image.translation @ turn.T
     found = np.linalg.lstsq(matrix, wanted.ravel(), rcond=None)[0]
     return RigidTransform.from_components(found[:3], Rotation.from_matrix(turn))
-
-
-def _nearest_rotation(matrix: FloatArray) -> FloatArray:
-    left, _, right = np.linalg.svd(matrix)
-    turned = left @ right
-    return np.asarray(turned * np.sign(np.linalg.det(turned)))

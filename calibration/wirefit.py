@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.geometry import skew
+from speckle3d.core.geometry import nearest_rotation, skew
 from speckle3d.core.wires import WirePhantom
 
 _RIDGE_MM2 = 1e-3
@@ -85,7 +85,8 @@ def rigid_fits(
     seen = positions_mm - centre[:, None]
     affine, _ = linear_fits(seen, wires, phantom)
     rows, offsets = _wire_equations(wires, phantom)
-    origin, turn, log_scale = affine[:, 0], _axes(affine), np.zeros((len(seen), 2))
+    origin, turn = affine[:, 0], nearest_rotation(np.swapaxes(affine[:, 1:], 1, 2))
+    log_scale = np.zeros((len(seen), 2))
     prior = _DOT_MM / scale_tolerance
     for _ in range(_STEPS):
         residual, jacobian = _linearised(seen * np.exp(log_scale)[:, None], origin, turn, rows, offsets)
@@ -107,13 +108,6 @@ def _wire_equations(wires: IntArray, phantom: WirePhantom) -> tuple[FloatArray, 
     """Rows, shape (b, m, 2, 3), and offsets, (b, m, 2): ``rows @ position = offsets`` on the wire."""
     rows = phantom.normals[wires]
     return rows, np.einsum("bmri,bmi->bmr", rows, phantom.points_mm[wires])
-
-
-def _axes(affine: FloatArray) -> FloatArray:
-    """Rotations nearest to axes that are roughly square, shape (b, 3, 3)."""
-    left, _, right = np.linalg.svd(np.swapaxes(affine[:, 1:], 1, 2), full_matrices=False)
-    x, y = np.moveaxis(left @ right, 2, 0)
-    return np.stack([x, y, np.cross(x, y)], axis=2)
 
 
 def _linearised(

@@ -22,7 +22,7 @@ from calibration.solution import Solution
 from calibration.starts import least_absolute, rotations_all_over
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import rotation_from_axes
+from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
 Registration = Literal["held", "turned", "free"]
@@ -209,6 +209,7 @@ def _linear_start(
     found, misfit = least_absolute(matrix, wanted)
     columns, rows_axis, origin = found[:9].reshape(3, 3)
     size = np.array([np.linalg.norm(columns), np.linalg.norm(rows_axis)])
-    probe = RigidTransform.from_components(origin, rotation_from_axes(columns, rows_axis))
+    turn = nearest_rotation(np.column_stack([columns, rows_axis]) / size)
+    probe = RigidTransform.from_components(origin, Rotation.from_matrix(turn))
     shift = RigidTransform.from_translation(found[9:12]) if fitted else RigidTransform.identity()
     return Chain(size, probe, shift * known), float(np.median(np.abs(misfit)))

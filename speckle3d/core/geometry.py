@@ -73,12 +73,35 @@ def skew(vectors: FloatArray) -> FloatArray:
     return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
 
 
-def rotation_from_axes(x: FloatArray, y: FloatArray) -> Rotation:
-    """Nearest rotation to image axes x and y, shape (3,) each, of any length and not quite square."""
-    unit = np.column_stack([x / np.linalg.norm(x), y / np.linalg.norm(y)])
-    left, _, right = np.linalg.svd(unit, full_matrices=False)
-    u, v = (left @ right).T
-    return Rotation.from_matrix(np.column_stack([u, v, np.cross(u, v)]))
+def nearest_rotation(matrices: npt.ArrayLike) -> FloatArray:
+    """Rotation matrices nearest to given ones in the sum of squared differences.
+
+    Parameters
+    ----------
+    matrices : array_like, shape (..., 3, 3) or (..., 3, 2)
+        Roughly rotations; or their first two columns, the x and y axes, of which the longer counts more.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+
+    References
+    ----------
+    .. [1] K. S. Arun, T. S. Huang and S. D. Blostein, "Least-squares fitting of two 3-D point sets", IEEE
+       Trans. Pattern Anal. Mach. Intell., 1987.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> nearest_rotation(1.001 * np.eye(3)).round(6).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    left, _, right = np.linalg.svd(np.asarray(matrices, dtype=float), full_matrices=False)
+    if right.shape[-1] == 2:
+        axes = left @ right
+        return np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], axis=-1)
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return np.asarray(left @ right)
 
 
 def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:

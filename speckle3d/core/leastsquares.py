@@ -18,6 +18,9 @@ from speckle3d.core.errors import InvalidInputError
 
 Residuals = Callable[[FloatArray], FloatArray]
 
+_MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -121,6 +124,111 @@ def levenberg_marquardt(
     return _diagnose(
         found.x, found.fun, np.asarray(found.jac), labels, found.nfev, found.success, found.message
     )
+
+
+def robust_sigma(residuals: FloatArray, smallest: float = 0.0) -> float:
+    """Standard deviation of normal residuals with the same median size, at least `smallest`."""
+    return max(_MAD_TO_SIGMA * float(np.median(np.abs(residuals))), smallest)
+
+
+def huber_weights(residuals: FloatArray, limit: float = 1.345) -> FloatArray:
+    """Huber's weights: one up to `limit`, beyond it its inverse; with a small limit, least absolute values.
+
+    Parameters
+    ----------
+    residuals : ndarray
+        Over their standard deviation.
+    """
+    return np.asarray(limit / np.maximum(np.abs(residuals), limit))
+
+
+def cauchy_weights(residuals: FloatArray, limit: float = 2.385) -> FloatArray:
+    """Cauchy's weights: a half at `limit`; the pull of residuals far beyond it vanishes.
+
+    Parameters
+    ----------
+    residuals : ndarray
+        Over their standard deviation.
+    """
+    return np.asarray(1.0 / (1.0 + (residuals / limit) ** 2))
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """The answer of a linear problem some of whose equations are wrong.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (p,)
+    residuals : ndarray, shape (n,) or (n, r)
+        ``matrix @ parameters - wanted``.
+    weights : ndarray, shape (n,)
+        With which the parameters were found.
+    sigma : float
+        Robust standard deviation of the residuals, of their norm where they come in groups.
+    rank : int
+        Of the weighted matrix.
+    normal : ndarray, shape (p, p)
+        Normal matrix of the weighted equations.
+    """
+
+    parameters: FloatArray
+    residuals: FloatArray
+    weights: FloatArray
+    sigma: float
+    rank: int
+    normal: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the parameters, shape (p, p); fails where they are not determined."""
+        return np.asarray(np.linalg.inv(self.normal) * self.sigma**2)
+
+
+def robust_linear(
+    matrix: FloatArray,
+    wanted: FloatArray,
+    weights: Callable[[FloatArray], FloatArray] = huber_weights,
+    rounds: int = 5,
+    rcond: float | None = None,
+    smallest_sigma: float = 1e-9,
+) -> RobustFit:
+    """Solve linear equations by iteratively reweighted least squares.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, p) or (n, r, p)
+        Rows of a group of r get one weight, by the norm of their residuals. Known precision of an equation
+        is brought in by multiplying both of its sides.
+    wanted : ndarray, shape (n,) or (n, r)
+    weights : callable
+        Weights of residuals over their robust standard deviation: `huber_weights` or `cauchy_weights`.
+    rounds : int
+        Solutions; the first with equal weights.
+    rcond : float, optional
+        Ratio of singular values below which a direction counts as not determined; see `numpy.linalg.lstsq`.
+    smallest_sigma : float
+        Smallest standard deviation of residuals that are more than rounding.
+
+    References
+    ----------
+    .. [1] P. W. Holland and R. E. Welsch, "Robust regression using iteratively reweighted least-squares",
+       Commun. Stat. Theory Methods, 1977.
+    """
+    rows, values = matrix.reshape(-1, matrix.shape[-1]), wanted.ravel()
+    group = values.size // len(wanted)
+    weight = np.ones(len(wanted))
+    for left in range(rounds, 0, -1):
+        root = np.repeat(np.sqrt(weight), group)
+        weighted = rows * root[:, None]
+        found, _, rank, _ = np.linalg.lstsq(weighted, values * root, rcond=rcond)
+        residuals = rows @ found - values
+        size = np.abs(residuals) if group == 1 else np.linalg.norm(residuals.reshape(-1, group), axis=1)
+        sigma = robust_sigma(size, smallest_sigma)
+        if left > 1:
+            weight = weights(size / sigma)
+    shaped = residuals.reshape(wanted.shape)
+    return RobustFit(np.asarray(found), shaped, weight, sigma, int(rank), weighted.T @ weighted)
 
 
 def clustered_covariance(

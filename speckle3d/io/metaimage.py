@@ -12,11 +12,11 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import require_increasing, rotation_from_axes, transforms_from_matrices
+from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
@@ -235,9 +235,9 @@ def _squared(matrices: FloatArray) -> FloatArray:
     """Nearest rotation of every matrix that is one up to rounding; the others stay for the error to name."""
     r = matrices[:, :3, :3]
     rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
-    left, _, right = np.linalg.svd(r[rounded])
+    rounded[rounded] = np.linalg.det(r[rounded]) > 0
     squared = matrices.copy()
-    squared[rounded, :3, :3] = left @ right
+    squared[rounded, :3, :3] = nearest_rotation(r[rounded])
     return squared
 
 
@@ -249,10 +249,11 @@ def _pixel_size(header: SequenceHeader, settings: ImportSettings) -> tuple[float
 def _probe_from_image(header: SequenceHeader, settings: ImportSettings) -> RigidTransform:
     """Nearest rigid transform to PLUS's image calibration, by singular values."""
     matrix = _calibration(header, settings)
-    x, y = (matrix[:3, k] / np.linalg.norm(matrix[:3, k]) for k in (0, 1))
-    if abs(x @ y) > SKEW_TOLERANCE:
-        raise InvalidInputError(f"image_to_probe: expected square axes, got cosine {x @ y:.3f}")
-    return RigidTransform.from_components(matrix[:3, 3], rotation_from_axes(x, y))
+    axes = matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)
+    cosine = float(axes[:, 0] @ axes[:, 1])
+    if abs(cosine) > SKEW_TOLERANCE:
+        raise InvalidInputError(f"image_to_probe: expected square axes, got cosine {cosine:.3f}")
+    return RigidTransform.from_components(matrix[:3, 3], Rotation.from_matrix(nearest_rotation(axes)))
 
 
 def _calibration(header: SequenceHeader, settings: ImportSettings) -> FloatArray:

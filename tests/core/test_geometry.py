@@ -6,6 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import (
+    nearest_rotation,
     relative_poses,
     require_finite,
     require_increasing,
@@ -152,3 +153,19 @@ def test_a_yaw_of_a_right_angle_is_no_reason_to_warn():
     rotation = rotation_from_fixed_angles(0.3, np.pi / 2, -0.2)
     again = rotation_from_fixed_angles(*roll_yaw_tilt(rotation))
     assert (rotation.inv() * again).magnitude() < 1e-7
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1), columns=st.sampled_from([2, 3]))
+def test_no_rotation_is_nearer_than_the_nearest(seed, columns):
+    rng = np.random.default_rng(seed)
+    given_ = Rotation.random(4, rng=rng).as_matrix()[:, :, :columns] + 0.2 * rng.normal(size=(4, 3, columns))
+    found = nearest_rotation(given_)
+    others = (Rotation.from_rotvec(rng.normal(0, 0.1, (20, 1, 3))) * Rotation.from_matrix(found)).as_matrix()
+    far = [np.sum((one[..., :columns] - given_) ** 2, axis=(-2, -1)) for one in (found, others)]
+    np.testing.assert_allclose(np.linalg.det(found), 1.0)
+    assert (far[0] <= far[1] + 1e-12).all()
+
+
+def test_the_nearest_rotation_to_a_mirror_is_no_mirror():
+    np.testing.assert_allclose(nearest_rotation(np.diag([1.0, 1.0, -0.5])), np.eye(3), atol=1e-15)

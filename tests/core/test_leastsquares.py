@@ -1,10 +1,18 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.leastsquares import levenberg_marquardt
+from speckle3d.core.leastsquares import (
+    cauchy_weights,
+    huber_weights,
+    levenberg_marquardt,
+    robust_linear,
+    robust_sigma,
+)
 
 # NIST StRD Misra1a, y = b1 (1 - exp(-b2 x)): certified values and standard deviations,
 # https://www.itl.nist.gov/div898/strd/nls/data/misra1a.shtml
@@ -109,3 +117,51 @@ def test_residuals_that_are_not_finite_are_refused():
 def test_running_out_of_evaluations_is_not_called_converged():
     fit = levenberg_marquardt(misra1a, np.array([500.0, 1e-4]), misra1a_jacobian, max_evaluations=2)
     assert not fit.converged
+
+
+@pytest.mark.parametrize("weights", [huber_weights, cauchy_weights, partial(huber_weights, limit=0.1)])
+def test_wrong_equations_pull_little(weights):
+    rng = np.random.default_rng(1)
+    matrix, truth = rng.normal(size=(200, 3)), np.array([1.0, -2.0, 3.0])
+    wanted = matrix @ truth + rng.normal(0, 0.01, 200)
+    wanted[:20] += 50.0
+    fit = robust_linear(matrix, wanted, weights, rounds=20)
+    assert np.abs(np.linalg.lstsq(matrix, wanted)[0] - truth).max() > 0.5
+    np.testing.assert_allclose(fit.parameters, truth, atol=0.005)
+    np.testing.assert_allclose(fit.sigma, 0.01, rtol=0.3)
+
+
+def test_covariance_of_sound_equations_is_that_of_least_squares():
+    rng = np.random.default_rng(2)
+    matrix = rng.normal(size=(20_000, 2))
+    fit = robust_linear(
+        matrix, matrix @ [1.0, 2.0] + rng.normal(0, 0.1, 20_000), partial(huber_weights, limit=9.0)
+    )
+    np.testing.assert_allclose(fit.covariance, 0.01 * np.linalg.inv(matrix.T @ matrix), rtol=0.05, atol=1e-8)
+
+
+def test_a_group_of_equations_is_weighed_as_one():
+    matrix = np.tile(np.eye(2), (9, 1, 1))
+    wanted = np.tile([1.0, 2.0], (9, 1))
+    wanted[0, 0] = 1e6
+    fit = robust_linear(matrix, wanted, cauchy_weights, rounds=30)
+    np.testing.assert_allclose(fit.parameters, [1.0, 2.0], atol=1e-9)
+    assert fit.weights.shape == (9,)
+    assert fit.weights[0] < 1e-6
+
+
+def test_exact_equations_are_all_kept():
+    matrix = np.random.default_rng(3).normal(size=(30, 4))
+    fit = robust_linear(matrix, matrix @ np.arange(4.0))
+    np.testing.assert_allclose(fit.parameters, np.arange(4.0), atol=1e-12)
+    np.testing.assert_array_equal(fit.weights, 1.0)
+
+
+def test_equations_that_leave_something_open_say_so_by_their_rank():
+    matrix = np.column_stack([np.ones(9), 2.0 * np.ones(9)])
+    assert robust_linear(matrix, np.ones(9)).rank == 1
+
+
+def test_robust_sigma_is_that_of_normal_residuals():
+    assert robust_sigma(np.random.default_rng(4).normal(0, 3.0, 100_000)) == pytest.approx(3.0, rel=0.01)
+    assert robust_sigma(np.zeros(5), smallest=1e-7) == 1e-7
