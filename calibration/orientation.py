@@ -14,10 +14,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints
+from calibration.chain import ANGLES, ChainSolution, ImagePoints
 from calibration.identifiability import require_adequate
-from calibration.plane import ANGLES, OUTLIER_SIGMA, LineDirections, settled_angles, solve, some
-from calibration.solution import Solution
+from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, LineDirections, settled_angles, solve_chain
 from calibration.starts import hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -44,7 +43,7 @@ def calibrate_orientation(
     level: bool = False,
     viewed_from: Viewed = "above",
     outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
+) -> ChainSolution:
     """Find ``sensor_from_image`` of a sensor that knows its orientation only.
 
     Parameters
@@ -77,13 +76,13 @@ def calibrate_orientation(
     normals = hemisphere()
     normals = normals[:1] if level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
     lines = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
-    start = settled_angles(some(lines), size[0], normals, level=level)
-    best = require_adequate(solve(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
+    start = settled_angles(lines.of_some_frames(SOME_FRAMES), size[0], normals, level=level)
+    best = require_adequate(solve_chain(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
     _require_floor(best)
     return upright(best, viewed_from)
 
 
-def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
+def upright(solution: ChainSolution, viewed_from: Viewed = "above") -> ChainSolution:
     """Of a solution and its in-plane mirror, choose the one whose beams point down (up, if from below).
 
     Raises
@@ -91,7 +90,7 @@ def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
     InsufficientDataError
         If the beams are level on average.
     """
-    used = solution.points[solution.used].world_from_sensor.rotation
+    used = solution.points_used.world_from_sensor.rotation
     beams = (used * solution.chain.sensor_from_image.rotation).as_matrix()[:, :, 1]
     down = -float(beams[:, 2].mean())
     if abs(down) < MIRROR_LIMIT:
@@ -107,8 +106,8 @@ def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
     return replace(solution, chain=chain, residuals=-solution.residuals)
 
 
-def _require_floor(solution: Solution) -> None:
-    """Refuse a plane that is certainly not a floor; one that is not determined is for `adequacy` to name."""
+def _require_floor(solution: ChainSolution) -> None:
+    """Refuse a plane that is certainly not a floor; `judge` names what leaves one undetermined."""
     certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
     slope = float(np.arccos(min(abs(solution.chain.target_from_world.rotation.as_matrix()[2, 2]), 1.0)))
     if certain and slope > STEEPEST_PLANE:

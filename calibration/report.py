@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.solution import Solution
+from calibration.chain import ChainSolution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, readable
 from speckle3d.core.geometry import roll_yaw_tilt
@@ -131,7 +131,7 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
     }
 
 
-def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
+def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -168,7 +168,7 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
     axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
 
 
-def _draw_residuals(axes: Axes, solution: Solution) -> None:
+def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     values, unit = _shown(solution)
     used = solution.used
     axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
@@ -179,7 +179,7 @@ def _draw_residuals(axes: Axes, solution: Solution) -> None:
     _label(axes, "frame", f"residual / {unit}")
 
 
-def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
+def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
     """A thick beam shows as a V."""
     values, unit = _shown(solution)
     turns = _turns_deg(solution)
@@ -188,21 +188,21 @@ def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
     _label(axes, "tilt / deg", f"residual / {unit}")
 
 
-def _draw_motion(axes: Axes, solution: Solution) -> None:
+def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
     _label(axes, "tilt / deg", "roll / deg")
 
 
-def _shown(solution: Solution) -> tuple[FloatArray, str]:
+def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:
     """The worst residual of each point, with its sign."""
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
     return (np.rad2deg(values), "deg") if solution.phantom.seen_as == "direction" else (values, "mm")
 
 
-def _turns_deg(solution: Solution) -> FloatArray:
+def _turns_deg(solution: ChainSolution) -> FloatArray:
     """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
     turns = solution.chain.target_from_image(solution.points).rotation
     return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from calibration.solution import Solution
+from calibration.chain import ChainSolution
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -40,7 +40,7 @@ def covered(
 
 
 def estimate_offset(
-    calibrate: Callable[[float], Solution], around_s: float = 0.0, search_s: float = 0.4
+    calibrate: Callable[[float], ChainSolution], around_s: float = 0.0, search_s: float = 0.4
 ) -> Offset:
     """Find the clock offset with which a calibration explains its lines best.
 
@@ -80,7 +80,7 @@ def estimate_offset(
     return Offset(float(near.x), _standard_error(cost, float(near.x), count))
 
 
-def _sigma(calibrate: Callable[[float], Solution], offset: float) -> float:
+def _sigma(calibrate: Callable[[float], ChainSolution], offset: float) -> float:
     try:
         return calibrate(offset).sigma
     except InsufficientDataError:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.chain import Chain, ImagePoints
 from calibration.detection.dots import Dots
-from calibration.wirefit import linear_fits, rigid_fits
+from calibration.starts import free_fits, rigid_fits
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.wires import WirePhantom
@@ -214,7 +214,7 @@ def _label(
     if len(chosen) == 0:
         raise InsufficientDataError("no parallel lines of dots at the layers' distances")
     wires = np.concatenate([layer.wires for layer in layers])
-    loose = linear_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
+    loose = free_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
     chosen = chosen[np.argsort(loose)[:_REFINED]]
     fits = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
     best = float(fits.rms_mm.min())

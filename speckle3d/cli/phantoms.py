@@ -17,7 +17,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 if TYPE_CHECKING:
     from calibration.chain import ImagePoints
     from calibration.detection.lines import LineSettings
-    from calibration.job import Job, Outcome, Recording, Seen
+    from calibration.job import JobSettings, Outcome, Recording, Seen
     from speckle3d.core.arrays import FloatArray
 
 Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
@@ -259,16 +259,18 @@ def _prepared(
     sensor: str,
     time_offset: str | None,
     outlier_sigma: float,
-) -> tuple[Recording, Job]:
-    from calibration.job import Job
+) -> tuple[Recording, JobSettings]:
+    from calibration.job import JobSettings
     from speckle3d.cli.recordings import open_recording
 
     recording = open_recording(images, poses, pixel_mm, sensor)
     if time_offset is None:
-        return recording, Job(False, outlier_sigma)
+        return recording, JobSettings(outlier_sigma=outlier_sigma)
     if time_offset == "estimate":
-        return recording, Job(True, outlier_sigma)
-    return replace(recording, time_offset_s=_seconds(time_offset)), Job(False, outlier_sigma, True)
+        return recording, JobSettings(outlier_sigma=outlier_sigma, estimate_offset=True)
+    return replace(recording, time_offset_s=_seconds(time_offset)), JobSettings(
+        outlier_sigma=outlier_sigma, offset_given=True
+    )
 
 
 def _seconds(text: str) -> float:
@@ -310,7 +312,6 @@ def find_lines(
 def _seen_wires(
     recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
 ) -> Seen:
-    from calibration.detection.wires import seen_crossings, seen_nwires
     from calibration.job import Seen
     from speckle3d.io.points import read_points
 
@@ -328,9 +329,9 @@ def _seen_wires(
     corners = _region(region)
     with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
         if config is None:
-            return seen_crossings(recording, corners, progress)
+            return Seen.crossings(recording, corners, progress)
         clip = config.clip.corners_px if corners is None and config.clip is not None else corners
-        return seen_nwires(recording, config.phantom, clip, progress)
+        return Seen.nwires(recording, config.phantom, clip, progress)
 
 
 def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:

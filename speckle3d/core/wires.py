@@ -134,10 +134,17 @@ class WirePhantom:
         first /= np.linalg.norm(first, axis=1, keepdims=True)
         return np.stack([first, np.cross(self.directions, first)], axis=1)
 
-    def distances_mm(self, positions_mm: FloatArray, wire: IntArray) -> FloatArray:
-        """Distance of positions in C, shape (n, 3), from the wire that each is said to lie on, shape (n,)."""
-        apart = np.asarray(positions_mm) - self.points_mm[wire]
-        return np.asarray(np.linalg.norm(np.cross(apart, self.directions[wire]), axis=-1))
+    def equations(self, wire: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Equations of positions in C on the wires with these numbers, shape (...).
+
+        Returns
+        -------
+        rows : ndarray, shape (..., 2, 3)
+        offsets : ndarray, shape (..., 2)
+            ``rows @ position - offsets`` are the two components, mm, of a position's distance from its wire.
+        """
+        rows = self.normals[wire]
+        return rows, np.asarray(np.einsum("...ri,...i->...r", rows, self.points_mm[wire]))
 
     @classmethod
     def from_ends(

@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 from calibration.chain import ImagePoints
 from calibration.identifiability import MOTIONS, REFUSED_MM, WEAK_MM, judge, require_adequate
 from calibration.orientation import calibrate_orientation
-from calibration.plane import Plane, calibrate_plane, solve
-from calibration.wires import calibrate_crossing
+from calibration.plane import Plane, calibrate_plane, solve_chain
+from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
 FULL = {"tilt": 25.0, "roll": 15.0, "rotate": 25.0, "move": 11.0, "shift": 15.0}
@@ -57,7 +57,7 @@ def calibrate_dots(moves):
     named = {"tilt_deg": "tilt", "roll_deg": "roll", "yaw_deg": "rotate"}
     degrees = {name: moves.get(word, 0.0) for name, word in named.items()}
     pixels, readings = scan_wires(np.random.default_rng(0), np.zeros((60, 3)), noise_mm=0.3, **degrees)
-    return calibrate_crossing(ImagePoints(pixels, np.arange(60), readings))
+    return calibrate_cross_wire(ImagePoints(pixels, np.arange(60), readings))
 
 
 def advised(text):
@@ -168,7 +168,7 @@ def test_a_phantom_that_does_not_explain_the_images_is_not_blamed_on_the_motion(
     shift, turn = lines.world_from_sensor.as_components()
     lifted = shift + np.outer(8.0 * np.sum(shift[:, :2] ** 2, axis=1) / 1e4, [0.0, 0.0, 1.0])
     bulging = replace(lines, world_from_sensor=RigidTransform.from_components(lifted, turn))
-    wrong = solve(bulging, Plane(), solution.chain, outlier_sigma=np.inf)
+    wrong = solve_chain(bulging, Plane(), solution.chain, outlier_sigma=np.inf)
     with pytest.raises(InsufficientDataError, match=r"does not explain the images \(they miss it by \d"):
         require_adequate(wrong)
     assert judge(wrong).missing == ()

@@ -88,12 +88,11 @@ def test_the_largest_errors_can_be_left_out():
         NWireErrors(np.zeros(0, int), np.zeros(0, int), np.zeros(0)).trimmed()
 
 
-@pytest.mark.parametrize("by", ["middle", "all"])
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=8)
-def test_exact_dots_give_the_exact_calibration(by, seed):
+def test_exact_dots_give_the_exact_calibration(seed):
     shown = scene(seed)
-    start = start_from_nwires(points_of(shown), shown.phantom, by=by)
+    start = start_from_nwires(points_of(shown), shown.phantom)
     np.testing.assert_allclose(start.pixel_mm, PIXEL_MM, rtol=1e-7)
     np.testing.assert_allclose(pixel_matrix(start)[:, :2], shown.pixel_matrix[:, :2], atol=1e-7)
     assert apart(start, shown)[0] < 1e-5
@@ -108,21 +107,6 @@ def test_wrong_wires_hardly_move_the_start():
     spoiled = start_from_nwires(replace(points, wire=swapped), shown.phantom)
     # Two frames of forty are wrong by tens of millimetres; least squares alone would be off by 1 mm and more.
     assert apart(spoiled, shown)[0] < apart(clean, shown)[0] + 0.2
-
-
-def test_all_wires_determine_the_image_better_than_the_middle_ones():
-    shown = [scene(seed) for seed in range(6)]
-    turned = [
-        [
-            apart(start_from_nwires(points_of(s, 0.1, seed), s.phantom, by=by), s)[1]
-            for by in ("middle", "all")
-        ]
-        for seed, s in enumerate(shown)
-    ]
-    middle, every = np.median(turned, axis=0)
-    # 0.1 mm over 20 mm of image, thirty frames: about 0.1 degrees.
-    assert every < middle
-    assert every < 0.4
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
@@ -148,11 +132,11 @@ def test_a_probe_that_hardly_turned_does_not_say_where_the_phantom_is():
 def test_what_is_too_little_or_nameless_is_refused():
     shown = scene(3)
     points = points_of(shown)
-    with pytest.raises(InsufficientDataError, match="expected at least 9 dots to start from, got 6"):
+    with pytest.raises(InsufficientDataError, match="at least 9 .* got 6"):
         start_from_nwires(points[points.frame < 2], shown.phantom)
     still = points_of(scene(3, degrees=0.0))
     with pytest.raises(InsufficientDataError, match="do not determine where the image is"):
-        start_from_nwires(still[still.wire == 1], shown.phantom, by="all")
+        start_from_nwires(still[still.wire < 3], shown.phantom)
     with pytest.raises(InvalidInputError, match="points: expected the wire of each, got none"):
         middle_wires(replace(points, wire=None), shown.phantom)
     with pytest.raises(InvalidInputError, match="expected wires from 0 to 8, got others"):

@@ -5,9 +5,9 @@ import pytest
 from calibration_examples import line_directions
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints
+from calibration.chain import ANGLES, ImagePoints
 from calibration.orientation import calibrate_orientation
-from calibration.plane import ANGLES, LineDirections
+from calibration.plane import LineDirections
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 SQUARE = np.ones(2)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import CHAIN, PROBE, TARGET, Chain, ImagePoints, residuals_and_jacobian
-from calibration.plane import Plane, calibrate_plane, condition_number, solve
+from calibration.plane import Plane, calibrate_plane, condition_number, solve_chain
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 CENTRE = centre_of(TRIAL_1, PIXEL_MM)
@@ -228,7 +228,7 @@ def test_a_chain_survives_its_parameters():
 def test_parameters_that_are_held_stay():
     scan = scan_plane(np.random.default_rng(0), 60, line_noise_mm=0.1)
     start = calibrate_plane(scan.lines).chain
-    held = solve(scan.lines, Plane(), start, probe=())
+    held = solve_chain(scan.lines, Plane(), start, probe=())
     np.testing.assert_array_equal(held.chain.pixel_mm, start.pixel_mm)
     np.testing.assert_allclose(
         held.chain.sensor_from_image.as_matrix(), start.sensor_from_image.as_matrix(), atol=1e-12

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.chain import ImagePoints
 from calibration.plane import calibrate_plane
 from calibration.repeatability import repeatability, rotation_errors, validate
-from calibration.wires import calibrate_crossing
+from calibration.wires import calibrate_cross_wire
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 
@@ -164,7 +164,7 @@ def test_a_crossing_stays_where_it_was():
         pixels, readings = scan_wires(np.random.default_rng(seed), places, noise_mm=0.3)
         return ImagePoints(pixels, np.arange(60), readings)
 
-    solution = calibrate_crossing(scan(0))
+    solution = calibrate_cross_wire(scan(0))
     # 0.3 mm in two of three components; the solution's own error comes in a tenth of that.
     assert validate(solution, scan(1)).rms == pytest.approx(0.3 * np.sqrt(2 / 3), rel=0.2)
     # Somebody moved the phantom by 3 mm, along one of three components: that is an error, and is shown.

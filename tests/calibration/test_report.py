@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from calibration_examples import line_directions
 
+from calibration.job import as_calibration
 from calibration.orientation import calibrate_orientation
 from calibration.report import Shot, figure_report, text_report
-from calibration.results import as_calibration
 from speckle3d.core.calibration import FramesUsed
 
 

@@ -38,8 +38,8 @@ def test_components_along_normals_make_up_the_distance_from_any_wire(seed):
     away = np.cross(ends[:, 1] - ends[:, 0], rng.normal(size=(5, 3)))
     away *= (rng.uniform(0, 5, 5) / np.linalg.norm(away, axis=1))[:, None]
     distance = np.linalg.norm(away, axis=1)
-    np.testing.assert_allclose(phantom.distances_mm(foot + away, np.arange(5)), distance, atol=1e-9)
-    components = np.einsum("kri,ki->kr", phantom.normals, foot + away - phantom.points_mm)
+    rows, offsets = phantom.equations(np.arange(5))
+    components = np.einsum("kri,ki->kr", rows, foot + away) - offsets
     np.testing.assert_allclose(np.linalg.norm(components, axis=1), distance, atol=1e-9)
 
 

@@ -10,7 +10,7 @@ from wire_scenes import ENDS_MM, PIXEL_MM, candidates, cut, n_phantom, scene
 from calibration.chain import Chain
 from calibration.detection.dots import Dots
 from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
-from calibration.wirefit import linear_fits, rigid_fits
+from calibration.starts import free_fits, rigid_fits
 from speckle3d.core.errors import InvalidInputError, MismatchError
 
 SYMMETRIC_MM = np.array(
@@ -165,11 +165,12 @@ def test_an_image_that_cuts_wires_is_found_among_them(seed):
     positions = (cut(ENDS_MM, pose) * PIXEL_MM / scale)[None]
     wires = np.arange(9)[None]
     # The ridge on axes that are left open keeps a hundredth of a millimetre.
-    assert linear_fits(positions - positions.mean(axis=1, keepdims=True), wires, n_phantom())[1] < 0.03
+    assert free_fits(positions - positions.mean(axis=1, keepdims=True), wires, n_phantom())[1] < 0.03
     fits = rigid_fits(positions, wires, n_phantom(), scale_tolerance=0.05)
     # The prior on the pixel size, three hundredths off at most, pulls; that costs a fifth of what noise does.
     assert fits.rms_mm[0] < 0.06
     found = fits.phantom_from_image[0].apply(np.column_stack([positions[0] * fits.scale[0], np.zeros(9)]))
-    assert n_phantom().distances_mm(found, wires[0]).max() < 0.15
+    rows, offsets = n_phantom().equations(wires[0])
+    assert np.linalg.norm(np.einsum("kri,ki->kr", rows, found) - offsets, axis=1).max() < 0.15
     wrong = rigid_fits(positions, wires[:, ::-1], n_phantom(), scale_tolerance=0.05)
     assert wrong.rms_mm[0] > 0.5

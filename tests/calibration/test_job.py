@@ -7,10 +7,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import CHAIN, PROBE, ImagePoints
 from calibration.identifiability import judge
+from calibration.job import as_calibration
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
-from calibration.results import as_calibration
-from calibration.wires import calibrate_crossing
+from calibration.wires import calibrate_cross_wire
 from speckle3d.core.calibration import FramesUsed
 from speckle3d.core.errors import InsufficientDataError
 
@@ -29,7 +29,7 @@ def of_crossing(seed=0, count=80, noise_mm=0.3):
     pixels, readings = scan_wires(rng, np.tile([10.0, -20.0, 30.0], (count, 1)), noise_mm=noise_mm)
     shift, turn = readings.as_components()
     shift = shift + 0.5 * rng.standard_normal(shift.shape)
-    return calibrate_crossing(
+    return calibrate_cross_wire(
         ImagePoints(pixels, np.arange(count), RigidTransform.from_components(shift, turn))
     )
 
