@@ -186,10 +186,7 @@ def start_from_nwires(
         )
     equations = np.broadcast_to(np.eye(3), (len(middle.points), 3, 3)), middle.phantom_mm
     weights = partial(cauchy_weights, limit=_FAR)
-    chain, fit = wire_start(middle.points, equations, pose.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)
-    if fit.rank < fit.parameters.size:
-        raise InsufficientDataError("the dots do not determine where the image is: too few wires or poses")
-    return chain
+    return wire_start(middle.points, equations, pose.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
 
 
 def label_and_start(

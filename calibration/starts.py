@@ -21,6 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import Chain, ImagePoints
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import nearest_rotation, skew
 from speckle3d.core.leastsquares import RobustFit, huber_weights, robust_linear
 from speckle3d.core.wires import WirePhantom
@@ -162,7 +163,7 @@ def wire_start(
     target_from_world: RigidTransform | Rotation,
     weights: Callable[[FloatArray], FloatArray] = NEARLY_ABSOLUTE,
     rounds: int = _REWEIGHTINGS,
-    rcond: float | None = None,
+    least_singular: float | None = None,
 ) -> tuple[Chain, RobustFit]:
     """Find the image among wires from all frames of a recording, by robust linear least squares.
 
@@ -175,14 +176,22 @@ def wire_start(
         get one weight.
     target_from_world : RigidTransform or Rotation
         If a rotation, the translation is found too.
-    weights, rounds, rcond
+    weights, rounds
         See `robust_linear`.
+    least_singular : float, optional
+        Ratio of singular values below which the answer counts as not determined.
 
     Returns
     -------
     chain : Chain
     fit : RobustFit
         Residuals of shape (n, r), mm, before the axes are squared.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the points do not determine the answer, judged by `least_singular`; without it, the smallest
+        parameters that explain the points are returned.
     """
     rows, offsets = equations
     shifted = isinstance(target_from_world, Rotation)
@@ -199,7 +208,9 @@ def wire_start(
     if shifted:
         matrix = np.concatenate([matrix, rows], axis=2)
     wanted = offsets - np.einsum("nri,ni->nr", rows, known.apply(points.shifts_mm))
-    fit = robust_linear(matrix, wanted, weights, rounds, rcond)
+    fit = robust_linear(matrix, wanted, weights, rounds, least_singular)
+    if least_singular is not None and fit.rank < fit.parameters.size:
+        raise InsufficientDataError("the dots do not determine where the image is: too few wires or poses")
     axes = fit.parameters[3:9].reshape(2, 3) / spread
     size = np.linalg.norm(axes, axis=1)
     turn = Rotation.from_matrix(nearest_rotation((axes / size[:, None]).T))
