@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.detection.columns import Columns
+from calibration.detection.region import Columns
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.lines import echo_fronts, echo_levels, filter_columns, first_edges
 

@@ -14,8 +14,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibration.detection.columns import DENSELY, Columns, lay_columns, without_blank_sides, without_standing
 from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
+from calibration.detection.region import (
+    DENSELY,
+    Columns,
+    checked_pixel,
+    lay_columns,
+    without_blank_sides,
+    without_standing,
+)
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import Frames
@@ -152,7 +159,7 @@ def detect_line(
         raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
     if not np.isrealobj(image):
         raise InvalidInputError(f"image: expected real values, got {image.dtype}")
-    pixel = _checked_pixel(pixel_mm)
+    pixel = checked_pixel(pixel_mm)
     if region_px is None:
         dense = lay_columns(image.shape, DENSELY * s.columns, None)
         columns = without_blank_sides(dense, image).thinned(s.columns)
@@ -191,7 +198,7 @@ def detect_lines(
         raise InvalidInputError(
             f"frames: expected real values of shape (n, column, row), got {frames.dtype} of {frames.shape}"
         )
-    pixel = _checked_pixel(pixel_mm)
+    pixel = checked_pixel(pixel_mm)
     columns = lay_columns(frames.shape[1:], s.columns, region_px)
     if region_px is None and frames.shape[0] > 0:
         dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
@@ -214,13 +221,6 @@ def detect_lines(
         direction_sd_rad=np.array([line.direction_sd_rad for line in lines]),
         dropped=dropped,
     )
-
-
-def _checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
-    pixel = np.asarray(pixel_mm, dtype=float)
-    if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
-        raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
-    return pixel
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 
 Residuals = Callable[[FloatArray], FloatArray]
@@ -126,7 +126,7 @@ def levenberg_marquardt(
     )
 
 
-def robust_sigma(residuals: FloatArray, smallest: float = 0.0) -> float:
+def robust_sigma(residuals: FloatArray | Float32Array, smallest: float = 0.0) -> float:
     """Standard deviation of normal residuals with the same median size, at least `smallest`."""
     return max(_MAD_TO_SIGMA * float(np.median(np.abs(residuals))), smallest)
 

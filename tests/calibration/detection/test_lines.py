@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Polygon
 from pydantic import ValidationError
 
-from calibration.detection.columns import lay_columns
 from calibration.detection.lines import EchoLines, LineSettings, NoLineError, detect_line, detect_lines
+from calibration.detection.region import lay_columns
 from speckle3d.core.errors import InvalidInputError
 
 PIXEL_MM = (0.25, 0.08)
