@@ -11,6 +11,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol
@@ -259,6 +260,12 @@ def residuals_and_jacobian(
         jacobian[..., 11 + k] = np.einsum("nri,ni->nr", rows, world @ target_turns[k].T)
     where = world @ target.T + parameters[8:11]
     return np.einsum("nri,ni->nr", rows, where) - offsets, jacobian
+
+
+def free_jacobian(points: ImagePoints, phantom: Phantom, chain: Chain, free: Sequence[str]) -> FloatArray:
+    """Derivatives by the free parameters in the sensor's and the world's own frames, shape (n r, p)."""
+    _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
+    return jacobian.reshape(-1, len(CHAIN))[:, [CHAIN.index(name) for name in free]]
 
 
 def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:

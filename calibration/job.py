@@ -12,12 +12,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import (
-    CHAIN,
     SCALES,
     ChainSolution,
     ImagePoints,
     as_directions,
-    residuals_and_jacobian,
+    free_jacobian,
 )
 from calibration.clock.pairing import Offset, covered, estimate_offset
 from calibration.detection.dots import dots_in_frames, single_dots
@@ -32,7 +31,7 @@ from calibration.wires import Registration, calibrate_cross_wire, calibrate_wire
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.leastsquares import clustered_covariance, correlated_lags
+from speckle3d.core.leastsquares import clustered_covariance
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
 from speckle3d.core.wires import WirePhantom
@@ -383,16 +382,13 @@ def as_calibration(
 
 def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
     """The parameters estimated, in the sensor's and the world's own frames."""
-    values = solution.chain.parameters()
-    used = solution.points_used
-    residuals, jacobian = residuals_and_jacobian(values, used, solution.phantom)
-    columns = solution.free_columns
-    matrix = jacobian.reshape(-1, len(CHAIN))[:, columns]
-    lags = correlated_lags(residuals.ravel(), used.frame)
-    errors = np.sqrt(np.diag(clustered_covariance(matrix, residuals.ravel(), used.frame, lags)))
+    values, used = solution.chain.parameters(), solution.points_used
+    matrix = free_jacobian(used, solution.phantom, solution.chain, solution.free)
+    covariance = clustered_covariance(matrix, solution.residuals[solution.used].ravel(), used.frame)
+    errors = np.sqrt(np.diag(covariance))
     return tuple(
         Parameter(name, float(values[column]), float(error), _unit(name))
-        for name, column, error in zip(solution.free, columns, errors, strict=True)
+        for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)
     )
 
 

@@ -9,7 +9,6 @@ References
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
@@ -28,6 +27,7 @@ from calibration.chain import (
     Phantom,
     Seen,
     as_directions,
+    free_jacobian,
     residuals_and_jacobian,
 )
 from calibration.identifiability import judge, require_adequate
@@ -44,7 +44,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (
     Fit,
     clustered_covariance,
-    correlated_lags,
+    condition_number,
     huber_weights,
     levenberg_marquardt,
     robust_sigma,
@@ -63,8 +63,8 @@ OUTLIER_SIGMA = 4.0
 """Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals of
 one size one in 16,000; of dots, which are known less well out of the image than in it, one in a hundred."""
 
-_NEARLY_ABSOLUTE = 0.07
-"""Limit of Huber's weights, in standard deviations: nearly all residuals count by their absolute values."""
+_NEARLY_ABSOLUTE = 0.06745
+"""Limit of Huber's weights, a tenth of the median: nearly all residuals count by their absolute values."""
 _REWEIGHTINGS = 8
 _SAME = 0.02
 """Two starts that settle at residuals as close as this share have found the same; no more are tried."""
@@ -167,17 +167,13 @@ def solve_chain(
         phantom,
         free,
         fit,
-        _covariance(jacobian, fit.residuals, points.frame[used]),
+        clustered_covariance(jacobian, fit.residuals, points.frame[used]),
         points,
         used,
         residuals,
         sigma,
-        condition_number(points[used], phantom, chain, free),
+        condition_number(free_jacobian(points[used], phantom, chain, free)),
     )
-
-
-def _covariance(jacobian: FloatArray, residuals: FloatArray, frame: IntArray) -> FloatArray:
-    return clustered_covariance(jacobian, residuals, frame, correlated_lags(residuals, frame))
 
 
 def _sigma(residuals: FloatArray) -> float:
@@ -199,16 +195,6 @@ def probe_parameters(
     if pixel_mm is None:
         raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
     return POSE, np.asarray(pixel_mm, dtype=float)
-
-
-def condition_number(points: ImagePoints, phantom: Phantom, chain: Chain, free: Iterable[str]) -> float:
-    """Ratio of the Jacobian's extreme singular values, columns of unit norm (TR 303, section 4.2)."""
-    columns = [CHAIN.index(name) for name in free]
-    _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
-    matrix = jacobian.reshape(-1, len(CHAIN))[:, columns]
-    norms = np.linalg.norm(matrix, axis=0)
-    singular = np.linalg.svd(matrix / np.where(norms > 0, norms, 1.0), compute_uv=False)
-    return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
 
 
 def _first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
