@@ -46,7 +46,7 @@ IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
 _FEWEST_COVERED = 0.3
-"""Share of the frames with something in them that must have a reading; below it, the recordings do not belong
+"""Least share of the frames with a detection that must have a reading; below it, the recordings do not belong
 together."""
 
 

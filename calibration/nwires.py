@@ -1,8 +1,8 @@
-"""N-wire phantoms: what three dots in a line say about where the image is, and a start for the calibration.
+"""N-wire phantoms: points of the image in the phantom from three dots each, and a start for the calibration.
 
 The outer wires of an N are parallel, so that the middle dot divides the distance between the outer two as the
-place where the image cuts the middle wire divides the distance between its crossings with the outer wires:
-one image gives a point in the phantom for each N, whatever the scale of its pixels.
+place where the image cuts the middle wire divides the distance between its crossings with the outer wires.
+Each N thus gives one point in the phantom, whatever the scale of the pixels.
 
 References
 ----------
@@ -30,12 +30,13 @@ from speckle3d.core.leastsquares import cauchy_weights
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
+"""Share of the errors of which PLUS reports mean and standard deviation, the least ones."""
 _REWEIGHTINGS = 10
 _FEWEST_POINTS = 9
 """Three equations each, for nine unknowns, and twice as many again to tell a wrong one."""
 _LEAST_SINGULAR = 1e-4
-"""Least ratio of singular values at which the linear problem has one answer: noise of a hundredth of a
-millimetre would move others by the image's own size."""
+"""Least ratio of singular values at which the linear problem is determined: at a smaller one, noise of 0.01
+mm moves the answer by the image's own size."""
 _FAR = 2.698
 """Distance, in robust standard deviations (four medians), at which a point has half its weight."""
 _LEAST_TURN = 0.02

@@ -26,13 +26,13 @@ Viewed = Literal["above", "below"]
 FEWEST_LINES = 6
 
 MIRROR_LIMIT = 0.2
-"""Mean vertical part of the beam direction below which gravity cannot tell the image from its mirror: with
-the beam within 12 degrees of level on average, hand and floor may be tilted as much."""
+"""Mean vertical component of the beam direction below which gravity cannot tell the image from its mirror:
+below 12 degrees from level, on average, the hand and the floor may be tilted as much."""
 
 _CERTAIN_RAD = np.deg2rad(5.0)
 
 STEEPEST_PLANE = np.deg2rad(45.0)
-"""A plane steeper than this is not a floor: the sensor's world has no z axis up, or the lines are not its."""
+"""A plane steeper than this is not a floor: the world's z axis is not up, or the lines are others."""
 
 
 def calibrate_orientation(
@@ -52,8 +52,7 @@ def calibrate_orientation(
         Columns and rows from one point of the plane's line to another.
     frame : ndarray of int, shape (m,)
     world_from_sensor : Rotation, length m
-        With the world's z axis up. Its heading may be wrong where the plane is level: only the vertical
-        counts then.
+        With the world's z axis up. If the plane is level, the heading may be wrong.
     pixel_mm : ndarray, shape (2,)
         Column pitch and row spacing; only their ratio matters.
     level : bool

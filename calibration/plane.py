@@ -1,4 +1,4 @@
-"""The plane module: the solver that all calibrations with a phantom share, and the one with a plane.
+"""Calibration with a plane, and the solver that all calibrations with a phantom share.
 
 References
 ----------
@@ -54,10 +54,10 @@ _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
 
 SOME_FRAMES = 100
-"""Frames that choose among starting points, all of them refining the answer afterwards."""
+"""Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
 
 _PIXEL_MM = 0.15
-"""Of an image some hundred pixels high of tissue some centimetres deep, where nobody says."""
+"""Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
 OUTLIER_SIGMA = 4.0
 """Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals of
@@ -71,7 +71,7 @@ _SAME = 0.02
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
 _FREE_ROUNDS = 5
-"""After these, frames may be dropped but not taken back, so that the rounds end."""
+"""After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
 

@@ -17,9 +17,10 @@ from calibration.chain import ChainSolution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, readable
 from speckle3d.core.geometry import roll_yaw_tilt
+from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
-"""Of Okabe and Ito's palette, told apart with any colour vision."""
+"""Colours of Okabe and Ito's palette, distinguishable with any colour vision."""
 
 _LONGEST_REASONS = 6
 _MOST_NAMED = 20
@@ -74,10 +75,7 @@ def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
     """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
-    rows = rows_of(calibration)
-    width = max(len(description) for description, _, _ in rows)
-    lines = [f"{description.ljust(width)}  {value} {unit}".rstrip() for description, value, unit in rows]
-    lines += _left_out(calibration)
+    lines = text_rows(rows_of(calibration)).splitlines() + _left_out(calibration)
     if calibration.translation_mm is not None and calibration.pixel_mm is not None:
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
@@ -96,7 +94,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
 
 
 def _left_out(calibration: Calibration) -> list[str]:
-    """The frames that do not count, by number, with the whole reason."""
+    """The numbers of the frames left out, with the reason of each."""
     dropped = sorted(calibration.frames.dropped.items())
     if not dropped:
         return []
@@ -136,7 +134,7 @@ def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequ
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
-    # Of an orientation sensor's pixels the ratio is known, which is what counts here.
+    # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
         _draw_shot(axes, shot, aspect)
@@ -180,7 +178,7 @@ def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
 
 
 def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
-    """A thick beam shows as a V."""
+    """Residuals against tilt, where a thick beam shows as a V."""
     values, unit = _shown(solution)
     turns = _turns_deg(solution)
     used = solution.used
@@ -196,10 +194,10 @@ def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
 
 
 def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:
-    """The worst residual of each point, with its sign."""
+    """The largest residual of each point, with its sign, and its unit."""
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
-    return (np.rad2deg(values), "deg") if solution.phantom.seen_as == "direction" else (values, "mm")
+    return (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
 
 
 def _turns_deg(solution: ChainSolution) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes; solved by the plane module.
+"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes. The plane module solves for them.
 
 References
 ----------
@@ -51,7 +51,7 @@ class Wires:
     ----------
     geometry : WirePhantom
     determined : tuple of str
-        What of the phantom's place in the tracker's world is estimated; the rest is held.
+        Parameters of the phantom's place in the tracker's world that are estimated; the others are held.
     """
 
     geometry: WirePhantom
@@ -107,10 +107,10 @@ def calibrate_wires(
     points : ImagePoints
         With the wire each lies on.
     geometry : WirePhantom
-        Where it does not say where it is in the tracker's world, that is estimated, too: fourteen parameters
-        in all, as for the three-wire phantom.
+        Without its place in the tracker's world, that is estimated, too: fourteen parameters in all, as for
+        the three-wire phantom.
     registration : {"held", "turned", "free"}
-        What to do with a place that `geometry` says: hold it; hold the wires' middle and estimate how the
+        What to do with the place stated in `geometry`: hold it; hold the wires' middle and estimate how the
         phantom is turned about it; or estimate all. Stylus registrations find a place to half a millimetre,
         and, over 50 mm, a turn only to a degree.
 
@@ -136,7 +136,7 @@ def calibrate_wires(
 
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
-    """The same wires in a frame whose origin is the middle of them, about which the phantom may be turned."""
+    """The same wires in a frame whose origin is their middle, about which the phantom may be turned."""
     ends = geometry.points_mm if geometry.ends_mm is None else geometry.ends_mm.reshape(-1, 3)
     middle = ends.mean(axis=0)
     place = geometry.world_from_phantom
@@ -146,7 +146,7 @@ def _about_middle(geometry: WirePhantom) -> WirePhantom:
 
 
 def _anywhere(few: ImagePoints, phantom: Wires, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
-    """Best start with the phantom turned every way there is."""
+    """Best start, from orientations of the phantom all over."""
     probe, held = probe_parameters(fit_pixels, pixel_mm)
     equations = phantom.vanishing(few)
     tried = [wire_start(few, equations, turn) for turn in rotations_all_over()]

@@ -1,7 +1,7 @@
-"""The echo of a plane in an image: a straight line, found without help.
+"""Automatic detection of the straight line that a plane's echo makes in an image.
 
-Columns are looked down for the first strong edge from dark to light, and the line is the one most of these
-edges agree with. A frame in which too few agree has no line, and says why.
+Each column is searched downwards for the first strong edge from dark to light; the line is the one that most
+of these edges agree with. A frame in which too few agree is dropped, with the reason.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import consensus_line
 
 _PARTS = (0.95, 0.85, 0.75, 0.65, 0.5)
-"""Brightness of an echo that counts when no threshold is given, as parts of the brightest one in the middle
-one of all columns: each is tried."""
+"""Least brightness of an echo when no threshold is given, as shares of the median of the columns' brightest
+echoes: each is tried."""
 _WEAKER = 0.75
-"""How bright a line must be to go before a brighter one beneath it: brighter than haze and side lobes. The
-floor's reverberations lie beneath it and are no brighter."""
+"""Least brightness, as a share of the brightest line's, of a line that is preferred for lying above it: haze
+and side lobes are fainter. The floor's reverberations lie beneath it and are no brighter."""
 _LEAST_SHARE = 0.25
-"""Part of the sampled columns that must agree however few the line could meet: two or three edges, which are
-noise, always agree with a line that cuts a corner of the region."""
+"""Share of all sampled columns that must agree, however few the line could meet: with a line that cuts a
+corner of the region, two or three noisy edges always agree."""
 _FINEST_ROWS = 0.1
-"""Scatter below which an edge is not placed: interpolation between rows is not better."""
+"""Least scatter of an edge's place: the precision of interpolation between rows."""
 
 
 class LineSettings(BaseModel):
@@ -58,18 +58,21 @@ class LineSettings(BaseModel):
     threshold: float | None = Field(
         None,
         gt=0,
-        description="Slope that makes an edge, grey levels per mm; by default echoes are judged by their "
-        "brightness instead, by several measures, and the first bright line is taken.",
+        description="Least slope of an edge, grey levels per mm; by default echoes are judged by their "
+        "brightness instead, against several thresholds, and the first bright line is taken.",
     )
     tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
     consensus: float = Field(
-        0.7, gt=0, le=1, description="Part that must agree of the columns whose region the line meets."
+        0.7,
+        gt=0,
+        le=1,
+        description="Share that must agree of the columns in which the line is inside the region.",
     )
     place: Place = Field(
         "peak",
         description="Where on an echo the line is put: where it has risen half way (front), where the "
         "smoothed image is steepest (slope; up to smoothing_mm above a thin echo), or where it is brightest "
-        "(peak; a beam met by a wall at an angle has its middle there, its nearer edge at the front).",
+        "(peak; of a thick beam that meets a wall at an angle, the middle; the front is its nearer edge).",
     )
 
 
@@ -87,11 +90,11 @@ class EchoLine:
         Column and row, fractional, of two points on the line: at the mean of the agreeing columns minus and
         plus their root mean square spread, where the errors of a fitted line are uncorrelated and equal.
     point_sd_mm : float
-        Standard error of each point's depth, neighbouring columns' likeness accounted for.
+        Standard error of each point's depth; residuals of neighbouring columns may be correlated.
     direction_sd_rad : float
         Standard error of the line's direction in the image plane.
     consensus, possible : int
-        Columns that agree, and sampled columns whose region the line meets.
+        Columns that agree, and sampled columns in which the line is inside the region.
     inlier_px : ndarray, shape (k, 2)
         Column and row of the edges that agree.
     """
@@ -265,7 +268,7 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
 
 
 def _distinct(echoes: list[Edges]) -> list[Edges]:
-    """Without those like the ones before them, as neighbouring thresholds mostly give."""
+    """Leave out edges equal to those before them: neighbouring thresholds mostly find the same."""
     kept = echoes[:1]
     for edges in echoes[1:]:
         if not np.array_equal(edges.row, kept[-1].row, equal_nan=True):
@@ -279,7 +282,7 @@ def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
 
 
 def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -> _Candidate:
-    """The uppermost of the lines nearly as strong as the strongest, as the most columns see it."""
+    """The uppermost of the lines nearly as strong as the strongest, as most columns see it."""
     least = _WEAKER * max(line.strength for line in lines)
     middle = float(columns.column.mean())
     depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
@@ -302,8 +305,8 @@ def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:
 
 
 def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoLine:
-    # Errors of a fit's level at the mean column and of its slope are uncorrelated. One spread to either side
-    # both count the same, so that their sum and their difference are uncorrelated, too.
+    # Errors of a fit's level at the mean column and of its slope are uncorrelated. At one standard deviation
+    # of the columns to either side both contribute equally, so that the two points' errors are uncorrelated.
     x, y = columns.column[line.agree].astype(float), line.edges.row[line.agree]
     spread = float(x.std())
     ends = x.mean() + spread * np.array([-1.0, 1.0])
@@ -321,18 +324,18 @@ def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoL
 
 
 def _level_sd(residual: FloatArray) -> float:
-    """Standard error of the mean of residuals (NaN where missing) that may resemble their neighbours."""
+    """Standard error of the mean of residuals (NaN where missing) that may be correlated with neighbours."""
     there = np.isfinite(residual)
     count = float(there.sum())
     r = np.where(there, residual, 0.0)
     energy = float(np.maximum(r @ r, count * _FINEST_ROWS**2))
-    likeness = 1.0
+    correlated = 1.0
     for lag in range(1, int(count) // 4):
         pairs = max(1, int(np.count_nonzero(there[lag:] & there[:-lag])))
         rho = float(r[lag:] @ r[:-lag]) * count / (energy * pairs)
         if rho <= 0:
             break
-        likeness += 2.0 * rho * (1 - lag / count)
-    likeness = float(np.minimum(likeness, count / 4))
-    # The line itself took two of as many free residuals as there are independent ones.
-    return float(np.sqrt(energy / (count - 2.0 * likeness) * likeness / count))
+        correlated += 2.0 * rho * (1 - lag / count)
+    correlated = float(np.minimum(correlated, count / 4))
+    # The line's two parameters are taken from the number of independent residuals.
+    return float(np.sqrt(energy / (count - 2.0 * correlated) * correlated / count))
