@@ -40,6 +40,7 @@ def of_orientation(seed=0):
 
 
 @pytest.mark.parametrize(("solve", "trials"), [(of_plane, 30), (of_crossing, 80)])
+@pytest.mark.slow
 def test_standard_errors_of_the_published_parameters_are_those_of_repetition(solve, trials):
     found = [as_calibration(solve(seed), "plane", ALL) for seed in range(trials)]
     names = [one.name for one in found[0].parameters if one.name in PROBE]

@@ -84,7 +84,7 @@ def test_the_largest_errors_can_be_left_out():
     errors = NWireErrors(np.arange(20), np.ones(20, dtype=int), np.append(np.full(19, 0.5), 80.0))
     assert errors.trimmed() == (0.5, 0.0)
     assert errors.trimmed(1.0)[0] == pytest.approx((19 * 0.5 + 80) / 20)
-    with pytest.raises(InsufficientDataError, match="expected an N with all three dots, got none"):
+    with pytest.raises(InsufficientDataError, match="three dots"):
         NWireErrors(np.zeros(0, int), np.zeros(0, int), np.zeros(0)).trimmed()
 
 
@@ -123,25 +123,25 @@ def test_a_phantom_nobody_registered_is_found_by_turning_the_probe(seed):
 def test_a_probe_that_hardly_turned_does_not_say_where_the_phantom_is():
     shown = scene(3, degrees=2.0)
     unknown = replace(shown.phantom, world_from_phantom=None)
-    with pytest.raises(InsufficientDataError, match="the sensor turned too little"):
+    with pytest.raises(InsufficientDataError, match="turned"):
         start_from_nwires(points_of(shown), unknown, PIXEL_MM)
-    with pytest.raises(InvalidInputError, match="pixel_mm: expected a rough pixel size"):
+    with pytest.raises(InvalidInputError, match="pixel_mm"):
         start_from_nwires(points_of(shown), unknown)
 
 
 def test_what_is_too_little_or_nameless_is_refused():
     shown = scene(3)
     points = points_of(shown)
-    with pytest.raises(InsufficientDataError, match=r"at least 9 .* got 6"):
+    with pytest.raises(InsufficientDataError, match=r"9 .* 6"):
         start_from_nwires(points[points.frame < 2], shown.phantom)
     # All dots in one line of the image say nothing about the axis across it.
-    with pytest.raises(InsufficientDataError, match="do not determine"):
+    with pytest.raises(InsufficientDataError, match="determine"):
         start_from_nwires(replace(points, pixels=points.pixels * [1.0, 0.0]), shown.phantom)
-    with pytest.raises(InvalidInputError, match="points: expected the wire of each, got none"):
+    with pytest.raises(InvalidInputError, match="wire of each"):
         middle_wires(replace(points, wire=None), shown.phantom)
-    with pytest.raises(InvalidInputError, match="expected wires from 0 to 8, got others"):
+    with pytest.raises(InvalidInputError, match="0 to 8"):
         middle_wires(replace(points, wire=points.wire + 1), shown.phantom)
-    with pytest.raises(InvalidInputError, match="expected where the phantom is in the world, got none"):
+    with pytest.raises(InvalidInputError, match="phantom"):
         nwire_errors_mm(points, n_phantom(), shown.pixel_matrix)
 
 
@@ -159,7 +159,7 @@ def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():
 def test_a_sequence_without_wires_says_why():
     shown = scene(9, frames=3)
     few = Dots(np.array([0, 0, 2]), np.ones((3, 2)), np.ones(3), {1: "no dot"})
-    with pytest.raises(InsufficientDataError, match="expected frames that show all wires, got none: no "):
+    with pytest.raises(InsufficientDataError, match="all wires"):
         label_and_start(few, shown.phantom, shown.world_from_sensor, PIXEL_MM)
 
 

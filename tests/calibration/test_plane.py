@@ -1,5 +1,7 @@
 """Calibration with a plane, on the published simulation and on recordings that go wrong."""
 
+import re
+
 import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, about, centre_of, scan_plane
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import CHAIN, PROBE, TARGET, Chain, ImagePoints, free_jacobian, residuals_and_jacobian
+from calibration.identifiability import MOTIONS
 from calibration.plane import Plane, calibrate_plane, solve_chain
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import condition_number
@@ -148,13 +151,13 @@ def test_frames_paired_with_the_readings_of_others_are_refused():
 @pytest.mark.parametrize(
     ("missing", "named"),
     [
-        ({"tilt_deg": 0.0}, "tilt the probe to and fro"),
-        ({"roll_deg": 0.0}, "roll the probe from side to side"),
+        ({"tilt_deg": 0.0}, 0),
+        ({"roll_deg": 0.0}, 2),
     ],
 )
 def test_the_missing_motion_is_named_and_nothing_returned(missing, named):
     scan = scan_plane(np.random.default_rng(0), 200, line_noise_mm=0.1, **missing)
-    with pytest.raises(InsufficientDataError, match=named):
+    with pytest.raises(InsufficientDataError, match=re.escape(MOTIONS[named].advice)):
         calibrate_plane(scan.lines)
 
 
@@ -171,10 +174,11 @@ def test_a_probe_held_still_is_refused():
     still = ImagePoints.of_lines(
         np.arange(50), np.tile(one.pixels, (50, 1, 1)), one.world_from_sensor[np.zeros(50, dtype=int)]
     )
-    with pytest.raises(InsufficientDataError, match="does not determine"):
+    with pytest.raises(InsufficientDataError, match="determine"):
         calibrate_plane(still)
 
 
+@pytest.mark.slow
 def test_claimed_standard_errors_are_those_of_repetition():
     names = ("gamma", "beta", "alpha", "x", "y", "z")
     scores = []

@@ -101,12 +101,13 @@ def test_places_are_told_only_where_they_are_known():
 
 
 def test_one_alone_and_different_sensors_are_refused():
-    with pytest.raises(InsufficientDataError, match="at least two"):
+    with pytest.raises(InsufficientDataError, match="two"):
         repeatability([calibration()])
-    with pytest.raises(MismatchError, match="orientation and tracker"):
+    with pytest.raises(MismatchError, match=r"orientation.*tracker"):
         repeatability([calibration(), calibration(sensor="orientation")])
 
 
+@pytest.mark.slow
 def test_repeated_calibrations_scatter_as_much_as_is_claimed():
     solutions = [
         calibrate_plane(scan_plane(np.random.default_rng([seed, 3]), 150, line_noise_mm=0.2).lines)

@@ -103,12 +103,12 @@ def test_column_scaling_makes_the_condition_number_free_of_units():
 
 
 def test_too_few_residuals_are_counted_in_the_error():
-    with pytest.raises(InvalidInputError, match="at least 3 residuals, got 2"):
+    with pytest.raises(InvalidInputError, match=r"3 residuals.*2"):
         levenberg_marquardt(lambda b: b[:2], np.zeros(3))
 
 
 def test_residuals_that_are_not_finite_are_refused():
-    with pytest.raises(InvalidInputError, match="finite residuals at the starting point"):
+    with pytest.raises(InvalidInputError, match="finite"):
         levenberg_marquardt(lambda b: np.full(4, np.nan) * b[0], np.ones(1))
 
 
