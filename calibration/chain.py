@@ -25,7 +25,7 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import Fit
 
-Seen = Literal["line", "direction", "dot"]
+SeenAs = Literal["line", "direction", "dot"]
 
 SCALES = ("s_x", "s_y")
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
@@ -115,7 +115,7 @@ class Phantom(Protocol):
     """What must vanish in the phantom's frame."""
 
     @property
-    def seen_as(self) -> Seen:
+    def seen_as(self) -> SeenAs:
         """What the points are: the two ends of a line, the direction of one, or a dot."""
 
     @property

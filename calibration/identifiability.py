@@ -21,15 +21,15 @@ MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
 
 REFUSED_MM, REFUSED_RAD = 5.0, np.deg2rad(2.0)
-"""Standard error of the image's corners, or of an orientation sensor's rotation, at which nothing is
-returned: what a ruler and a protractor on the probe achieve."""
+"""Standard error of the image's corners, or of an orientation sensor's rotation, above which a solution is
+refused: what a ruler and a protractor on the probe achieve."""
 
 WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
-"""Standard error from which on the verdict says so; 1 degree is the published precision (Housden 2008)."""
+"""Standard error of a weakly determined solution; 1 degree is the published precision (Housden 2008)."""
 
 MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
-"""Root mean square residual that no phantom leaves: the worst published is 3.5 mm as a distance, with early
-magnetic trackers (TR 303, section 5), 2 mm in each component."""
+"""Root mean square residual above which the phantom does not explain the images: the worst published is
+3.5 mm as a distance, with early magnetic trackers (TR 303, section 5), 2 mm in each component."""
 
 SMALLEST_IMAGE_MM = 1.0
 """Smallest plausible image. Where the probe was only turned about a point of the image, pixels shrink to
@@ -41,7 +41,7 @@ _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
 
 _UNKNOWN = {"s_x": 0.3, "s_y": 0.3}
-"""How far a parameter may be from anything plausible: a share of itself for pixel sizes."""
+"""Standard deviation of a parameter before anything is measured; of pixel sizes, as a share of them."""
 _UNKNOWN_RAD, _UNKNOWN_MM = 1.0, 300.0
 
 
@@ -152,7 +152,7 @@ def _size(error: float, angular: bool) -> str:
 
 
 def _more(only_phantom_unknown: bool) -> str:
-    """What helps where no motion does."""
+    """Advice where no motion would help."""
     if only_phantom_unknown:
         return "what stays unknown is where the phantom is: show more of it, all its wires"
     return "record more frames over a wider range"
@@ -236,7 +236,7 @@ def _shifted(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> Im
 
 
 def _turned(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
-    """The image turned about the dot in it, or the middle of the line, where the plane then cuts it anew."""
+    """The image turned about its dot, or about the middle of its line, which then runs elsewhere."""
     turn = Rotation.from_rotvec(_TURN_RAD * axis)
     seen, size = solution.phantom.seen_as, solution.chain.pixel_mm
     if seen == "dot":

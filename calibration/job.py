@@ -12,26 +12,22 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import (
-    SCALES,
     ChainSolution,
     ImagePoints,
     as_directions,
-    free_jacobian,
 )
 from calibration.clock.pairing import Offset, covered, estimate_offset
 from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
 from calibration.detection.lines import LineSettings, detect_lines
-from calibration.identifiability import judge
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
 from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
-from calibration.report import Shot
+from calibration.report import Shot, as_calibration
 from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
+from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.leastsquares import clustered_covariance
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
 from speckle3d.core.wires import WirePhantom
@@ -41,9 +37,6 @@ Progress = Callable[[int, int], None]
 SEARCH_S = 0.4
 """Clock offsets tried to either side of the recording's own: usual latencies of trackers and frame grabbers
 are below 0.2 s."""
-
-IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
-"""Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
 _FEWEST_COVERED = 0.3
 """Least share of the frames with a detection that must have a reading; below it, the recordings do not belong
@@ -148,7 +141,7 @@ class Seen:
         region_px: npt.ArrayLike | None = None,
         progress: Progress | None = None,
     ) -> Seen:
-        """Find in every image the one bright dot that a crossing of wires, or a bead, makes."""
+        """Find in every image the bright dot that a crossing of wires, or a bead, makes."""
         dots = single_dots(dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress))
         return cls(dots.frame, dots.pixels, None, dots.dropped)
 
@@ -343,66 +336,8 @@ def _shot(recording: Recording, seen: Seen, number: int, note: str) -> Shot:
 
 
 def _require_poses(recording: Recording) -> None:
-    """Raise `InvalidInputError` unless the sensor tells positions."""
+    """Raise `InvalidInputError` unless the readings hold positions."""
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(
             "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
         )
-
-
-def as_calibration(
-    solution: ChainSolution, method: str, frames: FramesUsed, time_offset_s: float | None = None
-) -> Calibration:
-    """Bring a solution into the form that is saved, with standard errors of the published parameters.
-
-    Parameters
-    ----------
-    frames : FramesUsed
-        With the frames in which nothing was found or that no sensor reading covers. Those that the solver
-        left out are added.
-    """
-    angular = solution.angular
-    chain, pose = solution.chain, IMAGE_POSE[:3] if angular else IMAGE_POSE
-    return Calibration(
-        method=method,
-        sensor="orientation" if angular else "tracker",
-        rotation=chain.sensor_from_image.rotation,
-        translation_mm=None if angular else np.asarray(chain.sensor_from_image.translation),
-        pixel_mm=None if angular else chain.pixel_mm,
-        covariance=solution.image_covariance(pose),
-        parameters=_parameters(solution),
-        rms=solution.rms,
-        rms_unit="rad" if angular else "mm",
-        condition_number=solution.condition_number,
-        frames=_frames_used(solution, frames),
-        time_offset_s=time_offset_s,
-        verdict=judge(solution).verdict,
-    )
-
-
-def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
-    """The parameters estimated, in the sensor's and the world's own frames."""
-    values, used = solution.chain.parameters(), solution.points_used
-    matrix = free_jacobian(used, solution.phantom, solution.chain, solution.free)
-    covariance = clustered_covariance(matrix, solution.residuals[solution.used].ravel(), used.frame)
-    errors = np.sqrt(np.diag(covariance))
-    return tuple(
-        Parameter(name, float(values[column]), float(error), _unit(name))
-        for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)
-    )
-
-
-def _unit(name: str) -> str:
-    if name in SCALES:
-        return "mm/pixel"
-    return "mm" if name[0] in "xyz" else "rad"
-
-
-def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
-    """Add the frames that contradict the others, with their residuals."""
-    dropped = dict(frames.dropped)
-    for number in np.unique(solution.points.frame[~solution.used]):
-        worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
-        size = f"{np.rad2deg(worst):.1f} degrees" if solution.angular else f"{worst:.1f} mm"
-        dropped[int(number)] = f"contradicts the other frames by {size}"
-    return FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), dropped)

@@ -44,7 +44,7 @@ def calibrate_orientation(
     viewed_from: Viewed = "above",
     outlier_sigma: float = OUTLIER_SIGMA,
 ) -> ChainSolution:
-    """Find ``sensor_from_image`` of a sensor that knows its orientation only.
+    """Calibrate an orientation sensor: find the rotation ``sensor_from_image`` from lines of a plane.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ from calibration.chain import (
     ChainSolution,
     ImagePoints,
     Phantom,
-    Seen,
+    SeenAs,
     as_directions,
     free_jacobian,
     residuals_and_jacobian,
@@ -83,7 +83,7 @@ class Plane:
     """A plane at z = 0 of its own frame: one equation for each point (TR 303, equation 8)."""
 
     determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
-    seen_as: Seen = "line"
+    seen_as: SeenAs = "line"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Height above the plane."""
@@ -107,7 +107,7 @@ class LineDirections:
 
     pixel_mm: FloatArray
     level: bool = False
-    seen_as: Seen = "direction"
+    seen_as: SeenAs = "direction"
 
     @property
     def determined(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A calibration's report: a table for people, the same for programs, and one page of pictures."""
+"""A calibration as it is saved, and its report: a table for people, one for programs, a page of pictures."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.chain import ChainSolution
+from calibration.chain import SCALES, ChainSolution, free_jacobian
+from calibration.identifiability import judge
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.calibration import Calibration, readable
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
 from speckle3d.core.geometry import roll_yaw_tilt
+from speckle3d.core.leastsquares import clustered_covariance
 from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
 """Colours of Okabe and Ito's palette, distinguishable with any colour vision."""
+
+IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
+"""Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
 _LONGEST_REASONS = 6
 _MOST_NAMED = 20
@@ -44,6 +49,64 @@ class Shot:
     marks_px: FloatArray
     as_line: bool
     note: str = ""
+
+
+def as_calibration(
+    solution: ChainSolution, method: str, frames: FramesUsed, time_offset_s: float | None = None
+) -> Calibration:
+    """Bring a solution into the form that is saved, with standard errors of the published parameters.
+
+    Parameters
+    ----------
+    frames : FramesUsed
+        With the frames in which nothing was found or that no sensor reading covers. Those that the solver
+        left out are added.
+    """
+    angular = solution.angular
+    chain, pose = solution.chain, IMAGE_POSE[:3] if angular else IMAGE_POSE
+    return Calibration(
+        method=method,
+        sensor="orientation" if angular else "tracker",
+        rotation=chain.sensor_from_image.rotation,
+        translation_mm=None if angular else np.asarray(chain.sensor_from_image.translation),
+        pixel_mm=None if angular else chain.pixel_mm,
+        covariance=solution.image_covariance(pose),
+        parameters=_parameters(solution),
+        rms=solution.rms,
+        rms_unit="rad" if angular else "mm",
+        condition_number=solution.condition_number,
+        frames=_frames_used(solution, frames),
+        time_offset_s=time_offset_s,
+        verdict=judge(solution).verdict,
+    )
+
+
+def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
+    """The parameters estimated, in the sensor's and the world's own frames."""
+    values, used = solution.chain.parameters(), solution.points_used
+    matrix = free_jacobian(used, solution.phantom, solution.chain, solution.free)
+    covariance = clustered_covariance(matrix, solution.residuals[solution.used].ravel(), used.frame)
+    errors = np.sqrt(np.diag(covariance))
+    return tuple(
+        Parameter(name, float(values[column]), float(error), _unit(name))
+        for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)
+    )
+
+
+def _unit(name: str) -> str:
+    if name in SCALES:
+        return "mm/pixel"
+    return "mm" if name[0] in "xyz" else "rad"
+
+
+def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
+    """Add the frames that contradict the others, with their residuals."""
+    dropped = dict(frames.dropped)
+    for number in np.unique(solution.points.frame[~solution.used]):
+        worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
+        size = f"{np.rad2deg(worst):.1f} degrees" if solution.angular else f"{worst:.1f} mm"
+        dropped[int(number)] = f"contradicts the other frames by {size}"
+    return FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), dropped)
 
 
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:

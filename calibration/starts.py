@@ -67,7 +67,7 @@ def hemisphere(count: int = _NORMALS) -> FloatArray:
 
 
 def rotations_all_over() -> Rotation:
-    """Rotations spread evenly over all there are.
+    """Rotations spread evenly over the whole rotation group.
 
     References
     ----------

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, Phantom, Seen
+from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, Phantom, SeenAs
 from calibration.identifiability import require_adequate
 from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
 from calibration.starts import rotations_all_over, wire_start
@@ -35,7 +35,7 @@ class CrossWire:
     """Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
 
     determined: tuple[str, ...] = TARGET[:3]
-    seen_as: Seen = "dot"
+    seen_as: SeenAs = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the crossing."""
@@ -56,7 +56,7 @@ class Wires:
 
     geometry: WirePhantom
     determined: tuple[str, ...] = TARGET
-    seen_as: Seen = "dot"
+    seen_as: SeenAs = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the wire, along two directions across it."""
@@ -146,7 +146,7 @@ def _about_middle(geometry: WirePhantom) -> WirePhantom:
 
 
 def _anywhere(few: ImagePoints, phantom: Wires, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
-    """Best start, from orientations of the phantom all over."""
+    """Best start among orientations of the phantom spread over all rotations."""
     probe, held = probe_parameters(fit_pixels, pixel_mm)
     equations = phantom.vanishing(few)
     tried = [wire_start(few, equations, turn) for turn in rotations_all_over()]

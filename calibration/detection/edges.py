@@ -45,7 +45,7 @@ class Profiles:
     sigma: float
 
     def brightness(self) -> Float32Array:
-        """Level of the echo that begins at each steep place, above the image's middle level; 0 elsewhere."""
+        """Brightness of the echo that begins at each edge, above the image's median level; 0 elsewhere."""
         bright = np.empty_like(self.levels)
         least = _LEAST * typical(self.slope, self.columns)
         dark = float(np.median(self.levels[self.columns.inside]))

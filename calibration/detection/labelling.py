@@ -171,7 +171,7 @@ def label_by_calibration(
 
 @dataclass(frozen=True)
 class _Layer:
-    """An N: its three wires, where the middle one crosses the others, and where it is among its like."""
+    """A layer of wires, an N, and its place relative to the first layer."""
 
     wires: IntArray
     crossings_mm: FloatArray
