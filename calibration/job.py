@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -179,13 +179,14 @@ def plane_job(
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with a plane; `beam_mm` are thicknesses whose bias the report shows."""
     _require_poses(recording)
-
-    def calibrate(points: ImagePoints) -> ChainSolution:
-        return calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma)
-
-    outcome = _finished(recording, seen, job, calibrate, "plane")
-    beam = tuple(predict_bias(outcome.solution, width) for width in beam_mm)
-    return Outcome(outcome.solution, outcome.calibration, outcome.shots, beam, outcome.offset)
+    outcome = _finished(
+        recording,
+        seen,
+        job,
+        lambda points: calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma),
+        "plane",
+    )
+    return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in beam_mm))
 
 
 def orientation_job(
@@ -303,7 +304,7 @@ def _finished(
     known = offset is not None or job.offset_given or recording.time_offset_s != 0.0
     stored = used_offset if known else None
     calibration = as_calibration(solution, method, frames, stored)
-    return Outcome(solution, calibration, _shots(recording, seen, calibration), (), offset)
+    return Outcome(solution, calibration, _shots(recording, seen, calibration), offset=offset)
 
 
 def _everywhere_paired(recording: Recording, seen: Seen, offset_s: float) -> ImagePoints:

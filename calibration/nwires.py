@@ -60,35 +60,18 @@ class MiddleWires:
     phantom_mm: FloatArray
 
 
-@dataclass(frozen=True)
-class NWireErrors:
-    """Distances of middle dots from where the outer dots say they are.
+def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[float, float]:
+    """Mean and standard deviation of the least `share` of the errors, mm, as PLUS reports them.
 
-    Attributes
-    ----------
-    frame, wire : ndarray of int, shape (n,)
-        The frame, and the number of the middle wire.
-    error_mm : ndarray, shape (n,)
+    Raises
+    ------
+    InsufficientDataError
+        If there are none.
     """
-
-    frame: IntArray
-    wire: IntArray
-    error_mm: FloatArray
-
-    def trimmed(self, share: float = _PLUS_SHARE) -> tuple[float, float]:
-        """Mean and standard deviation of the least errors, mm.
-
-        PLUS reports those of the least 95 per cent; with a share of one they are those of all.
-
-        Raises
-        ------
-        InsufficientDataError
-            If there are none.
-        """
-        kept = np.sort(self.error_mm)[: round(share * len(self.error_mm))]
-        if kept.size == 0:
-            raise InsufficientDataError("expected an N with all three dots, got none")
-        return float(kept.mean()), float(kept.std())
+    kept = np.sort(errors_mm)[: round(share * len(errors_mm))]
+    if kept.size == 0:
+        raise InsufficientDataError("expected an N with all three dots, got none")
+    return float(kept.mean()), float(kept.std())
 
 
 def middle_wires(points: ImagePoints, phantom: WirePhantom) -> MiddleWires:
@@ -121,9 +104,9 @@ def nwire_errors_mm(
     points: ImagePoints,
     phantom: WirePhantom,
     sensor_from_pixels: FloatArray,
-    world_from_phantom: RigidTransform | None = None,
-) -> NWireErrors:
-    """How far middle dots are from where the outer dots say they are: PLUS's 3-D reprojection error.
+    world_from_phantom: RigidTransform,
+) -> FloatArray:
+    """Distances of middle dots from where the outer dots say they are: PLUS's 3-D reprojection error.
 
     Parameters
     ----------
@@ -131,20 +114,21 @@ def nwire_errors_mm(
         With the wire of each; all N whose three dots are there count.
     sensor_from_pixels : ndarray, shape (4, 4)
         Affine: PLUS's ``ImageToProbe``, `Calibration.pixel_matrix`, or `pixel_matrix` of a chain.
-    world_from_phantom : RigidTransform, optional
-        By default the phantom's own.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the order of `middle_wires`.
 
     Raises
     ------
     InvalidInputError
-        If neither says where the phantom is, or the points have no wires.
+        If the points have no wires.
     """
-    pose = _registered(phantom, world_from_phantom)
     middle = middle_wires(points, phantom)
     seen = middle.points.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
-    expected = (middle.points.world_from_sensor.inv() * pose).apply(middle.phantom_mm)
-    wire = _wires(middle.points, phantom)
-    return NWireErrors(middle.points.frame, wire, np.linalg.norm(seen - expected, axis=1))
+    expected = (middle.points.world_from_sensor.inv() * world_from_phantom).apply(middle.phantom_mm)
+    return np.asarray(np.linalg.norm(seen - expected, axis=1))
 
 
 def pixel_matrix(chain: Chain) -> FloatArray:
@@ -227,13 +211,6 @@ def _wires(points: ImagePoints, phantom: WirePhantom) -> IntArray:
     if len(points) and not (int(points.wire.min()) >= 0 and int(points.wire.max()) < len(phantom)):
         raise InvalidInputError(f"points: expected wires from 0 to {len(phantom) - 1}, got others")
     return points.wire
-
-
-def _registered(phantom: WirePhantom, world_from_phantom: RigidTransform | None) -> RigidTransform:
-    pose = phantom.world_from_phantom if world_from_phantom is None else world_from_phantom
-    if pose is None:
-        raise InvalidInputError("expected where the phantom is in the world, got none")
-    return pose
 
 
 def _together(frame: IntArray, wire: IntArray, shape: tuple[int, ...]) -> list[IntArray]:

@@ -57,10 +57,10 @@ class Angles:
     ratio: float
 
 
-def hemisphere(count: int = _NORMALS) -> FloatArray:
-    """Unit vectors spread evenly over the hemisphere z >= 0, the pole first, shape (count, 3)."""
-    k = np.arange(count)
-    z = 1.0 - k / count
+def hemisphere() -> FloatArray:
+    """Unit vectors spread evenly over the hemisphere z >= 0, the pole first, shape (30, 3)."""
+    k = np.arange(_NORMALS)
+    z = 1.0 - k / _NORMALS
     around = k * np.pi * (3.0 - np.sqrt(5.0))
     flat = np.sqrt(1.0 - z**2)
     return np.column_stack([flat * np.cos(around), flat * np.sin(around), z])

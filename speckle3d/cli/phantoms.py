@@ -351,14 +351,14 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
 
 def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     """PLUS's 3-D error, where there are N-shapes."""
-    from calibration.nwires import nwire_errors_mm, pixel_matrix
+    from calibration.nwires import nwire_errors_mm, pixel_matrix, trimmed_mean_mm
     from calibration.wires import Wires
 
     chain, phantom = outcome.solution.chain, outcome.solution.phantom
     if not isinstance(phantom, Wires) or not phantom.geometry.n_shapes:
         return []
     place = chain.target_from_world.inv()
-    mean, sd = nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place).trimmed()
+    mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place))
     return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
 
 
