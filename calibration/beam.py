@@ -1,4 +1,4 @@
-"""What the thickness of the beam does to a calibration on a bare wall: a bias along the beam, predicted.
+"""Bias along the beam that the beam's thickness causes in a calibration on a bare wall.
 
 A sheet of thickness w that meets a wall at an angle meets it first with its nearer edge, so that the line
 lies (w / 2) |tan(tilt)| / cos(roll) too shallow. The Cambridge phantom, a thin bar, does not do this.
@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.plane import Plane, solve
-from calibration.solution import Solution
+from calibration.chain import ChainSolution
+from calibration.plane import Plane, solve_chain
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 
 _ROUNDING = 1e-20
-"""Variance of cosines that are all the same but for rounding; tilts of a tenth of a degree make 1e-13."""
+"""Variance of equal cosines, from rounding; tilts of a tenth of a degree make 1e-13."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,6 @@ class BeamBias:
     rms_mm: float
 
 
-def focal_width_mm(focus_mm: float, wavelength_mm: float, aperture_radius_mm: float) -> float:
-    """Thickness of a beam at its focus, its least: F lambda / a (TR 303, appendix D)."""
-    if min(focus_mm, wavelength_mm, aperture_radius_mm) <= 0:
-        raise InvalidInputError(
-            "expected focus, wavelength and aperture radius above zero, got "
-            f"{focus_mm:g}, {wavelength_mm:g} and {aperture_radius_mm:g} mm"
-        )
-    return focus_mm * wavelength_mm / aperture_radius_mm
-
-
 def depth_error_mm(normal_in_image: FloatArray, width_mm: float) -> FloatArray:
     """How much too shallow lines appear: (w / 2) |n_z / n_y|, the same all along the line.
 
@@ -68,10 +58,15 @@ def depth_error_mm(normal_in_image: FloatArray, width_mm: float) -> FloatArray:
 
 
 def bias_along_beam_mm(normal_in_image: FloatArray, width_mm: float) -> float:
-    """Closed form of the bias along y, were all but the image's and the wall's heights known.
+    """Closed form of the bias along y if only the heights of the image and the wall were unknown.
 
-    The height error (w / 2)|n_z| is explained best, in the sense of least squares, by moving the image by
-    (w / 2) cov(|n_z|, |n_y|) / var(|n_y|) along its y axis, and the wall.
+    Least squares explain the height error (w / 2)|n_z| by moving the wall, and the image along its y axis by
+    (w / 2) cov(|n_z|, |n_y|) / var(|n_y|).
+
+    Returns
+    -------
+    float
+        NaN where the wall was met at one angle only.
     """
     oblique, along = np.abs(normal_in_image[:, 2]), np.abs(normal_in_image[:, 1])
     spread = float(np.var(along))
@@ -80,10 +75,10 @@ def bias_along_beam_mm(normal_in_image: FloatArray, width_mm: float) -> float:
     return width_mm / 2.0 * float(np.mean((oblique - oblique.mean()) * (along - along.mean()))) / spread
 
 
-def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
+def predict_bias(solution: ChainSolution, width_mm: float) -> BeamBias:
     """Predict the bias of a calibration with a bare wall, by simulation of its own motions.
 
-    The lines of a thick beam are put where the wall would show them, and solved for like real ones.
+    Lines are placed where a thick beam would show the wall, and a calibration is solved from them.
 
     Raises
     ------
@@ -92,7 +87,7 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     """
     if not (np.isfinite(width_mm) and width_mm >= 0):
         raise InvalidInputError(f"width_mm: expected zero or more, got {width_mm:g}")
-    points, chain = solution.points[solution.used], solution.chain
+    points, chain = solution.points_used, solution.chain
     near = chain.target_from_image(points)
     normal = near.rotation.as_matrix()[:, 2]
     columns = points.pixels[:, 0] * chain.pixel_mm[0]
@@ -100,7 +95,7 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     rows = (exact - depth_error_mm(normal, width_mm)) / chain.pixel_mm[1]
     thick = replace(points, pixels=np.column_stack([points.pixels[:, 0], rows]))
     probe = tuple(name for name in solution.free if name not in solution.phantom.determined)
-    seen = solve(thick, Plane(), chain, probe, outlier_sigma=np.inf)
+    seen = solve_chain(thick, Plane(), chain, probe, outlier_sigma=np.inf)
     middle = points.pixels.mean(axis=0)
     before, after = (
         one.sensor_from_image.apply(np.append(middle * one.pixel_mm, 0.0)) for one in (chain, seen.chain)

@@ -11,23 +11,28 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from calibration.mirror import canonical
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
+from speckle3d.core.leastsquares import Fit
 
-Seen = Literal["line", "direction", "dot"]
+SeenAs = Literal["line", "direction", "dot"]
 
 SCALES = ("s_x", "s_y")
-PROBE = (*SCALES, "x", "y", "z", "alpha", "beta", "gamma")
-"""Pixel size, mm, and ``sensor_from_image`` (the report's R_T_P): position, mm, and fixed angles, rad."""
+POSE = ("x", "y", "z", "alpha", "beta", "gamma")
+"""``sensor_from_image`` (the report's R_T_P): position, mm, and fixed angles, rad."""
+ANGLES = POSE[3:]
+PROBE = (*SCALES, *POSE)
+"""Pixel size, mm, and ``sensor_from_image``."""
 TARGET = ("x_c", "y_c", "z_c", "alpha_c", "beta_c", "gamma_c")
 """``target_from_world`` (the report's C_T_T)."""
 CHAIN = (*PROBE, *TARGET)
@@ -81,6 +86,16 @@ class ImagePoints:
         """Translations of the poses, shape (n, 3)."""
         return np.asarray(self.world_from_sensor.translation)
 
+    @cached_property
+    def frames(self) -> IntArray:
+        """Numbers of the frames that have points, ascending."""
+        return np.unique(self.frame)
+
+    def of_some_frames(self, count: int) -> ImagePoints:
+        """The points of at most `count` frames, spread evenly over the recording."""
+        places = np.unique(np.linspace(0, len(self.frames) - 1, count).astype(int))
+        return self[np.isin(self.frame, self.frames[places])]
+
     @classmethod
     def of_lines(
         cls, frame: IntArray, points_px: FloatArray, world_from_sensor: RigidTransform
@@ -100,8 +115,8 @@ class Phantom(Protocol):
     """What must vanish in the phantom's frame."""
 
     @property
-    def seen_as(self) -> Seen:
-        """What two or one of the points are: the ends of a line, the direction of one, or a dot."""
+    def seen_as(self) -> SeenAs:
+        """What the points are: the two ends of a line, the direction of one, or a dot."""
 
     @property
     def determined(self) -> tuple[str, ...]:
@@ -146,6 +161,71 @@ class Chain:
         )
 
 
+@dataclass(frozen=True)
+class ChainSolution:
+    """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.
+
+    Attributes
+    ----------
+    chain : Chain
+    free : tuple of str, length p
+        The parameters estimated, among `CHAIN`.
+    fit : Fit
+        Of the points used, in frames that lie on the image and on the phantom: there the angles are
+        small rotations about the image's z, y and x, wherever the sensor is mounted.
+    covariance : ndarray, shape (p, p)
+        In the same frames, in the order of `free`; residuals may be correlated within a frame (a sensor's
+        error moves all its points) and from frame to frame (it drifts).
+    points : ImagePoints
+        All that were given.
+    used : ndarray of bool, shape (n,)
+    residuals : ndarray, shape (n, r)
+        Of all points, mm (sines of angles for directions).
+    sigma : float
+        Robust standard deviation of the residuals of the points used.
+    condition_number : float
+        Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2).
+    """
+
+    chain: Chain
+    phantom: Phantom
+    free: tuple[str, ...]
+    fit: Fit
+    covariance: FloatArray
+    points: ImagePoints
+    used: BoolArray
+    residuals: FloatArray
+    sigma: float
+    condition_number: float
+
+    @property
+    def angular(self) -> bool:
+        """Whether only directions are known: residuals are sines of angles, and nothing has a length."""
+        return self.phantom.seen_as == "direction"
+
+    @property
+    def free_columns(self) -> list[int]:
+        """Where the free parameters are in `CHAIN`."""
+        return [CHAIN.index(name) for name in self.free]
+
+    @cached_property
+    def points_used(self) -> ImagePoints:
+        """The points that the solution is made from."""
+        return self.points[self.used]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual of the points used."""
+        return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
+
+    def image_covariance(self, names: tuple[str, ...]) -> FloatArray:
+        """Covariance of some of the parameters, zero for those held."""
+        index = [self.free.index(name) if name in self.free else -1 for name in names]
+        known = np.array([i >= 0 for i in index])
+        picked = self.covariance[np.ix_(index, index)]
+        return np.where(np.outer(known, known), picked, 0.0)
+
+
 def residuals_and_jacobian(
     parameters: FloatArray, points: ImagePoints, phantom: Phantom
 ) -> tuple[FloatArray, FloatArray]:
@@ -182,9 +262,49 @@ def residuals_and_jacobian(
     return np.einsum("nri,ni->nr", rows, where) - offsets, jacobian
 
 
+def free_jacobian(points: ImagePoints, phantom: Phantom, chain: Chain, free: Sequence[str]) -> FloatArray:
+    """Derivatives by the free parameters in the sensor's and the world's own frames, shape (n r, p)."""
+    _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
+    return jacobian.reshape(-1, len(CHAIN))[:, [CHAIN.index(name) for name in free]]
+
+
 def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotation by x-y-z fixed angles (alpha, beta, gamma), and its derivatives, shape (3, 3, 3)."""
     x, y, z = skew(np.eye(3))
     rotation = rotation_from_fixed_angles(*angles).as_matrix()
     about_y = np.cos(angles[0]) * y - np.sin(angles[0]) * x
     return rotation, np.stack([z @ rotation, about_y @ rotation, rotation @ x])
+
+
+def wrapped(angles_rad: npt.ArrayLike) -> FloatArray:
+    """Angles brought into (-pi, pi]."""
+    return np.asarray(np.pi - np.mod(np.pi - np.asarray(angles_rad, dtype=float), 2 * np.pi))
+
+
+def canonical(angles_rad: npt.ArrayLike, pixel_mm: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Bring fixed angles and pixel sizes into the form with positive sizes and |beta| <= pi / 2.
+
+    Several sets of angles and sizes are one calibration: the matrix ``rotation @ diag(s_x, s_y, 0)`` stays
+    what it is.
+
+    Parameters
+    ----------
+    angles_rad : array_like, shape (3,)
+        alpha, beta, gamma.
+    pixel_mm : array_like, shape (2,)
+        s_x, s_y.
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, appendix C. Its second step adds pi to beta, which is
+       another rotation; beta is reflected here, which is the same one.
+    """
+    alpha, beta, gamma = (float(a) for a in wrapped(angles_rad))
+    s_x, s_y = (float(s) for s in np.asarray(pixel_mm, dtype=float))
+    if abs(beta) > np.pi / 2:
+        alpha, beta, gamma = alpha + np.pi, np.copysign(np.pi, beta) - beta, gamma + np.pi
+    if s_y < 0:
+        gamma, s_y = gamma + np.pi, -s_y
+    if s_x < 0:
+        alpha, beta, gamma, s_x = alpha + np.pi, -beta, np.pi - gamma, -s_x
+    return np.array([*wrapped([alpha, beta, gamma])]), np.array([s_x, s_y])

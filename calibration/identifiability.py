@@ -1,7 +1,7 @@
-"""Whether the motion was sufficient, and which motion is missing.
+"""Whether the motion of a scan determines the calibration, and which motion is missing.
 
-A missing motion is found by trying: frames are imagined in which the probe is turned or shifted in one more
-way, and the motion whose frames would make the answer most certain is the one that was missing.
+To find the missing motion, more frames are imagined in which the probe is turned or shifted in one more way;
+missing is the motion whose frames would make the answer most certain.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import CHAIN, ImagePoints, residuals_and_jacobian
-from calibration.solution import Solution
-from speckle3d.core.arrays import BoolArray, FloatArray
+from calibration.chain import CHAIN, ChainSolution, ImagePoints, residuals_and_jacobian
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
@@ -22,27 +21,27 @@ MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
 
 REFUSED_MM, REFUSED_RAD = 5.0, np.deg2rad(2.0)
-"""Standard error of the image's corners, or of an orientation sensor's rotation, at which nothing is
-returned: what a ruler and a protractor on the probe achieve."""
+"""Standard error of the image's corners, or of an orientation sensor's rotation, above which a solution is
+refused: what a ruler and a protractor on the probe achieve."""
 
 WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
-"""Standard error from which on the verdict says so; 1 degree is the published precision (Housden 2008)."""
+"""Standard error of a weakly determined solution; 1 degree is the published precision (Housden 2008)."""
 
 MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
-"""Root mean square residual that no phantom leaves: the worst published is 3.5 mm as a distance, with early
-magnetic trackers (TR 303, section 5), 2 mm in each component."""
+"""Root mean square residual above which the phantom does not explain the images: the worst published is
+3.5 mm as a distance, with early magnetic trackers (TR 303, section 5), 2 mm in each component."""
 
 SMALLEST_IMAGE_MM = 1.0
-"""Pixels that make an image smaller have shrunk to nothing: the image is then one point, which hovers at the
-same height if the probe was turned about a point of it."""
+"""Smallest plausible image. Where the probe was only turned about a point of the image, pixels shrink to
+nothing: an image that is one point is at the same height in all frames."""
 
 _TURN_RAD, _SHIFT_MM = np.deg2rad(15.0), 10.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
-"""No line is found better; exact data would otherwise make every motion look sufficient."""
+"""Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
 
 _UNKNOWN = {"s_x": 0.3, "s_y": 0.3}
-"""How far a parameter may be from anything plausible: a share of itself for pixel sizes."""
+"""Standard deviation of a parameter before anything is measured; of pixel sizes, as a share of them."""
 _UNKNOWN_RAD, _UNKNOWN_MM = 1.0, 300.0
 
 
@@ -79,7 +78,7 @@ class Adequacy:
     condition_number : float
         Of the scaled Jacobian, in frames on the image and the phantom.
     missing : tuple of str
-        Motions that would help most, first first; none if the answer is certain enough.
+        Motions, most useful first; none if the answer is certain enough.
     """
 
     standard_error: float
@@ -89,7 +88,7 @@ class Adequacy:
     verdict: str
 
 
-def require_adequate(solution: Solution) -> Solution:
+def require_adequate(solution: ChainSolution) -> ChainSolution:
     """Return `solution` if its motion was sufficient.
 
     Raises
@@ -104,18 +103,19 @@ def require_adequate(solution: Solution) -> Solution:
     return solution
 
 
-def judge(solution: Solution) -> Adequacy:
+def judge(solution: ChainSolution) -> Adequacy:
     """Judge the motion of a solution, and whether the phantom explains the images at all.
 
     The image is taken to reach as far as the phantom was seen in it.
     """
-    angular = solution.phantom.seen_as == "direction"
+    angular = solution.angular
     weak, limit = (WEAK_RAD, REFUSED_RAD) if angular else (WEAK_MM, REFUSED_MM)
-    information = _information(solution, solution.points[solution.used])
+    information = _information(solution, _on_phantom(solution, solution.points_used))
     error = _standard_error(solution, information)
     condition = solution.fit.condition_number
     share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
-    # Not where a phantom that fits would be no help: the solver runs off along the way that is left open.
+    # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
+    # solver runs away in the direction left open.
     if share < 1 and share * error <= limit:
         return Adequacy(error, condition, (), True, _misfit(solution))
     if not angular and _image_mm(solution).min() < SMALLEST_IMAGE_MM:
@@ -134,15 +134,15 @@ def judge(solution: Solution) -> Adequacy:
     return Adequacy(error, condition, missing, refused, verdict)
 
 
-def _image_mm(solution: Solution) -> FloatArray:
-    """How far right and down the phantom was seen."""
-    return np.asarray(solution.points.pixels[solution.used].max(axis=0) * solution.chain.pixel_mm)
+def _image_mm(solution: ChainSolution) -> FloatArray:
+    """How far right and down in the image the phantom was seen."""
+    return np.asarray(solution.points_used.pixels.max(axis=0) * solution.chain.pixel_mm)
 
 
-def _misfit(solution: Solution) -> str:
+def _misfit(solution: ChainSolution) -> str:
     return (
         "the phantom does not explain the images (they miss it by "
-        f"{_size(solution.rms, solution.phantom.seen_as == 'direction')}): do the images and the sensor "
+        f"{_size(solution.rms, solution.angular)}): do the images and the sensor "
         "readings belong together, and are the phantom, its wires and their numbers the ones named?"
     )
 
@@ -152,35 +152,34 @@ def _size(error: float, angular: bool) -> str:
 
 
 def _more(only_phantom_unknown: bool) -> str:
-    """What helps where no motion does."""
+    """Advice where no motion would help."""
     if only_phantom_unknown:
         return "what stays unknown is where the phantom is: show more of it, all its wires"
     return "record more frames over a wider range"
 
 
-def _information(solution: Solution, points: ImagePoints) -> FloatArray:
-    """Inverse covariance that points bring to the free parameters, in frames on the image and the phantom."""
-    near = replace(points, world_from_sensor=solution.chain.target_from_image(points))
-    return _information_near(solution, near)
+def _on_phantom(solution: ChainSolution, points: ImagePoints) -> ImagePoints:
+    """Points whose sensor is at the image and whose world is the phantom: all angles to be found are zero."""
+    return replace(points, world_from_sensor=solution.chain.target_from_image(points))
 
 
-def _information_near(solution: Solution, near: ImagePoints) -> FloatArray:
+def _information(solution: ChainSolution, near: ImagePoints) -> FloatArray:
+    """Inverse covariance that points (`_on_phantom`) bring to the free parameters."""
     origin = np.concatenate([solution.chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
     _, jacobian = residuals_and_jacobian(origin, near, solution.phantom)
-    columns = [CHAIN.index(name) for name in solution.free]
-    matrix = jacobian.reshape(-1, len(CHAIN))[:, columns]
-    least = _LEAST_SIGMA_RAD if solution.phantom.seen_as == "direction" else _LEAST_SIGMA_MM
+    matrix = jacobian.reshape(-1, len(CHAIN))[:, solution.free_columns]
+    least = _LEAST_SIGMA_RAD if solution.angular else _LEAST_SIGMA_MM
     return np.asarray(matrix.T @ matrix / max(solution.sigma, least) ** 2)
 
 
-def _standard_error(solution: Solution, information: FloatArray) -> float:
-    """Standard error of the corners, mm, or of the worst angle, rad, were nothing else known."""
+def _standard_error(solution: ChainSolution, information: FloatArray) -> float:
+    """Standard error of the corners, mm, or of the worst angle, rad, from this information alone."""
     covariance = np.zeros((len(CHAIN), len(CHAIN)))
-    columns = [CHAIN.index(name) for name in solution.free]
+    columns = solution.free_columns
     covariance[np.ix_(columns, columns)] = np.linalg.inv(information + np.diag(_plausible(solution)))
-    if solution.phantom.seen_as == "direction":
+    if solution.angular:
         return float(np.sqrt(np.linalg.eigvalsh(covariance[5:8, 5:8])[-1]))
-    right, bottom = solution.points.pixels[solution.used].max(axis=0)
+    right, bottom = solution.points_used.pixels.max(axis=0)
     corners_px = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
     flat = np.column_stack([corners_px * solution.chain.pixel_mm, np.zeros(len(corners_px))])
     moved = np.zeros((len(corners_px), 3, len(CHAIN)))
@@ -190,7 +189,7 @@ def _standard_error(solution: Solution, information: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.einsum("kip,pq,kiq->k", moved, covariance, moved))))
 
 
-def _plausible(solution: Solution) -> FloatArray:
+def _plausible(solution: ChainSolution) -> FloatArray:
     """Inverse variance of each free parameter before anything is measured."""
     sizes = dict(zip(CHAIN[:2], solution.chain.pixel_mm, strict=True))
     widths = [
@@ -204,7 +203,7 @@ def _plausible(solution: Solution) -> FloatArray:
     return np.array(widths) ** -2.0
 
 
-def _missing(solution: Solution, information: FloatArray, enough: float) -> Iterator[str]:
+def _missing(solution: ChainSolution, information: FloatArray, enough: float) -> Iterator[str]:
     """Motions, the most helpful first, until the answer would be certain enough."""
     known, error = information, _standard_error(solution, information)
     candidates = list(MOTIONS)
@@ -218,33 +217,26 @@ def _missing(solution: Solution, information: FloatArray, enough: float) -> Iter
         yield candidates.pop(best).advice
 
 
-def _imagined(solution: Solution, motion: Motion) -> FloatArray:
+def _imagined(solution: ChainSolution, motion: Motion) -> FloatArray:
     """Information of as many frames again, with the probe moved in one more way."""
-    points = solution.points[_some_frames(solution)]
-    near = replace(points, world_from_sensor=solution.chain.target_from_image(points))
-    if not motion.turns and solution.phantom.seen_as == "direction":
+    if not motion.turns and solution.angular:
         return np.zeros((len(solution.free), len(solution.free)))
+    near = _on_phantom(solution, solution.points_used.of_some_frames(_TRIED_FRAMES))
     moved = _turned if motion.turns else _shifted
-    share = len(np.unique(solution.points.frame[solution.used])) / len(np.unique(near.frame)) / 2.0
+    share = len(solution.points_used.frames) / len(near.frames) / 2.0
     steps = [moved(solution, near, np.eye(3)[motion.axis] * sign) for sign in (-1.0, 1.0)]
-    return np.asarray(share * sum(_information_near(solution, step) for step in steps))
+    return np.asarray(share * sum(_information(solution, step) for step in steps))
 
 
-def _some_frames(solution: Solution) -> BoolArray:
-    frames = np.unique(solution.points.frame[solution.used])
-    picked = frames[np.unique(np.linspace(0, len(frames) - 1, _TRIED_FRAMES).astype(int))]
-    return np.isin(solution.points.frame, picked)
-
-
-def _shifted(solution: Solution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
+def _shifted(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
     """The image shifted along itself, so that the same points of the phantom appear elsewhere in it."""
     shift = RigidTransform.from_translation(_SHIFT_MM * axis)
     pixels = near.pixels - _SHIFT_MM * axis[:2] / solution.chain.pixel_mm
     return replace(near, pixels=pixels, world_from_sensor=near.world_from_sensor * shift)
 
 
-def _turned(solution: Solution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
-    """The image turned about the dot in it, or the middle of the line, where the plane then cuts it anew."""
+def _turned(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
+    """The image turned about its dot, or about the middle of its line, which then runs elsewhere."""
     turn = Rotation.from_rotvec(_TURN_RAD * axis)
     seen, size = solution.phantom.seen_as, solution.chain.pixel_mm
     if seen == "dot":

@@ -1,24 +1,30 @@
-"""A recording of a phantom in, a calibration with its report out."""
+"""From a recording of a phantom to a calibration with what its report shows."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
-from calibration.chain import ImagePoints, as_directions
+from calibration.chain import (
+    ChainSolution,
+    ImagePoints,
+    as_directions,
+)
 from calibration.clock.offset import ClockOffset, covered, estimate_offset
-from calibration.detection.lines import EchoLines, LineSettings, detect_lines
+from calibration.detection.dots import dots_in_frames, single_dots
+from calibration.detection.labelling import label_dots
+from calibration.detection.lines import LineSettings, detect_lines
+from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
 from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
-from calibration.report import Shot
-from calibration.results import as_calibration
-from calibration.solution import Solution
-from calibration.wires import Registration, calibrate_crossing, calibrate_wires
+from calibration.report import Shot, as_calibration
+from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -33,7 +39,7 @@ SEARCH_S = 0.4
 are below 0.2 s."""
 
 _FEWEST_COVERED = 0.3
-"""Share of the frames with something in them that must have a reading; below it, the recordings do not belong
+"""Least share of the frames with a detection that must have a reading; below it, the recordings do not belong
 together."""
 
 
@@ -63,28 +69,29 @@ class Recording:
     time_offset_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Job:
-    """What to do with the sensor's clock and with frames that contradict the others.
+class JobSettings(BaseModel):
+    """What to do with the sensor's clock and with frames that contradict the others."""
 
-    Parameters
-    ----------
-    estimate_offset : bool
-        Find the clock offset that explains the images best, near the recording's own.
-    offset_given : bool
-        The recording's clock offset was given, and belongs to the calibration even if it is zero.
-    """
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-    estimate_offset: bool = False
-    outlier_sigma: float = OUTLIER_SIGMA
-    offset_given: bool = False
+    estimate_offset: bool = Field(
+        False,
+        description="Find the clock offset that explains the images best, near the recording's own.",
+    )
+    offset_given: bool = Field(
+        False,
+        description="The recording's clock offset was given: it is saved with the calibration even if zero.",
+    )
+    outlier_sigma: float = Field(
+        OUTLIER_SIGMA, gt=0, description="Drop frames whose residual exceeds so many standard deviations."
+    )
 
 
 @dataclass(frozen=True)
 class Outcome:
     """A calibration and what its report shows."""
 
-    solution: Solution
+    solution: ChainSolution
     calibration: Calibration
     shots: tuple[Shot, ...]
     beam: tuple[BeamBias, ...] = ()
@@ -124,35 +131,70 @@ class Seen:
         progress: Progress | None = None,
     ) -> Seen:
         """Find the plane's line in every image."""
-        found: EchoLines = detect_lines(recording.images, recording.pixel_mm, settings, region_px, progress)
+        found = detect_lines(recording.images, recording.pixel_mm, settings, region_px, progress)
         return cls(found.frame, found.points_px, None, found.dropped)
+
+    @classmethod
+    def crossings(
+        cls,
+        recording: Recording,
+        region_px: npt.ArrayLike | None = None,
+        progress: Progress | None = None,
+    ) -> Seen:
+        """Find in every image the bright dot that a crossing of wires, or a bead, makes."""
+        dots = single_dots(dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress))
+        return cls(dots.frame, dots.pixels, None, dots.dropped)
+
+    @classmethod
+    def nwires(
+        cls,
+        recording: Recording,
+        phantom: WirePhantom,
+        region_px: npt.ArrayLike | None = None,
+        progress: Progress | None = None,
+    ) -> Seen:
+        """Find the dots of an N-wire phantom and the wires they show.
+
+        Where every frame has a sensor reading, a calibration from the frames that show all wires then finds
+        those of the other frames.
+        """
+        dots = dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress)
+        times, offset_s = recording.frame_time_s, recording.time_offset_s
+        everywhere = covered(recording.readings, times, offset_s).all()
+        if isinstance(recording.readings, TimedPoses) and everywhere:
+            poses = recording.readings.at(times - offset_s)
+            labelled = label_and_start(dots, phantom, poses, recording.pixel_mm)[0]
+        else:
+            labelled = label_dots(dots, phantom, recording.pixel_mm)
+        return cls(labelled.frame, labelled.pixels, labelled.wire, labelled.dropped)
 
 
 def plane_job(
     recording: Recording,
     seen: Seen,
-    job: Job,
+    job: JobSettings,
     fit_pixels: bool = True,
     stages: Stages = "three",
     beam_mm: Sequence[float] = (),
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with a plane; `beam_mm` are thicknesses whose bias the report shows."""
     _require_poses(recording)
-
-    def calibrate(points: ImagePoints) -> Solution:
-        return calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma)
-
-    outcome = _finished(recording, seen, job, calibrate, "plane")
-    beam = tuple(predict_bias(outcome.solution, width) for width in beam_mm)
-    return Outcome(outcome.solution, outcome.calibration, outcome.shots, beam, outcome.offset)
+    outcome = _finished(
+        recording,
+        seen,
+        job,
+        lambda points: calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma),
+        "plane",
+    )
+    return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in beam_mm))
 
 
 def orientation_job(
-    recording: Recording, seen: Seen, job: Job, level: bool = False, viewed_from: Viewed = "above"
+    recording: Recording, seen: Seen, job: JobSettings, level: bool = False, viewed_from: Viewed = "above"
 ) -> Outcome:
     """Calibrate an orientation sensor with a plane."""
 
-    def calibrate(points: ImagePoints) -> Solution:
+    def calibrate(points: ImagePoints) -> ChainSolution:
         lines = as_directions(points)
         return calibrate_orientation(
             lines.pixels,
@@ -167,12 +209,12 @@ def orientation_job(
     return _finished(recording, seen, job, calibrate, "orientation")
 
 
-def crossing_job(recording: Recording, seen: Seen, job: Job, fit_pixels: bool = True) -> Outcome:
+def crossing_job(recording: Recording, seen: Seen, job: JobSettings, fit_pixels: bool = True) -> Outcome:
     """Calibrate a 6-DOF sensor with two crossing wires or a bead."""
     _require_poses(recording)
 
-    def calibrate(points: ImagePoints) -> Solution:
-        return calibrate_crossing(points, recording.pixel_mm, fit_pixels, job.outlier_sigma)
+    def calibrate(points: ImagePoints) -> ChainSolution:
+        return calibrate_cross_wire(points, recording.pixel_mm, fit_pixels, job.outlier_sigma)
 
     return _finished(recording, seen, job, calibrate, "cross-wire")
 
@@ -180,7 +222,7 @@ def crossing_job(recording: Recording, seen: Seen, job: Job, fit_pixels: bool = 
 def wires_job(
     recording: Recording,
     seen: Seen,
-    job: Job,
+    job: JobSettings,
     phantom: WirePhantom,
     fit_pixels: bool = True,
     registration: Registration = "turned",
@@ -188,7 +230,7 @@ def wires_job(
     """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes."""
     _require_poses(recording)
 
-    def calibrate(points: ImagePoints) -> Solution:
+    def calibrate(points: ImagePoints) -> ChainSolution:
         return calibrate_wires(
             points, phantom, recording.pixel_mm, fit_pixels, registration, job.outlier_sigma
         )
@@ -199,7 +241,7 @@ def wires_job(
 def paired(
     recording: Recording, seen: Seen, offset_s: float, slack_s: float = 0.0
 ) -> tuple[ImagePoints, Seen]:
-    """Join what was seen with the readings of a clock that is off by `offset_s`.
+    """Join what was seen with the readings at the same time, by a clock that is off by `offset_s`.
 
     Returns
     -------
@@ -239,7 +281,11 @@ def _poses(recording: Recording, times_s: FloatArray) -> RigidTransform:
 
 
 def _finished(
-    recording: Recording, seen: Seen, job: Job, calibrate: Callable[[ImagePoints], Solution], method: str
+    recording: Recording,
+    seen: Seen,
+    job: JobSettings,
+    calibrate: Callable[[ImagePoints], ChainSolution],
+    method: str,
 ) -> Outcome:
     if len(seen.frame) == 0:
         reasons = sorted(set(seen.dropped.values())) or ["no frames"]
@@ -247,7 +293,7 @@ def _finished(
     offset = None
     if job.estimate_offset:
 
-        def at(offset_s: float) -> Solution:
+        def at(offset_s: float) -> ChainSolution:
             return calibrate(_everywhere_paired(recording, seen, offset_s))
 
         offset = estimate_offset(at, recording.time_offset_s, SEARCH_S)
@@ -258,11 +304,11 @@ def _finished(
     known = offset is not None or job.offset_given or recording.time_offset_s != 0.0
     stored = used_offset if known else None
     calibration = as_calibration(solution, method, frames, stored)
-    return Outcome(solution, calibration, _shots(recording, seen, calibration), (), offset)
+    return Outcome(solution, calibration, _shots(recording, seen, calibration), offset=offset)
 
 
 def _everywhere_paired(recording: Recording, seen: Seen, offset_s: float) -> ImagePoints:
-    """The same frames whatever the offset that is tried."""
+    """Points of the frames that have a reading at every offset tried: all are judged by the same frames."""
     there = covered(recording.readings, recording.frame_time_s[seen.frame], recording.time_offset_s, SEARCH_S)
     if not there.any():
         raise InsufficientDataError(
@@ -291,7 +337,7 @@ def _shot(recording: Recording, seen: Seen, number: int, note: str) -> Shot:
 
 
 def _require_poses(recording: Recording) -> None:
-    """Raise `InvalidInputError` unless the sensor tells positions."""
+    """Raise `InvalidInputError` unless the readings hold positions."""
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(
             "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"

@@ -1,21 +1,19 @@
-"""N-wire phantoms: what three dots in a line say about where the image is, and a start for the calibration.
+"""N-wire phantoms: points of the image in the phantom from three dots each, and a start for the calibration.
 
 The outer wires of an N are parallel, so that the middle dot divides the distance between the outer two as the
-place where the image cuts the middle wire divides the distance between its crossings with the outer wires:
-one image gives a point in the phantom for each N, whatever the scale of its pixels.
+place where the image cuts the middle wire divides the distance between its crossings with the outer wires.
+Each N thus gives one point in the phantom, whatever the scale of the pixels.
 
 References
 ----------
 .. [1] R. M. Comeau, A. Fenster and T. M. Peters, "Integrated MR and ultrasound imaging for improved image
    guidance in neurosurgery", Proc. SPIE 3338, 1998.
-.. [2] G. Carbajal, A. Lasso, A. Gomez and G. Fichtinger, "Improving N-wire phantom-based freehand ultrasound
-   calibration", Int. J. Comput. Assist. Radiol. Surg. 8, 2013 (distances of all dots to their wires).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -24,23 +22,23 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.chain import Chain, ImagePoints
 from calibration.detection.dots import Dots
 from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
-from calibration.wirefit import rigid_fits
+from calibration.starts import rigid_fits, wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
+from speckle3d.core.leastsquares import cauchy_weights
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
+"""Share of the errors of which PLUS reports mean and standard deviation, the least ones."""
 _REWEIGHTINGS = 10
 _FEWEST_POINTS = 9
-"""Two or three equations each, for nine unknowns, and as many again to tell a wrong one."""
+"""Three equations each, for nine unknowns, and twice as many again to tell a wrong one."""
 _LEAST_SINGULAR = 1e-4
-"""Least ratio of singular values at which the linear problem has one answer: noise of a hundredth of a
-millimetre would move others by the image's own size."""
-_FAR = 4.0
-"""Distance, in medians, at which a point pulls with half its weight."""
-
-By = Literal["middle", "all"]
+"""Least ratio of singular values at which the linear problem is determined: at a smaller one, noise of 0.01
+mm moves the answer by the image's own size."""
+_FAR = 2.698
+"""Distance, in robust standard deviations (four medians), at which a point has half its weight."""
 _LEAST_TURN = 0.02
 """Least ratio of singular values at which a phantom's pose counts as determined by the turns of the sensor:
 noise of a degree over turns of a radian."""
@@ -62,35 +60,18 @@ class MiddleWires:
     phantom_mm: FloatArray
 
 
-@dataclass(frozen=True)
-class NWireErrors:
-    """Distances of middle dots from where the outer dots say they are.
+def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[float, float]:
+    """Mean and standard deviation of the least `share` of the errors, mm, as PLUS reports them.
 
-    Attributes
-    ----------
-    frame, wire : ndarray of int, shape (n,)
-        The frame, and the number of the middle wire.
-    error_mm : ndarray, shape (n,)
+    Raises
+    ------
+    InsufficientDataError
+        If there are none.
     """
-
-    frame: IntArray
-    wire: IntArray
-    error_mm: FloatArray
-
-    def trimmed(self, share: float = _PLUS_SHARE) -> tuple[float, float]:
-        """Mean and standard deviation of the least errors, mm.
-
-        PLUS reports those of the least 95 per cent; with a share of one they are those of all.
-
-        Raises
-        ------
-        InsufficientDataError
-            If there are none.
-        """
-        kept = np.sort(self.error_mm)[: round(share * len(self.error_mm))]
-        if kept.size == 0:
-            raise InsufficientDataError("expected an N with all three dots, got none")
-        return float(kept.mean()), float(kept.std())
+    kept = np.sort(errors_mm)[: round(share * len(errors_mm))]
+    if kept.size == 0:
+        raise InsufficientDataError("expected an N with all three dots, got none")
+    return float(kept.mean()), float(kept.std())
 
 
 def middle_wires(points: ImagePoints, phantom: WirePhantom) -> MiddleWires:
@@ -123,9 +104,9 @@ def nwire_errors_mm(
     points: ImagePoints,
     phantom: WirePhantom,
     sensor_from_pixels: FloatArray,
-    world_from_phantom: RigidTransform | None = None,
-) -> NWireErrors:
-    """How far middle dots are from where the outer dots say they are: PLUS's 3-D reprojection error.
+    world_from_phantom: RigidTransform,
+) -> FloatArray:
+    """Distances of middle dots from where the outer dots say they are: PLUS's 3-D reprojection error.
 
     Parameters
     ----------
@@ -133,20 +114,21 @@ def nwire_errors_mm(
         With the wire of each; all N whose three dots are there count.
     sensor_from_pixels : ndarray, shape (4, 4)
         Affine: PLUS's ``ImageToProbe``, `Calibration.pixel_matrix`, or `pixel_matrix` of a chain.
-    world_from_phantom : RigidTransform, optional
-        By default the phantom's own.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the order of `middle_wires`.
 
     Raises
     ------
     InvalidInputError
-        If neither says where the phantom is, or the points have no wires.
+        If the points have no wires.
     """
-    pose = _registered(phantom, world_from_phantom)
     middle = middle_wires(points, phantom)
     seen = middle.points.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
-    expected = (middle.points.world_from_sensor.inv() * pose).apply(middle.phantom_mm)
-    wire = _wires(middle.points, phantom)
-    return NWireErrors(middle.points.frame, wire, np.linalg.norm(seen - expected, axis=1))
+    expected = (middle.points.world_from_sensor.inv() * world_from_phantom).apply(middle.phantom_mm)
+    return np.asarray(np.linalg.norm(seen - expected, axis=1))
 
 
 def pixel_matrix(chain: Chain) -> FloatArray:
@@ -156,11 +138,9 @@ def pixel_matrix(chain: Chain) -> FloatArray:
 
 
 def start_from_nwires(
-    points: ImagePoints, phantom: WirePhantom, pixel_mm: npt.ArrayLike | None = None, by: By = "middle"
+    points: ImagePoints, phantom: WirePhantom, pixel_mm: npt.ArrayLike | None = None
 ) -> Chain:
-    """Calibrate in closed form, by robust linear least squares for the image's origin and axes.
-
-    The axes come out free of the constraint that they be square; the solution is the nearest that are.
+    """Calibrate in closed form: least squares of the errors of `nwire_errors_mm`, [1]_ (see `wire_start`).
 
     Parameters
     ----------
@@ -169,9 +149,6 @@ def start_from_nwires(
     pixel_mm : array_like, shape (2,), optional
         Rough distance between columns and between rows, mm; needed only where the phantom's own pose is not
         known. That is then found first, from the images' places among the wires.
-    by : {"middle", "all"}
-        What is least: the errors of `nwire_errors_mm`, [1]_, or the distances of all dots from their wires,
-        [2]_, for which frames need not show all wires of an N.
 
     Raises
     ------
@@ -183,14 +160,18 @@ def start_from_nwires(
     References
     ----------
     .. [1] R. M. Comeau et al., 1998, see this module.
-    .. [2] G. Carbajal et al., 2013, see this module.
     """
-    _wires(points, phantom)
     pose = phantom.world_from_phantom
     if pose is None:
         pose = _phantom_pose(points, phantom, pixel_mm)
-    equations = _middle_equations if by == "middle" else _wire_equations
-    return _chain(_robust(*equations(points, phantom, pose)), pose.inv())
+    middle = middle_wires(points, phantom)
+    if len(middle.points) < _FEWEST_POINTS:
+        raise InsufficientDataError(
+            f"expected at least {_FEWEST_POINTS} middle dots of N to start from, got {len(middle.points)}"
+        )
+    equations = np.broadcast_to(np.eye(3), (len(middle.points), 3, 3)), middle.phantom_mm
+    weights = partial(cauchy_weights, limit=_FAR)
+    return wire_start(middle.points, equations, pose.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
 
 
 def label_and_start(
@@ -232,71 +213,12 @@ def _wires(points: ImagePoints, phantom: WirePhantom) -> IntArray:
     return points.wire
 
 
-def _registered(phantom: WirePhantom, world_from_phantom: RigidTransform | None) -> RigidTransform:
-    pose = phantom.world_from_phantom if world_from_phantom is None else world_from_phantom
-    if pose is None:
-        raise InvalidInputError("expected where the phantom is in the world, got none")
-    return pose
-
-
 def _together(frame: IntArray, wire: IntArray, shape: tuple[int, ...]) -> list[IntArray]:
     """Of the frames that show all wires of a shape, the numbers of the points, one array for each wire."""
     numbers = [np.flatnonzero(wire == k) for k in shape]
     first = [dict(zip(frame[n].tolist(), n.tolist(), strict=True)) for n in numbers]
     common = sorted(set.intersection(*(set(found) for found in first)))
     return [np.array([found[f] for f in common], dtype=np.int64) for found in first]
-
-
-def _middle_equations(
-    points: ImagePoints, phantom: WirePhantom, pose: RigidTransform
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where middle dots are, in the sensor's frame: rows, shape (n, 3, 3), positions, and pixels."""
-    middle = middle_wires(points, phantom)
-    expected = (middle.points.world_from_sensor.inv() * pose).apply(middle.phantom_mm)
-    return np.tile(np.eye(3), (len(expected), 1, 1)), expected, middle.points.pixels
-
-
-def _wire_equations(
-    points: ImagePoints, phantom: WirePhantom, pose: RigidTransform
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Two directions square to each dot's wire, in its sensor frame: rows (n, 2, 3), places, pixels."""
-    wire = _wires(points, phantom)
-    phantom_from_sensor = pose.inv() * points.world_from_sensor
-    rows = phantom.normals[wire]
-    offsets = np.einsum("nri,ni->nr", rows, phantom.points_mm[wire] - phantom_from_sensor.translation)
-    return rows @ phantom_from_sensor.rotation.as_matrix(), offsets, points.pixels
-
-
-def _robust(rows: FloatArray, wanted: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Origin of the image and its axes per pixel, as rows, shape (3, 3).
-
-    Points far off pull little (reweighted least squares with Cauchy's weights).
-    """
-    if len(pixels) < _FEWEST_POINTS:
-        raise InsufficientDataError(
-            f"expected at least {_FEWEST_POINTS} dots to start from, got {len(pixels)}"
-        )
-    centre, spread = pixels.mean(axis=0), float(pixels.std()) or 1.0
-    lifted = np.column_stack([np.ones(len(pixels)), (pixels - centre) / spread])
-    matrix = np.einsum("nk,nri->nrki", lifted, rows).reshape(*wanted.shape, 9)
-    weights = np.ones((len(pixels), 1))
-    for _ in range(_REWEIGHTINGS):
-        weighted = (weights[..., None] * matrix).reshape(-1, 9)
-        found, _, rank, _ = np.linalg.lstsq(weighted, (weights * wanted).ravel(), rcond=_LEAST_SINGULAR)
-        if rank < matrix.shape[2]:
-            raise InsufficientDataError(
-                "the dots do not determine where the image is: too few wires or poses"
-            )
-        misfit = np.linalg.norm(matrix @ found - wanted, axis=1, keepdims=True)
-        weights = 1.0 / np.sqrt(1.0 + (misfit / (_FAR * np.median(misfit) + 1e-9)) ** 2)
-    axes = found.reshape(3, 3)[1:] / spread
-    return np.vstack([found[:3] - centre @ axes, axes])
-
-
-def _chain(affine: FloatArray, target_from_world: RigidTransform) -> Chain:
-    lengths = np.linalg.norm(affine[1:], axis=1)
-    turn = Rotation.from_matrix(nearest_rotation((affine[1:] / lengths[:, None]).T))
-    return Chain(lengths, RigidTransform.from_components(affine[0], turn), target_from_world)
 
 
 def _phantom_pose(

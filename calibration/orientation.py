@@ -14,10 +14,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints
+from calibration.chain import ANGLES, ChainSolution, ImagePoints
 from calibration.identifiability import require_adequate
-from calibration.plane import ANGLES, OUTLIER_SIGMA, LineDirections, settled_angles, solve, some
-from calibration.solution import Solution
+from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, LineDirections, settled_angles, solve_chain
 from calibration.starts import hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -27,13 +26,13 @@ Viewed = Literal["above", "below"]
 FEWEST_LINES = 6
 
 MIRROR_LIMIT = 0.2
-"""Mean vertical part of the beam direction below which gravity cannot tell the image from its mirror: with
-the beam within 12 degrees of level on average, hand and floor may be tilted as much."""
+"""Mean vertical component of the beam direction below which gravity cannot tell the image from its mirror:
+below 12 degrees from level, on average, the hand and the floor may be tilted as much."""
 
 _CERTAIN_RAD = np.deg2rad(5.0)
 
 STEEPEST_PLANE = np.deg2rad(45.0)
-"""A plane steeper than this is not a floor: the sensor's world has no z axis up, or the lines are not its."""
+"""A plane steeper than this is not a floor: the world's z axis is not up, or the lines are others."""
 
 
 def calibrate_orientation(
@@ -44,8 +43,8 @@ def calibrate_orientation(
     level: bool = False,
     viewed_from: Viewed = "above",
     outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
-    """Find ``sensor_from_image`` of a sensor that knows its orientation only.
+) -> ChainSolution:
+    """Calibrate an orientation sensor: find the rotation ``sensor_from_image`` from lines of a plane.
 
     Parameters
     ----------
@@ -53,8 +52,7 @@ def calibrate_orientation(
         Columns and rows from one point of the plane's line to another.
     frame : ndarray of int, shape (m,)
     world_from_sensor : Rotation, length m
-        With the world's z axis up. Its heading may be wrong where the plane is level: only the vertical
-        counts then.
+        With the world's z axis up. If the plane is level, the heading may be wrong.
     pixel_mm : ndarray, shape (2,)
         Column pitch and row spacing; only their ratio matters.
     level : bool
@@ -77,13 +75,13 @@ def calibrate_orientation(
     normals = hemisphere()
     normals = normals[:1] if level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
     lines = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
-    start = settled_angles(some(lines), size[0], normals, level=level)
-    best = require_adequate(solve(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
+    start = settled_angles(lines.of_some_frames(SOME_FRAMES), size[0], normals, level=level)
+    best = require_adequate(solve_chain(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
     _require_floor(best)
     return upright(best, viewed_from)
 
 
-def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
+def upright(solution: ChainSolution, viewed_from: Viewed = "above") -> ChainSolution:
     """Of a solution and its in-plane mirror, choose the one whose beams point down (up, if from below).
 
     Raises
@@ -91,7 +89,7 @@ def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
     InsufficientDataError
         If the beams are level on average.
     """
-    used = solution.points[solution.used].world_from_sensor.rotation
+    used = solution.points_used.world_from_sensor.rotation
     beams = (used * solution.chain.sensor_from_image.rotation).as_matrix()[:, :, 1]
     down = -float(beams[:, 2].mean())
     if abs(down) < MIRROR_LIMIT:
@@ -107,8 +105,8 @@ def upright(solution: Solution, viewed_from: Viewed = "above") -> Solution:
     return replace(solution, chain=chain, residuals=-solution.residuals)
 
 
-def _require_floor(solution: Solution) -> None:
-    """Refuse a plane that is certainly not a floor; one that is not determined is for `adequacy` to name."""
+def _require_floor(solution: ChainSolution) -> None:
+    """Refuse a plane that is certainly not a floor; `judge` names what leaves one undetermined."""
     certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
     slope = float(np.arccos(min(abs(solution.chain.target_from_world.rotation.as_matrix()[2, 2]), 1.0)))
     if certain and slope > STEEPEST_PLANE:

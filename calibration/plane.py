@@ -1,4 +1,4 @@
-"""The plane module: the solver that all calibrations with a phantom share, and the one with a plane.
+"""Calibration with a plane, and the solver that all calibrations with a phantom share.
 
 References
 ----------
@@ -9,7 +9,6 @@ References
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
@@ -18,45 +17,61 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import (
+    ANGLES,
     CHAIN,
+    POSE,
     PROBE,
-    SCALES,
     Chain,
+    ChainSolution,
     ImagePoints,
     Phantom,
-    Seen,
+    SeenAs,
     as_directions,
+    free_jacobian,
     residuals_and_jacobian,
 )
 from calibration.identifiability import judge, require_adequate
-from calibration.solution import Solution
-from calibration.starts import Angles, angle_starts, distance_start, hemisphere, in_plane_mirror
+from calibration.starts import (
+    Angles,
+    angle_starts,
+    distance_start,
+    hemisphere,
+    in_plane_mirror,
+    rotation_to_z,
+)
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.leastsquares import Fit, clustered_covariance, correlated_lags, levenberg_marquardt
+from speckle3d.core.leastsquares import (
+    Fit,
+    clustered_covariance,
+    condition_number,
+    huber_weights,
+    levenberg_marquardt,
+    robust_sigma,
+)
 
-ANGLES = PROBE[5:]
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
 
-_SOME_FRAMES = 100
-"""Frames that choose among starting points, all of them refining the answer afterwards."""
+SOME_FRAMES = 100
+"""Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
 
 _PIXEL_MM = 0.15
-"""Of an image some hundred pixels high of tissue some centimetres deep, where nobody says."""
+"""Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
 OUTLIER_SIGMA = 4.0
 """Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals of
 one size one in 16,000; of dots, which are known less well out of the image than in it, one in a hundred."""
 
-MAD_TO_SIGMA = 1.4826
+_NEARLY_ABSOLUTE = 0.06745
+"""Limit of Huber's weights, a tenth of the median: nearly all residuals count by their absolute values."""
 _REWEIGHTINGS = 8
 _SAME = 0.02
-"""Two starts that settle at residuals so nearly the same have found the same; no more are tried."""
+"""Two starts that settle at residuals as close as this share have found the same; no more are tried."""
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
 _FREE_ROUNDS = 5
-"""After these, frames may be dropped but not taken back, so that the rounds end."""
+"""After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
 
@@ -68,7 +83,7 @@ class Plane:
     """A plane at z = 0 of its own frame: one equation for each point (TR 303, equation 8)."""
 
     determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
-    seen_as: Seen = "line"
+    seen_as: SeenAs = "line"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Height above the plane."""
@@ -92,7 +107,7 @@ class LineDirections:
 
     pixel_mm: FloatArray
     level: bool = False
-    seen_as: Seen = "direction"
+    seen_as: SeenAs = "direction"
 
     @property
     def determined(self) -> tuple[str, ...]:
@@ -107,13 +122,13 @@ class LineDirections:
         return rows, np.zeros((len(points), 1))
 
 
-def solve(
+def solve_chain(
     points: ImagePoints,
     phantom: Phantom,
     start: Chain,
     probe: tuple[str, ...] = PROBE,
     outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
+) -> ChainSolution:
     """Refine a chain until the phantom's residuals are least, leaving out frames that contradict the others.
 
     Parameters
@@ -135,60 +150,62 @@ def solve(
     free = (*probe, *phantom.determined)
     chain = _first_guess(points, phantom, start, free)
     residuals = _residuals(points, phantom, chain)
-    used = _frames_within(residuals, points.frame, outlier_sigma * robust_sigma(residuals))
+    used = _frames_within(residuals, points.frame, outlier_sigma * _sigma(residuals))
     for round_ in itertools.count():
         _require_majority(used, points)
         chain, fit, jacobian = _refined(points[used], phantom, chain, free)
         residuals = _residuals(points, phantom, chain)
-        sigma = robust_sigma(residuals[used])
+        sigma = _sigma(residuals[used])
         agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
         if round_ >= _FREE_ROUNDS:
             agreeing &= used
         if (agreeing == used).all():
             break
         used = agreeing
-    return Solution(
+    return ChainSolution(
         chain,
         phantom,
         free,
         fit,
-        _covariance(jacobian, fit.residuals, points.frame[used]),
+        clustered_covariance(jacobian, fit.residuals, points.frame[used]),
         points,
         used,
         residuals,
         sigma,
-        condition_number(points[used], phantom, chain, free),
+        condition_number(free_jacobian(points[used], phantom, chain, free)),
     )
 
 
-def _covariance(jacobian: FloatArray, residuals: FloatArray, frame: IntArray) -> FloatArray:
-    return clustered_covariance(jacobian, residuals, frame, correlated_lags(residuals, frame))
+def _sigma(residuals: FloatArray) -> float:
+    return robust_sigma(residuals, _SMALLEST_SIGMA)
 
 
-def robust_sigma(residuals: FloatArray) -> float:
-    """Standard deviation of Gaussian residuals of the same median size."""
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), _SMALLEST_SIGMA)
+def probe_parameters(
+    fit_pixels: bool, pixel_mm: FloatArray | None
+) -> tuple[tuple[str, ...], FloatArray | None]:
+    """Which of `PROBE` to estimate, and the pixel size to hold, if any.
 
-
-def condition_number(points: ImagePoints, phantom: Phantom, chain: Chain, free: Iterable[str]) -> float:
-    """Ratio of the Jacobian's extreme singular values, columns of unit norm (TR 303, section 4.2)."""
-    columns = [CHAIN.index(name) for name in free]
-    _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
-    matrix = jacobian.reshape(-1, len(CHAIN))[:, columns]
-    norms = np.linalg.norm(matrix, axis=0)
-    singular = np.linalg.svd(matrix / np.where(norms > 0, norms, 1.0), compute_uv=False)
-    return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
+    Raises
+    ------
+    InvalidInputError
+        If the pixel size is neither fitted nor given.
+    """
+    if fit_pixels:
+        return PROBE, None
+    if pixel_mm is None:
+        raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
+    return POSE, np.asarray(pixel_mm, dtype=float)
 
 
 def _first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
-    """Nearly least absolute residuals, by reweighting: wrong frames pull little."""
+    """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
     chain, before = start, np.inf
     for _ in range(_REWEIGHTINGS):
         size = np.abs(_residuals(points, phantom, chain))
         if size.mean() > _SETTLED * before:
             break
         before = size.mean()
-        weights = 1.0 / np.sqrt(np.maximum(size, 0.1 * np.median(size) + _SMALLEST_SIGMA))
+        weights = np.sqrt(huber_weights(size / _sigma(size), _NEARLY_ABSOLUTE))
         chain, _, _ = _refined(points, phantom, chain, free, weights, tolerance=1e-3)
     return chain
 
@@ -246,7 +263,7 @@ def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> Bool
 
 
 def _require_majority(used: BoolArray, points: ImagePoints) -> None:
-    frames, agreeing = len(np.unique(points.frame)), len(np.unique(points.frame[used]))
+    frames, agreeing = len(points.frames), len(points[used].frames)
     if 2 * agreeing <= frames:
         raise InsufficientDataError(
             f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the images "
@@ -260,7 +277,7 @@ def calibrate_plane(
     fit_pixels: bool = True,
     stages: Stages = "three",
     outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
+) -> ChainSolution:
     """Calibrate a 6-DOF sensor from lines of a plane: the floor of a water bath, or the Cambridge phantom.
 
     Parameters
@@ -285,28 +302,23 @@ def calibrate_plane(
         raise InsufficientDataError(
             f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
         )
-    if not fit_pixels and pixel_mm is None:
-        raise InvalidInputError(
-            "expected pixel_mm, the scanner's pixel size, where it is not fitted, got none"
-        )
-    held = None if fit_pixels else np.asarray(pixel_mm, dtype=float)
-    probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
+    probe, held = probe_parameters(fit_pixels, pixel_mm)
     start = _three_stages(lines, held) if stages == "three" else _one_stage(lines, held, probe)
-    solution = solve(lines, Plane(), start, probe, outlier_sigma)
+    solution = solve_chain(lines, Plane(), start, probe, outlier_sigma)
     if fit_pixels and judge(solution).refused:
         size = np.full(2, _PIXEL_MM) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
         solution = _from_plausible_pixels(lines, size, outlier_sigma)
     return facing_up(require_adequate(solution))
 
 
-def _from_plausible_pixels(lines: ImagePoints, pixel_mm: FloatArray, outlier_sigma: float) -> Solution:
-    """Try once more, pixels held at first: free ones may shrink to nothing where the motion is poor.
+def _from_plausible_pixels(lines: ImagePoints, pixel_mm: FloatArray, outlier_sigma: float) -> ChainSolution:
+    """Solve again with the pixels held at first: free ones may shrink to nothing where the motion is poor.
 
-    If they do so again, the solution with held pixels is returned as one with free ones, to be judged by.
+    If they shrink again, the solution with held pixels is returned as if they were free, for `judge`.
     """
     start = _three_stages(lines, pixel_mm)
-    held = solve(lines, Plane(), start, PROBE[len(SCALES) :], outlier_sigma)
-    again = solve(lines, Plane(), held.chain, PROBE, outlier_sigma)
+    held = solve_chain(lines, Plane(), start, POSE, outlier_sigma)
+    again = solve_chain(lines, Plane(), held.chain, PROBE, outlier_sigma)
     if not judge(again).refused:
         return again
     shown = replace(held, free=again.free, fit=again.fit)
@@ -314,29 +326,25 @@ def _from_plausible_pixels(lines: ImagePoints, pixel_mm: FloatArray, outlier_sig
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
-    """Angles from some directions; then distances; the third stage, refining all, is the caller's."""
-    chain = settled_angles(_directions(lines), _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
+    """The first two stages: angles from some directions, then distances. The caller refines all together."""
+    directions = as_directions(lines.of_some_frames(SOME_FRAMES))
+    chain = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
     normal = chain.target_from_world.rotation.as_matrix()[2]
     seen = float(chain.pixel_mm[0] / chain.pixel_mm[1])
     return _with_distances(lines, Angles(chain.sensor_from_image.rotation, normal, seen), pixel_mm)
 
 
 def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
-    """The best of all-at-once solutions of some lines, from several mountings that are not refined first."""
-    directions, few = _directions(lines), some(lines)
-    starts = angle_starts(
-        directions.pixels, directions.world_from_sensor.rotation, _ratio(pixel_mm), hemisphere()
-    )
+    """The best solution for all parameters at once of some lines, from several mountings."""
+    few = lines.of_some_frames(SOME_FRAMES)
+    directions = as_directions(few)
+    turns = directions.world_from_sensor.rotation
+    starts = angle_starts(directions.pixels, turns, _ratio(pixel_mm), hemisphere())
     settled = [
-        solve(few, Plane(), _with_distances(few, start, pixel_mm), probe, outlier_sigma=np.inf)
+        solve_chain(few, Plane(), _with_distances(few, start, pixel_mm), probe, outlier_sigma=np.inf)
         for start in starts
     ]
     return min(settled, key=lambda solution: solution.sigma).chain
-
-
-def _directions(lines: ImagePoints) -> ImagePoints:
-    """From one end to the other of some of the lines."""
-    return as_directions(some(lines))
 
 
 def _ratio(pixel_mm: FloatArray | None) -> float:
@@ -344,42 +352,31 @@ def _ratio(pixel_mm: FloatArray | None) -> float:
 
 
 def _with_distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> Chain:
-    """Second stage, for the image and its in-plane mirror: distances tell them apart."""
+    """Second stage, for the image and its in-plane mirror, which distances tell apart."""
     mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
     found = [distance_start(lines, either, pixel_mm) for either in (angles, mirror)]
     return min(found, key=lambda pair: pair[1])[0]
 
 
-def some(points: ImagePoints) -> ImagePoints:
-    """Points of frames from all over the recording, enough to choose among starting points."""
-    frames = np.unique(points.frame)
-    picked = frames[np.unique(np.linspace(0, len(frames) - 1, _SOME_FRAMES).astype(int))]
-    return points[np.isin(points.frame, picked)]
-
-
 def settled_angles(
     lines: ImagePoints, ratio: float, normals: FloatArray, fit_ratio: bool = False, level: bool = False
 ) -> Chain:
-    """First stage: the angles that make line directions lie in the plane, outliers pulling little.
+    """First stage: find the angles that make line directions lie in the plane, robustly.
 
     Parameters
     ----------
     lines : ImagePoints
-        Their pixels are directions, their poses' translations without effect.
+        With directions for pixels (`as_directions`).
     """
-    turns = lines.world_from_sensor.rotation
-    points = replace(lines, world_from_sensor=RigidTransform.from_rotation(turns))
     size = np.array([ratio, 1.0])
     phantom = LineDirections(size, level)
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
     best, least = None, np.inf
-    for start in angle_starts(points.pixels, turns, ratio, normals):
-        upright = (
-            Rotation.identity() if level else Rotation.align_vectors([[0.0, 0.0, 1.0]], [start.normal])[0]
-        )
+    for start in angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals):
+        upright = Rotation.identity() if level else rotation_to_z(start.normal)
         chain = Chain(size, *(RigidTransform.from_rotation(r) for r in (start.sensor_from_image, upright)))
-        chain = _first_guess(points, phantom, chain, free)
-        sigma = robust_sigma(_residuals(points, phantom, chain))
+        chain = _first_guess(lines, phantom, chain, free)
+        sigma = _sigma(_residuals(lines, phantom, chain))
         agreed = abs(sigma - least) < _SAME * least
         if sigma < least:
             best, least = chain, sigma
@@ -390,12 +387,10 @@ def settled_angles(
     return best
 
 
-def facing_up(solution: Solution) -> Solution:
+def facing_up(solution: ChainSolution) -> ChainSolution:
     """The same solution with the plane's normal on the probe's side: heights of images are positive."""
     target = solution.chain.target_from_world
-    heights = (target * solution.points.world_from_sensor * solution.chain.sensor_from_image).translation[
-        :, 2
-    ]
+    heights = solution.chain.target_from_image(solution.points).translation[:, 2]
     if np.median(heights) >= 0:
         return solution
     over = RigidTransform.from_rotation(Rotation.from_euler("x", np.pi))

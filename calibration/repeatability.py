@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.chain import Chain, ImagePoints, as_directions, residuals_and_jacobian
-from calibration.plane import solve
-from calibration.solution import Solution
+from calibration.chain import Chain, ChainSolution, ImagePoints, as_directions, residuals_and_jacobian
+from calibration.plane import solve_chain
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -117,10 +116,11 @@ class Validation:
         return float(np.sqrt(np.mean(self.residuals**2)))
 
 
-def validate(solution: Solution, points: ImagePoints) -> Validation:
+def validate(solution: ChainSolution, points: ImagePoints) -> Validation:
     """Hold a calibration and see how well it explains another recording.
 
-    A plane is found anew, for it may be another, unless it is level; wires are held where they were.
+    The plane's position is estimated anew, for it may be another plane, unless it is level; wires are held
+    where they were.
 
     Parameters
     ----------
@@ -133,8 +133,8 @@ def validate(solution: Solution, points: ImagePoints) -> Validation:
         If the recording is too short to find the plane in.
     """
     chain, phantom = solution.chain, solution.phantom
-    points = as_directions(points) if phantom.seen_as == "direction" else points
+    points = as_directions(points) if solution.angular else points
     if phantom.seen_as != "dot" and phantom.determined:
-        found = solve(points, phantom, chain, probe=(), outlier_sigma=np.inf)
+        found = solve_chain(points, phantom, chain, probe=(), outlier_sigma=np.inf)
         return Validation(found.chain, found.residuals)
     return Validation(chain, residuals_and_jacobian(chain.parameters(), points, phantom)[0])

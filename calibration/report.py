@@ -1,4 +1,4 @@
-"""A calibration's report: a table for people, the same for programs, and one page of pictures."""
+"""A calibration as it is saved, and its report: a table for people, one for programs, a page of pictures."""
 
 from __future__ import annotations
 
@@ -13,13 +13,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.solution import Solution
+from calibration.chain import SCALES, ChainSolution, free_jacobian
+from calibration.identifiability import judge
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.calibration import Calibration, readable
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
 from speckle3d.core.geometry import roll_yaw_tilt
+from speckle3d.core.leastsquares import clustered_covariance
+from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
-"""Of Okabe and Ito's palette, told apart with any colour vision."""
+"""Colours of Okabe and Ito's palette, distinguishable with any colour vision."""
+
+IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
+"""Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
 _LONGEST_REASONS = 6
 _MOST_NAMED = 20
@@ -43,6 +49,64 @@ class Shot:
     marks_px: FloatArray
     as_line: bool
     note: str = ""
+
+
+def as_calibration(
+    solution: ChainSolution, method: str, frames: FramesUsed, time_offset_s: float | None = None
+) -> Calibration:
+    """Bring a solution into the form that is saved, with standard errors of the published parameters.
+
+    Parameters
+    ----------
+    frames : FramesUsed
+        With the frames in which nothing was found or that no sensor reading covers. Those that the solver
+        left out are added.
+    """
+    angular = solution.angular
+    chain, pose = solution.chain, IMAGE_POSE[:3] if angular else IMAGE_POSE
+    return Calibration(
+        method=method,
+        sensor="orientation" if angular else "tracker",
+        rotation=chain.sensor_from_image.rotation,
+        translation_mm=None if angular else np.asarray(chain.sensor_from_image.translation),
+        pixel_mm=None if angular else chain.pixel_mm,
+        covariance=solution.image_covariance(pose),
+        parameters=_parameters(solution),
+        rms=solution.rms,
+        rms_unit="rad" if angular else "mm",
+        condition_number=solution.condition_number,
+        frames=_frames_used(solution, frames),
+        time_offset_s=time_offset_s,
+        verdict=judge(solution).verdict,
+    )
+
+
+def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
+    """The parameters estimated, in the sensor's and the world's own frames."""
+    values, used = solution.chain.parameters(), solution.points_used
+    matrix = free_jacobian(used, solution.phantom, solution.chain, solution.free)
+    covariance = clustered_covariance(matrix, solution.residuals[solution.used].ravel(), used.frame)
+    errors = np.sqrt(np.diag(covariance))
+    return tuple(
+        Parameter(name, float(values[column]), float(error), _unit(name))
+        for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)
+    )
+
+
+def _unit(name: str) -> str:
+    if name in SCALES:
+        return "mm/pixel"
+    return "mm" if name[0] in "xyz" else "rad"
+
+
+def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
+    """Add the frames that contradict the others, with their residuals."""
+    dropped = dict(frames.dropped)
+    for number in np.unique(solution.points.frame[~solution.used]):
+        worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
+        size = f"{np.rad2deg(worst):.1f} degrees" if solution.angular else f"{worst:.1f} mm"
+        dropped[int(number)] = f"contradicts the other frames by {size}"
+    return FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), dropped)
 
 
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
@@ -74,10 +138,7 @@ def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
     """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
-    rows = rows_of(calibration)
-    width = max(len(description) for description, _, _ in rows)
-    lines = [f"{description.ljust(width)}  {value} {unit}".rstrip() for description, value, unit in rows]
-    lines += _left_out(calibration)
+    lines = text_rows(rows_of(calibration)).splitlines() + _left_out(calibration)
     if calibration.translation_mm is not None and calibration.pixel_mm is not None:
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
@@ -96,7 +157,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
 
 
 def _left_out(calibration: Calibration) -> list[str]:
-    """The frames that do not count, by number, with the whole reason."""
+    """The numbers of the frames left out, with the reason of each."""
     dropped = sorted(calibration.frames.dropped.items())
     if not dropped:
         return []
@@ -131,12 +192,12 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
     }
 
 
-def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
+def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
-    # Of an orientation sensor's pixels the ratio is known, which is what counts here.
+    # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
         _draw_shot(axes, shot, aspect)
@@ -168,7 +229,7 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
     axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
 
 
-def _draw_residuals(axes: Axes, solution: Solution) -> None:
+def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     values, unit = _shown(solution)
     used = solution.used
     axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
@@ -179,8 +240,8 @@ def _draw_residuals(axes: Axes, solution: Solution) -> None:
     _label(axes, "frame", f"residual / {unit}")
 
 
-def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
-    """A thick beam shows as a V."""
+def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
+    """Residuals against tilt, where a thick beam shows as a V."""
     values, unit = _shown(solution)
     turns = _turns_deg(solution)
     used = solution.used
@@ -188,21 +249,21 @@ def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
     _label(axes, "tilt / deg", f"residual / {unit}")
 
 
-def _draw_motion(axes: Axes, solution: Solution) -> None:
+def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
     _label(axes, "tilt / deg", "roll / deg")
 
 
-def _shown(solution: Solution) -> tuple[FloatArray, str]:
-    """The worst residual of each point, with its sign."""
+def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:
+    """The largest residual of each point, with its sign, and its unit."""
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
-    return (np.rad2deg(values), "deg") if solution.phantom.seen_as == "direction" else (values, "mm")
+    return (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
 
 
-def _turns_deg(solution: Solution) -> FloatArray:
+def _turns_deg(solution: ChainSolution) -> FloatArray:
     """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
     turns = solution.chain.target_from_image(solution.points).rotation
     return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))

@@ -1,4 +1,4 @@
-"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes; solved by the plane module.
+"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes. The plane module solves for them.
 
 References
 ----------
@@ -15,14 +15,12 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import PROBE, SCALES, TARGET, Chain, ImagePoints, Phantom, Seen
+from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, Phantom, SeenAs
 from calibration.identifiability import require_adequate
-from calibration.plane import OUTLIER_SIGMA, solve, some
-from calibration.solution import Solution
-from calibration.starts import least_absolute, rotations_all_over
+from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
+from calibration.starts import rotations_all_over, wire_start
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
 Registration = Literal["held", "turned", "free"]
@@ -33,11 +31,11 @@ _STARTS = 6
 
 
 @dataclass(frozen=True)
-class Crossing:
+class CrossWire:
     """Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
 
     determined: tuple[str, ...] = TARGET[:3]
-    seen_as: Seen = "dot"
+    seen_as: SeenAs = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the crossing."""
@@ -53,27 +51,26 @@ class Wires:
     ----------
     geometry : WirePhantom
     determined : tuple of str
-        What of the phantom's place in the tracker's world is estimated; the rest is held.
+        Parameters of the phantom's place in the tracker's world that are estimated; the others are held.
     """
 
     geometry: WirePhantom
     determined: tuple[str, ...] = TARGET
-    seen_as: Seen = "dot"
+    seen_as: SeenAs = "dot"
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the wire, along two directions across it."""
         if points.wire is None:
             raise InvalidInputError("expected points with the wire each lies on, got points without")
-        rows = self.geometry.normals[points.wire]
-        return rows, np.einsum("nri,ni->nr", rows, self.geometry.points_mm[points.wire])
+        return self.geometry.equations(points.wire)
 
 
-def calibrate_crossing(
+def calibrate_cross_wire(
     points: ImagePoints,
     pixel_mm: FloatArray | None = None,
     fit_pixels: bool = True,
     outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
+) -> ChainSolution:
     """Calibrate a 6-DOF sensor from images of two crossing wires, or of a bead.
 
     Parameters
@@ -90,8 +87,9 @@ def calibrate_crossing(
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
-    start = _linear_start(points, Crossing(), Rotation.identity(), fitted=True)[0]
-    return _finished(points, Crossing(), start, pixel_mm, fit_pixels, outlier_sigma)
+    _require_frames(points)
+    start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
+    return _finished(points, CrossWire(), start, pixel_mm, fit_pixels, outlier_sigma)
 
 
 def calibrate_wires(
@@ -101,7 +99,7 @@ def calibrate_wires(
     fit_pixels: bool = True,
     registration: Registration = "turned",
     outlier_sigma: float = OUTLIER_SIGMA,
-) -> Solution:
+) -> ChainSolution:
     """Calibrate a 6-DOF sensor from dots on straight wires.
 
     Parameters
@@ -109,10 +107,10 @@ def calibrate_wires(
     points : ImagePoints
         With the wire each lies on.
     geometry : WirePhantom
-        Where it does not say where it is in the tracker's world, that is estimated, too: fourteen parameters
-        in all, as for the three-wire phantom.
+        Without its place in the tracker's world, that is estimated, too: fourteen parameters in all, as for
+        the three-wire phantom.
     registration : {"held", "turned", "free"}
-        What to do with a place that `geometry` says: hold it; hold the wires' middle and estimate how the
+        What to do with the place stated in `geometry`: hold it; hold the wires' middle and estimate how the
         phantom is turned about it; or estimate all. Stylus registrations find a place to half a millimetre,
         and, over 50 mm, a turn only to a degree.
 
@@ -125,19 +123,20 @@ def calibrate_wires(
         raise InvalidInputError(
             f"registration: expected one of {', '.join(_ESTIMATED)}, got {registration!r}"
         )
+    _require_frames(points)
     centred = _about_middle(geometry)
     place = centred.world_from_phantom
     if place is not None:
         phantom = Wires(centred, _ESTIMATED[registration])
-        start = _linear_start(points, phantom, place.inv(), fitted=False)[0]
+        start, _ = wire_start(points, phantom.vanishing(points), place.inv())
     else:
         phantom = Wires(centred)
-        start = _anywhere(some(points), phantom, pixel_mm, fit_pixels)
+        start = _anywhere(points.of_some_frames(SOME_FRAMES), phantom, pixel_mm, fit_pixels)
     return _finished(points, phantom, start, pixel_mm, fit_pixels, outlier_sigma)
 
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
-    """The same wires in a frame whose origin is the middle of them, about which the phantom may be turned."""
+    """The same wires in a frame whose origin is their middle, about which the phantom may be turned."""
     ends = geometry.points_mm if geometry.ends_mm is None else geometry.ends_mm.reshape(-1, 3)
     middle = ends.mean(axis=0)
     place = geometry.world_from_phantom
@@ -147,11 +146,12 @@ def _about_middle(geometry: WirePhantom) -> WirePhantom:
 
 
 def _anywhere(few: ImagePoints, phantom: Wires, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
-    """Best start with the phantom turned every way there is."""
-    tried = [_linear_start(few, phantom, turn, fitted=True) for turn in rotations_all_over()]
-    best = sorted(tried, key=lambda one: one[1])[:_STARTS]
-    probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
-    settled = [solve(few, phantom, _sized(chain, pixel_mm, fit_pixels), probe, np.inf) for chain, _ in best]
+    """Best start among orientations of the phantom spread over all rotations."""
+    probe, held = probe_parameters(fit_pixels, pixel_mm)
+    equations = phantom.vanishing(few)
+    tried = [wire_start(few, equations, turn) for turn in rotations_all_over()]
+    best = sorted(tried, key=lambda one: float(np.median(np.abs(one[1].residuals))))[:_STARTS]
+    settled = [solve_chain(few, phantom, _sized(chain, held), probe, np.inf) for chain, _ in best]
     return min(settled, key=lambda solution: solution.sigma).chain
 
 
@@ -162,54 +162,17 @@ def _finished(
     pixel_mm: FloatArray | None,
     fit_pixels: bool,
     outlier_sigma: float,
-) -> Solution:
-    frames = len(np.unique(points.frame))
-    if frames < _FEWEST_FRAMES:
-        raise InsufficientDataError(f"expected the wires in at least {_FEWEST_FRAMES} frames, got {frames}")
-    probe = PROBE if fit_pixels else PROBE[len(SCALES) :]
-    return require_adequate(solve(points, phantom, _sized(start, pixel_mm, fit_pixels), probe, outlier_sigma))
+) -> ChainSolution:
+    probe, held = probe_parameters(fit_pixels, pixel_mm)
+    return require_adequate(solve_chain(points, phantom, _sized(start, held), probe, outlier_sigma))
 
 
-def _sized(start: Chain, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
-    if fit_pixels:
-        return start
-    if pixel_mm is None:
-        raise InvalidInputError(
-            "expected pixel_mm, the scanner's pixel size, where it is not fitted, got none"
+def _sized(start: Chain, pixel_mm: FloatArray | None) -> Chain:
+    return start if pixel_mm is None else replace(start, pixel_mm=pixel_mm)
+
+
+def _require_frames(points: ImagePoints) -> None:
+    if len(points.frames) < _FEWEST_FRAMES:
+        raise InsufficientDataError(
+            f"expected the wires in at least {_FEWEST_FRAMES} frames, got {len(points.frames)}"
         )
-    return Chain(np.asarray(pixel_mm, dtype=float), start.sensor_from_image, start.target_from_world)
-
-
-def _linear_start(
-    points: ImagePoints, phantom: Phantom, place: Rotation | RigidTransform, fitted: bool
-) -> tuple[Chain, float]:
-    """Chain whose image axes need not be square, by linear least absolute values, then squared.
-
-    Parameters
-    ----------
-    place : Rotation or RigidTransform
-        ``target_from_world``; of a rotation the translation is found too.
-
-    Returns
-    -------
-    chain : Chain
-    cost : float
-        Median absolute residual before squaring, mm.
-    """
-    known = place if isinstance(place, RigidTransform) else RigidTransform.from_rotation(place)
-    rows, offsets = phantom.vanishing(points)
-    in_world = rows @ known.rotation.as_matrix()
-    in_sensor = in_world @ points.turns
-    pixels = np.column_stack([points.pixels, np.ones(len(points))])
-    matrix = np.einsum("nri,na->nrai", in_sensor, pixels).reshape(-1, 9)
-    if fitted:
-        matrix = np.concatenate([matrix, rows.reshape(-1, 3)], axis=1)
-    at_sensor = known.apply(points.shifts_mm)
-    wanted = (offsets - np.einsum("nri,ni->nr", rows, at_sensor)).ravel()
-    found, misfit = least_absolute(matrix, wanted)
-    columns, rows_axis, origin = found[:9].reshape(3, 3)
-    size = np.array([np.linalg.norm(columns), np.linalg.norm(rows_axis)])
-    turn = nearest_rotation(np.column_stack([columns, rows_axis]) / size)
-    probe = RigidTransform.from_components(origin, Rotation.from_matrix(turn))
-    shift = RigidTransform.from_translation(found[9:12]) if fitted else RigidTransform.identity()
-    return Chain(size, probe, shift * known), float(np.median(np.abs(misfit)))

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from calibration.solution import Solution
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -61,7 +60,7 @@ def delays_around(around_s: float, search_s: float, step_s: float) -> FloatArray
 
 
 def estimate_offset(
-    calibrate: Callable[[float], Solution], around_s: float = 0.0, search_s: float = 0.4
+    calibrate: Callable[[float], ChainSolution], around_s: float = 0.0, search_s: float = 0.4
 ) -> ClockOffset:
     """Find the clock offset with which a calibration explains its lines best.
 
@@ -99,7 +98,7 @@ def estimate_offset(
     return ClockOffset(seconds, curvature_error(cost, seconds, _STEP_S, count))
 
 
-def _sigma(calibrate: Callable[[float], Solution], offset: float) -> float:
+def _sigma(calibrate: Callable[[float], ChainSolution], offset: float) -> float:
     try:
         return calibrate(offset).sigma
     except InsufficientDataError:

@@ -1,4 +1,4 @@
-"""The first strong echo in each column: a steep rise of the smoothed levels, then its front or its peak."""
+"""First strong echo in each column: found by the slope of smoothed grey levels, placed at front or peak."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.detection.columns import Columns
+from calibration.detection.region import Columns
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.lines import echo_fronts, echo_levels, filter_columns, first_edges
 
 Place = Literal["front", "slope", "peak"]
 
 _FINE = 0.25
-"""Smoothing with which an echo is placed, as a part of that with which it is found: enough against noise, and
-short against the rise of an echo."""
+"""Smoothing for placing an echo, as a share of that for finding it: enough against noise, little against
+the rise of an echo."""
 _REACH = 3.5
 """Length of the filters' sides, standard deviations."""
 _AHEAD = 2.0
-"""How far below its edge an echo is brightest at the most, standard deviations: one and a half its length."""
+"""Farthest that an echo is brightest below its edge, standard deviations; its length is 1.5 of them."""
 _LEAST = 0.3
-"""Slope that is looked at, as a part of the steepest in the middle one of all columns."""
+"""Least slope of an edge, as a share of the median of the columns' steepest slopes."""
 
 
 @dataclass(frozen=True)
 class Profiles:
-    """What columns of an image show along their depth.
+    """Smoothed grey levels and slopes along columns of an image.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Profiles:
     sigma: float
 
     def brightness(self) -> Float32Array:
-        """Level of the echo that begins at each steep place, above the image's middle level; 0 elsewhere."""
+        """Brightness of the echo that begins at each edge, above the image's median level; 0 elsewhere."""
         bright = np.empty_like(self.levels)
         least = _LEAST * typical(self.slope, self.columns)
         dark = float(np.median(self.levels[self.columns.inside]))
@@ -71,12 +71,12 @@ class Edges:
 
 
 def typical(score: Float32Array, columns: Columns) -> float:
-    """Largest score of the middle one of all columns."""
+    """Median of the columns' largest scores."""
     return float(np.median(score[columns.inside.any(axis=1)].max(axis=1)))
 
 
 def take_profiles(samples: Float32Array, columns: Columns, sigma: float) -> Profiles:
-    """Smooth columns by Gaussians, and differentiate in the same convolution; only the region counts.
+    """Smooth columns by Gaussians and differentiate them, within the region.
 
     Parameters
     ----------
@@ -100,12 +100,12 @@ def take_profiles(samples: Float32Array, columns: Columns, sigma: float) -> Prof
 
 
 def first_echoes(profiles: Profiles, score: Float32Array, threshold: float, place: Place) -> Edges:
-    """Find in each column the first steep place of more than some score, or else of the largest.
+    """Find in each column the first edge whose score exceeds a threshold, or else that of the largest score.
 
     Parameters
     ----------
     score : ndarray, shape (n, r)
-        What edges are judged by: their slope or their brightness.
+        Slope or brightness, by which edges are judged.
     place : str
         See `LineSettings`.
     """

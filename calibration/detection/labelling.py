@@ -1,9 +1,9 @@
-"""Which dot is which wire of an N-wire phantom.
+"""Assignment of dots to the wires of an N-wire phantom.
 
-First for every frame by itself: dots in a line are the wires of a layer, lines that are parallel at the right
-distances are layers, and the image must then lie among the wires so that all dots meet theirs. Once an image
-calibration is known, from other frames, it says where each wire is to be seen, and a dot found there counts
-even if others are missing.
+Each frame is first treated by itself: three dots in a line may be the wires of a layer, parallel lines at the
+right distances may be the layers, and the hypothesis counts whose dots best fit a pose of the image among the
+wires. A calibration from the frames that show all wires then predicts where each wire is seen in the others,
+and a dot found there counts even if dots of other wires are missing.
 
 References
 ----------
@@ -22,21 +22,21 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.chain import Chain, ImagePoints
 from calibration.detection.dots import Dots
-from calibration.wirefit import linear_fits, rigid_fits
+from calibration.starts import free_fits, rigid_fits
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.wires import WirePhantom
 
 _STEEPEST = 2.0
-"""How much longer than in the phantom a distance may be in the image: a plane 60 degrees from square."""
+"""Largest ratio of a distance in the image to that in the phantom: of an image 60 degrees from square."""
 _PARALLEL_COSINE = 0.99
 _MOST_HYPOTHESES = 4000
 _REFINED = 128
-"""Ringing under four wires of a phantom that looks the same from four sides makes half as many hypotheses."""
+"""Hypotheses refined; ringing under four wires of a phantom with a fourfold symmetry makes half as many."""
 _LIKE_MM = 0.1
-"""Hypotheses that fit as well as the best up to this are told apart by their dots' strength."""
+"""Of hypotheses whose misfit is within this of the best, the one with the strongest dots counts."""
 _LEAST_MM = 0.5
-"""Nearer to an outer dot a middle one is the same: dots are found that far apart and more."""
+"""A middle dot nearer to an outer one than this is the same dot: dots are found at least so far apart."""
 _BEYOND_MM = 5.0
 """How far beyond a wire's stated ends it may be seen: ends are where it is fastened, roughly."""
 
@@ -58,7 +58,7 @@ class LabelSettings(BaseModel):
 
 @dataclass(frozen=True)
 class LabelledDots:
-    """Dots and the wires they show.
+    """Dots with the wires they show.
 
     Attributes
     ----------
@@ -106,8 +106,8 @@ def label_dots(
     Returns
     -------
     LabelledDots
-        All wires of all N of each frame, or none of them. Where the phantom looks the same from two sides,
-        its first pattern is taken to be uppermost and its first wire on the side of the last column.
+        All wires of all N in each frame, or none. Where a phantom's symmetry leaves a choice, its first
+        pattern is taken to be uppermost and its first wire on the side of the last column.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def label_by_calibration(
     world_from_sensor: RigidTransform,
     settings: LabelSettings | None = None,
 ) -> LabelledDots:
-    """Assign to each wire the dot that is where a calibration says it is to be seen.
+    """Assign to each wire the dot nearest to where a calibration predicts it.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def label_by_calibration(
     Returns
     -------
     LabelledDots
-        As many wires of each frame as show.
+        The wires found in each frame.
     """
     s = settings or LabelSettings()
     image_from_phantom = (chain.target_from_world * world_from_sensor * chain.sensor_from_image).inv()
@@ -171,7 +171,7 @@ def label_by_calibration(
 
 @dataclass(frozen=True)
 class _Layer:
-    """An N: its three wires, where the middle one crosses the others, and where it is among its like."""
+    """A layer of wires, an N, and its place relative to the first layer."""
 
     wires: IntArray
     crossings_mm: FloatArray
@@ -214,14 +214,14 @@ def _label(
     if len(chosen) == 0:
         raise InsufficientDataError("no parallel lines of dots at the layers' distances")
     wires = np.concatenate([layer.wires for layer in layers])
-    loose = linear_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
+    loose = free_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
     chosen = chosen[np.argsort(loose)[:_REFINED]]
     fits = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
     best = float(fits.rms_mm.min())
     if best > s.residual_mm:
         raise InsufficientDataError("no dots fit the wires")
     like = np.flatnonzero(fits.rms_mm <= best + _LIKE_MM)
-    # Rounded, so that the usual way round decides where the same dots fit either way.
+    # Rounded, so that where the same dots fit either way round, the usual one is chosen.
     strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
     usual = [-_unusual(dots_mm[chosen[i]]) for i in like]
     return np.asarray(chosen[like[np.lexsort((usual, strength))[-1]]])
@@ -250,7 +250,7 @@ def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom, s: LabelS
 
 
 def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.NDArray[np.bool_]:
-    """Whether the middle wire, where it is seen, is between its ends."""
+    """Whether the middle wire is seen at a place between its ends."""
     if phantom.ends_mm is None:
         return np.ones(share.shape, dtype=bool)
     start, end = layer.crossings_mm
@@ -302,7 +302,7 @@ def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatA
 def _nearest(
     dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray, gate_mm: float
 ) -> list[tuple[int, int]]:
-    """Pairs of dot and wire, each once; a dot that is stronger may be farther."""
+    """Pairs of dot and wire, each in one pair at most; a stronger dot may be farther away."""
     apart = np.linalg.norm(dots_mm[:, None] - expected_mm[None], axis=2)
     worth = np.where(apart < gate_mm, score[:, None] * np.exp(-2.0 * (apart / gate_mm) ** 2), 0.0)
     pairs = []

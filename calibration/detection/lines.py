@@ -1,7 +1,7 @@
-"""The echo of a plane in an image: a straight line, found without help.
+"""Automatic detection of the straight line that a plane's echo makes in an image.
 
-Columns are looked down for the first strong edge from dark to light, and the line is the one most of these
-edges agree with. A frame in which too few agree has no line, and says why.
+Each column is searched downwards for the first strong edge from dark to light; the line is the one that most
+of these edges agree with. A frame in which too few agree is dropped, with the reason.
 """
 
 from __future__ import annotations
@@ -14,8 +14,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibration.detection.columns import DENSELY, Columns, lay_columns, without_blank_sides, without_standing
 from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
+from calibration.detection.region import (
+    DENSELY,
+    Columns,
+    checked_pixel,
+    lay_columns,
+    without_blank_sides,
+    without_standing,
+)
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import autocorrelation_time
@@ -23,16 +30,16 @@ from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import consensus_line
 
 _PARTS = (0.95, 0.85, 0.75, 0.65, 0.5)
-"""Brightness of an echo that counts when no threshold is given, as parts of the brightest one in the middle
-one of all columns: each is tried."""
+"""Least brightness of an echo when no threshold is given, as shares of the median of the columns' brightest
+echoes: each is tried."""
 _WEAKER = 0.75
-"""How bright a line must be to go before a brighter one beneath it: brighter than haze and side lobes. The
-floor's reverberations lie beneath it and are no brighter."""
+"""Least brightness, as a share of the brightest line's, of a line that is preferred for lying above it: haze
+and side lobes are fainter. The floor's reverberations lie beneath it and are no brighter."""
 _LEAST_SHARE = 0.25
-"""Part of the sampled columns that must agree however few the line could meet: two or three edges, which are
-noise, always agree with a line that cuts a corner of the region."""
+"""Share of all sampled columns that must agree, however few the line could meet: with a line that cuts a
+corner of the region, two or three noisy edges always agree."""
 _FINEST_ROWS = 0.1
-"""Scatter below which an edge is not placed: interpolation between rows is not better."""
+"""Least scatter of an edge's place: the precision of interpolation between rows."""
 
 
 class LineSettings(BaseModel):
@@ -52,18 +59,21 @@ class LineSettings(BaseModel):
     threshold: float | None = Field(
         None,
         gt=0,
-        description="Slope that makes an edge, grey levels per mm; by default echoes are judged by their "
-        "brightness instead, by several measures, and the first bright line is taken.",
+        description="Least slope of an edge, grey levels per mm; by default echoes are judged by their "
+        "brightness instead, against several thresholds, and the first bright line is taken.",
     )
     tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
     consensus: float = Field(
-        0.7, gt=0, le=1, description="Part that must agree of the columns whose region the line meets."
+        0.7,
+        gt=0,
+        le=1,
+        description="Share that must agree of the columns in which the line is inside the region.",
     )
     place: Place = Field(
         "peak",
         description="Where on an echo the line is put: where it has risen half way (front), where the "
         "smoothed image is steepest (slope; up to smoothing_mm above a thin echo), or where it is brightest "
-        "(peak; a beam met by a wall at an angle has its middle there, its nearer edge at the front).",
+        "(peak; of a thick beam that meets a wall at an angle, the middle; the front is its nearer edge).",
     )
 
 
@@ -81,11 +91,11 @@ class EchoLine:
         Column and row, fractional, of two points on the line: at the mean of the agreeing columns minus and
         plus their root mean square spread, where the errors of a fitted line are uncorrelated and equal.
     point_sd_mm : float
-        Standard error of each point's depth, neighbouring columns' likeness accounted for.
+        Standard error of each point's depth; residuals of neighbouring columns may be correlated.
     direction_sd_rad : float
         Standard error of the line's direction in the image plane.
     consensus, possible : int
-        Columns that agree, and sampled columns whose region the line meets.
+        Columns that agree, and sampled columns in which the line is inside the region.
     inlier_px : ndarray, shape (k, 2)
         Column and row of the edges that agree.
     """
@@ -153,7 +163,7 @@ def detect_line(
         raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
     if not np.isrealobj(image):
         raise InvalidInputError(f"image: expected real values, got {image.dtype}")
-    pixel = _checked_pixel(pixel_mm)
+    pixel = checked_pixel(pixel_mm)
     if region_px is None:
         dense = lay_columns(image.shape, DENSELY * s.columns, None)
         columns = without_blank_sides(dense, image).thinned(s.columns)
@@ -192,7 +202,7 @@ def detect_lines(
         raise InvalidInputError(
             f"frames: expected real values of shape (n, column, row), got {frames.dtype} of {frames.shape}"
         )
-    pixel = _checked_pixel(pixel_mm)
+    pixel = checked_pixel(pixel_mm)
     columns = lay_columns(frames.shape[1:], s.columns, region_px)
     if region_px is None and frames.shape[0] > 0:
         dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
@@ -215,13 +225,6 @@ def detect_lines(
         direction_sd_rad=np.array([line.direction_sd_rad for line in lines]),
         dropped=dropped,
     )
-
-
-def _checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
-    pixel = np.asarray(pixel_mm, dtype=float)
-    if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
-        raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
-    return pixel
 
 
 @dataclass(frozen=True)
@@ -266,7 +269,7 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
 
 
 def _distinct(echoes: list[Edges]) -> list[Edges]:
-    """Without those like the ones before them, as neighbouring thresholds mostly give."""
+    """Leave out edges equal to those before them: neighbouring thresholds mostly find the same."""
     kept = echoes[:1]
     for edges in echoes[1:]:
         if not np.array_equal(edges.row, kept[-1].row, equal_nan=True):
@@ -280,7 +283,7 @@ def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
 
 
 def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -> _Candidate:
-    """The uppermost of the lines nearly as strong as the strongest, as the most columns see it."""
+    """The uppermost of the lines nearly as strong as the strongest, as most columns see it."""
     least = _WEAKER * max(line.strength for line in lines)
     middle = float(columns.column.mean())
     depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
@@ -303,8 +306,8 @@ def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:
 
 
 def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoLine:
-    # Errors of a fit's level at the mean column and of its slope are uncorrelated. One spread to either side
-    # both count the same, so that their sum and their difference are uncorrelated, too.
+    # Errors of a fit's level at the mean column and of its slope are uncorrelated. At one standard deviation
+    # of the columns to either side both contribute equally, so that the two points' errors are uncorrelated.
     x, y = columns.column[line.agree].astype(float), line.edges.row[line.agree]
     spread = float(x.std())
     ends = x.mean() + spread * np.array([-1.0, 1.0])
@@ -322,7 +325,7 @@ def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoL
 
 
 def _level_sd(residual: FloatArray) -> float:
-    """Standard error of the mean of residuals (NaN where missing) that may resemble their neighbours."""
+    """Standard error of the mean of residuals (NaN where missing) that may be correlated with neighbours."""
     there = np.isfinite(residual)
     count = float(there.sum())
     energy = float(np.maximum(np.nansum(residual**2), count * _FINEST_ROWS**2))

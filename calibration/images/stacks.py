@@ -229,7 +229,7 @@ def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:
 
     across, down = by
     whole = image[: image.shape[0] // across * across, : image.shape[1] // down * down]
-    return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)  # type: ignore[no-untyped-call]
+    return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)
 
 
 def _weighted(images: Float32Array, weight: FloatArray) -> Float32Array:

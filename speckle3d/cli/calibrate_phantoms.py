@@ -30,7 +30,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 if TYPE_CHECKING:
     from calibration.chain import ImagePoints
     from calibration.detection.lines import LineSettings
-    from calibration.job import Job, Outcome, Recording, Seen
+    from calibration.job import JobSettings, Outcome, Recording, Seen
     from speckle3d.core.arrays import FloatArray
 
 TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
@@ -230,16 +230,18 @@ def _prepared(
     sensor: str,
     time_offset: str | None,
     outlier_sigma: float,
-) -> tuple[Recording, Job]:
-    from calibration.job import Job
+) -> tuple[Recording, JobSettings]:
+    from calibration.job import JobSettings
     from speckle3d.cli.recordings import open_recording
 
     recording = open_recording(images, poses, pixel_mm, sensor)
     if time_offset is None:
-        return recording, Job(False, outlier_sigma)
+        return recording, JobSettings(outlier_sigma=outlier_sigma)
     if time_offset == "estimate":
-        return recording, Job(True, outlier_sigma)
-    return replace(recording, time_offset_s=_seconds(time_offset)), Job(False, outlier_sigma, True)
+        return recording, JobSettings(outlier_sigma=outlier_sigma, estimate_offset=True)
+    return replace(recording, time_offset_s=_seconds(time_offset)), JobSettings(
+        outlier_sigma=outlier_sigma, offset_given=True
+    )
 
 
 def _seconds(text: str) -> float:
@@ -281,7 +283,6 @@ def find_lines(
 def _seen_wires(
     recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
 ) -> Seen:
-    from calibration.detection.wires import seen_crossings, seen_nwires
     from calibration.job import Seen
     from speckle3d.io.points import read_points
 
@@ -299,9 +300,9 @@ def _seen_wires(
     corners = _region(region)
     with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
         if config is None:
-            return seen_crossings(recording, corners, progress)
+            return Seen.crossings(recording, corners, progress)
         clip = config.clip.corners_px if corners is None and config.clip is not None else corners
-        return seen_nwires(recording, config.phantom, clip, progress)
+        return Seen.nwires(recording, config.phantom, clip, progress)
 
 
 def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
@@ -321,14 +322,14 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
 
 def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     """Report PLUS's 3-D error, if the phantom has N-shapes."""
-    from calibration.nwires import nwire_errors_mm, pixel_matrix
+    from calibration.nwires import nwire_errors_mm, pixel_matrix, trimmed_mean_mm
     from calibration.wires import Wires
 
     chain, phantom = outcome.solution.chain, outcome.solution.phantom
     if not isinstance(phantom, Wires) or not phantom.geometry.n_shapes:
         return []
     place = chain.target_from_world.inv()
-    mean, sd = nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place).trimmed()
+    mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place))
     return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
 
 

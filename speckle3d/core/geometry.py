@@ -58,8 +58,8 @@ def relative_poses(world_from_image: RigidTransform) -> RigidTransform:
 def mirrored(world_from_image: RigidTransform) -> RigidTransform:
     """The same motion seen in a mirror in the first image's plane: elevation, tilt and yaw change sign.
 
-    Images cannot tell a sweep from its mirror image: distances from decorrelation have no sign. The world is
-    the first image, or in line with it.
+    Images cannot tell a sweep from its mirror image, since distances from decorrelation have no sign. The
+    world must be the frame of the first image, or parallel to it.
     """
     flip = np.diag([1.0, 1.0, -1.0, 1.0])
     return RigidTransform.from_matrix(flip @ world_from_image.as_matrix() @ flip)

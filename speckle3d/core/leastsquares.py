@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt with the diagnosis a published number needs.
+"""Least squares: nonlinear with standard errors, linear and robust, and covariance of clustered residuals.
 
-One solver for the whole package: SciPy's `least_squares`, the columns of the Jacobian scaled to unit
-norm at the start (Prager et al. 1997, section 4), and a `Fit` that says how well the data determine
-the answer.
+`levenberg_marquardt` solves the chains of calibrations with a phantom and the curves of the drift correction.
+Other nonlinear fits need no standard errors and call SciPy themselves. `robust_linear` serves whatever is
+linear and has outliers.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 
 Residuals = Callable[[FloatArray], FloatArray]
@@ -24,7 +24,7 @@ MAD_TO_SIGMA = 1.4826
 
 @dataclass(frozen=True)
 class Fit:
-    """The answer of a least-squares problem and how far it can be trusted.
+    """The answer of a least-squares problem and how well the data determine it.
 
     Attributes
     ----------
@@ -35,27 +35,17 @@ class Fit:
     covariance : ndarray, shape (n, n)
         Of the parameters, from the Jacobian at the solution and the residual variance; directions the
         data do not determine have infinite variance on every parameter they touch.
-    singular_values : ndarray, shape (n,)
-        Of the Jacobian with columns scaled to unit norm, descending.
-    weakest_direction : ndarray, shape (n,)
-        Right singular vector of the least singular value, in scaled parameters.
+    condition_number : float
+        Of the Jacobian (`condition_number`).
     """
 
     parameters: FloatArray
     names: tuple[str, ...]
     residuals: FloatArray
     covariance: FloatArray
-    singular_values: FloatArray
-    weakest_direction: FloatArray
+    condition_number: float
     evaluations: int
     converged: bool
-    message: str
-
-    @property
-    def condition_number(self) -> float:
-        """Ratio of the largest and the least singular value of the scaled Jacobian; inf if singular."""
-        least = self.singular_values[-1]
-        return float(self.singular_values[0] / least) if least > 0 else float("inf")
 
     @property
     def rms(self) -> float:
@@ -67,11 +57,6 @@ class Fit:
         """Square roots of the covariance's diagonal, shape (n,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
-    def weakest_parameters(self, share: float = 0.3) -> tuple[str, ...]:
-        """Names of the parameters that make up the least determined direction, strongest first."""
-        order = np.argsort(-np.abs(self.weakest_direction))
-        return tuple(self.names[i] for i in order if abs(self.weakest_direction[i]) >= share)
-
 
 def levenberg_marquardt(
     residuals: Residuals,
@@ -81,7 +66,7 @@ def levenberg_marquardt(
     tolerance: float = 1e-10,
     max_evaluations: int = 200,
 ) -> Fit:
-    """Minimise the sum of squared residuals.
+    """Minimise the sum of squared residuals by SciPy's MINPACK, its columns scaled by the Jacobian's.
 
     Parameters
     ----------
@@ -121,12 +106,34 @@ def levenberg_marquardt(
         gtol=tolerance,
         max_nfev=max_evaluations,
     )
-    return _diagnose(
-        found.x, found.fun, np.asarray(found.jac), labels, found.nfev, found.success, found.message
+    jac = np.asarray(found.jac)
+    return Fit(
+        parameters=found.x,
+        names=labels,
+        residuals=found.fun,
+        covariance=_covariance(jac, found.fun),
+        condition_number=condition_number(jac),
+        evaluations=int(found.nfev),
+        converged=bool(found.success),
     )
 
 
-def robust_sigma(residuals: FloatArray, smallest: float = 0.0) -> float:
+def condition_number(jacobian: FloatArray) -> float:
+    """Ratio of the extreme singular values, columns scaled to unit norm; inf if singular.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (m, n)
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 4.2.
+    """
+    singular = np.linalg.svd(jacobian / _column_norms(jacobian), compute_uv=False)
+    return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
+
+
+def robust_sigma(residuals: FloatArray | Float32Array, smallest: float = 0.0) -> float:
     """Standard deviation of normal residuals with the same median size, at least `smallest`."""
     return max(MAD_TO_SIGMA * float(np.median(np.abs(residuals))), smallest)
 
@@ -155,7 +162,7 @@ def cauchy_weights(residuals: FloatArray, limit: float = 2.385) -> FloatArray:
 
 @dataclass(frozen=True)
 class RobustFit:
-    """The answer of a linear problem some of whose equations are wrong.
+    """The answer of a linear problem some of whose equations may be wrong.
 
     Attributes
     ----------
@@ -193,27 +200,36 @@ def robust_linear(
     rcond: float | None = None,
     smallest_sigma: float = 1e-9,
 ) -> RobustFit:
-    """Solve linear equations by iteratively reweighted least squares.
+    """Solve linear equations, some of which may be wrong, by iteratively reweighted least squares.
 
     Parameters
     ----------
     matrix : ndarray, shape (n, p) or (n, r, p)
-        Rows of a group of r get one weight, by the norm of their residuals. Known precision of an equation
-        is brought in by multiplying both of its sides.
+        A group of r rows gets one weight, from the norm of its residuals. Where equations differ in
+        precision, both sides of each are to be divided by its standard deviation.
     wanted : ndarray, shape (n,) or (n, r)
     weights : callable
         Weights of residuals over their robust standard deviation: `huber_weights` or `cauchy_weights`.
     rounds : int
-        Solutions; the first with equal weights.
+        Number of solutions; the first has equal weights.
     rcond : float, optional
         Ratio of singular values below which a direction counts as not determined; see `numpy.linalg.lstsq`.
     smallest_sigma : float
-        Smallest standard deviation of residuals that are more than rounding.
+        Standard deviation below which residuals are rounding errors.
 
     References
     ----------
     .. [1] P. W. Holland and R. E. Welsch, "Robust regression using iteratively reweighted least-squares",
        Commun. Stat. Theory Methods, 1977.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> x = np.arange(6.0)
+    >>> y = 2.0 * x + np.array([0.0, 0.1, -0.1, 0.0, 50.0, 0.1])
+    >>> fit = robust_linear(x[:, None], y, cauchy_weights)
+    >>> round(float(fit.parameters[0]), 1)
+    2.0
     """
     rows, values = matrix.reshape(-1, matrix.shape[-1]), wanted.ravel()
     group = values.size // len(wanted)
@@ -232,19 +248,23 @@ def robust_linear(
 
 
 def clustered_covariance(
-    jacobian: FloatArray, residuals: FloatArray, cluster: IntArray, lags: int = 0
+    jacobian: FloatArray, residuals: FloatArray, cluster: IntArray, lags: int | None = None
 ) -> FloatArray:
-    """Covariance of least squares whose residuals are correlated within clusters, and from one to the next.
+    """Covariance of least squares whose residuals are correlated within clusters and between close ones.
 
     Parameters
     ----------
     jacobian : ndarray, shape (m, p)
     residuals : ndarray, shape (m,)
-        Some to each point, in the order of the points.
+        The same number for each point, in the order of the points.
     cluster : ndarray of int, shape (n,)
-        Of each point; numbered in their order in time, if `lags` are given.
-    lags : int
-        Clusters so many apart may still be correlated (`correlated_lags`).
+        Of each point; ascending in time, unless `lags` is zero.
+    lags : int, optional
+        How many clusters apart residuals are still correlated; by default `correlated_lags`.
+
+    Returns
+    -------
+    ndarray, shape (p, p)
 
     References
     ----------
@@ -253,7 +273,7 @@ def clustered_covariance(
     .. [2] W. K. Newey and K. D. West, "A simple, positive semi-definite, heteroskedasticity and
        autocorrelation consistent covariance matrix", Econometrica, 1987.
     """
-    index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
+    index = _cluster_of_each(residuals, cluster)
     bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-15, hermitian=True)
     order = np.argsort(index, kind="stable")
     counts = np.bincount(index)
@@ -263,26 +283,27 @@ def clustered_covariance(
         alike = np.flatnonzero(counts == size)
         members = order[starts[alike][:, None] + np.arange(size)]
         rows = jacobian[members]
-        # What the residuals would be, had the cluster not pulled the solution towards itself.
+        # Residuals from the solution without the cluster, which does not pull it towards itself.
         left = np.eye(size) - rows @ bread @ np.swapaxes(rows, 1, 2)
         unpulled = np.linalg.pinv(left, rcond=1e-9, hermitian=True) @ residuals[members][:, :, None]
         scores[alike] = (np.swapaxes(rows, 1, 2) @ unpulled)[:, :, 0]
     spread = scores.T @ scores
-    for lag in range(1, min(lags, len(scores) - 1) + 1):
+    reach = correlated_lags(residuals, cluster) if lags is None else lags
+    for lag in range(1, min(reach, len(scores) - 1) + 1):
         together = scores[lag:].T @ scores[:-lag]
-        spread += (1.0 - lag / (lags + 1.0)) * (together + together.T)
+        spread += (1.0 - lag / (reach + 1.0)) * (together + together.T)
     return np.asarray(bread @ spread @ bread)
 
 
 def correlated_lags(residuals: FloatArray, cluster: IntArray) -> int:
-    """How many clusters apart residuals are still correlated: up to where that could be chance.
+    """How many clusters apart the clusters' mean residuals are correlated by more than chance.
 
     Parameters
     ----------
     residuals, cluster
-        See `clustered_covariance`; the mean of each cluster counts.
+        See `clustered_covariance`.
     """
-    index = np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
+    index = _cluster_of_each(residuals, cluster)
     means = np.bincount(index, residuals) / np.bincount(index)
     means = means - means.mean()
     energy, most = float(means @ means), len(means) // 4
@@ -317,32 +338,24 @@ def autocorrelation_time(residuals: FloatArray, least_energy: float = 0.0) -> fl
     return time
 
 
-def _diagnose(
-    x: FloatArray,
-    r: FloatArray,
-    j: FloatArray,
-    names: tuple[str, ...],
-    evaluations: int,
-    converged: bool,
-    message: str,
-) -> Fit:
-    norms = np.linalg.norm(j, axis=0)
-    scale = np.where(norms > 0, norms, 1.0)
-    _, singular, vt = np.linalg.svd(j / scale, full_matrices=False)
-    known = singular > singular[0] * max(j.shape) * np.finfo(float).eps
-    variance = float(r @ r) / max(r.size - x.size, 1)
+def _cluster_of_each(residuals: FloatArray, cluster: IntArray) -> IntArray:
+    """Number of the cluster of each residual, from zero and without gaps."""
+    return np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
+
+
+def _column_norms(jacobian: FloatArray) -> FloatArray:
+    norms = np.linalg.norm(jacobian, axis=0)
+    return np.asarray(np.where(norms > 0, norms, 1.0))
+
+
+def _covariance(jacobian: FloatArray, residuals: FloatArray) -> FloatArray:
+    """Covariance of the parameters, infinite where the data do not determine them."""
+    scale = _column_norms(jacobian)
+    _, singular, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    known = singular > singular[0] * max(jacobian.shape) * np.finfo(float).eps
+    variance = float(residuals @ residuals) / max(residuals.size - scale.size, 1)
     inverse = (vt[known].T / singular[known] ** 2) @ vt[known]
-    covariance = variance * inverse / np.outer(scale, scale)
+    covariance = np.asarray(variance * inverse / np.outer(scale, scale))
     blind = (np.abs(vt[~known]) > 1e-6).any(axis=0)
     covariance[np.ix_(blind, blind)] = np.inf
-    return Fit(
-        parameters=x,
-        names=names,
-        residuals=r,
-        covariance=covariance,
-        singular_values=singular,
-        weakest_direction=vt[-1],
-        evaluations=int(evaluations),
-        converged=bool(converged),
-        message=str(message),
-    )
+    return covariance

@@ -1,4 +1,4 @@
-"""Phantoms made of stretched wires: where each wire runs, and which wires make a shape that says more."""
+"""Phantoms made of stretched wires: the line of each wire, and which wires form an N."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from speckle3d.core.geometry import require_finite
 
 _UNIT_TOLERANCE = 1e-6
 _PARALLEL_SINE = 0.02
-"""About one degree: outer wires closer to parallel than this make an N. Holes are drilled to a tenth of a
-millimetre over tens of millimetres, a quarter of that."""
+"""Sine of about one degree, within which the outer wires of an N are parallel. Holes are drilled to 0.1 mm
+over tens of millimetres, a quarter of that."""
 _FLAT_MM = 0.5
-"""How far apart wires of one layer may pass and still be said to cross: half a wire's thickness or so."""
+"""Largest distance at which two wires of one layer still cross: about half a wire's thickness."""
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,22 @@ class WirePhantom:
     points_mm : ndarray, shape (k, 3)
         A point on each wire.
     directions : ndarray, shape (k, 3)
-        Along each wire, of unit length; either way.
+        Along each wire, in either sense, of unit length.
     patterns : tuple of tuple of int
         Wires that lie in one plane, in the order in which an image shows them from one side to the other.
         Three of which the outer two are parallel and the middle one is not are an N (`n_shapes`).
     ends_mm : ndarray, shape (k, 2, 3), optional
         Where each wire ends.
     world_from_phantom : RigidTransform, optional
-        Where the phantom is in the position sensor's world, if somebody measured it.
+        Where the phantom is in the position sensor's world, if that was measured.
 
     Raises
     ------
     InvalidInputError
-        If the wires are none, or not finite, or directions are not of unit length, or names repeat, or a
-        pattern names a wire that there is not.
+        If there are no wires, values are not finite, directions are not of unit length, names repeat, or a
+        pattern has a number that is no wire's.
     MismatchError
-        If the names, points, directions and ends are not as many.
+        If names, points, directions and ends differ in number.
     """
 
     names: tuple[str, ...]
@@ -128,16 +128,23 @@ class WirePhantom:
         ``normals @ (position - points_mm)`` are the two components of a position's distance from the wire.
         """
         steep = np.argsort(np.abs(self.directions), axis=1)[:, :2]
-        # The axes least along the wire come first, so that a wire along an axis has the other two.
+        # Of the two axes least along the wire, the first in order: a wire along an axis gets the other two.
         first = np.eye(3)[np.sort(steep, axis=1)[:, 0]]
         first = first - np.sum(first * self.directions, axis=1, keepdims=True) * self.directions
         first /= np.linalg.norm(first, axis=1, keepdims=True)
         return np.stack([first, np.cross(self.directions, first)], axis=1)
 
-    def distances_mm(self, positions_mm: FloatArray, wire: IntArray) -> FloatArray:
-        """Distance of positions in C, shape (n, 3), from the wire that each is said to lie on, shape (n,)."""
-        apart = np.asarray(positions_mm) - self.points_mm[wire]
-        return np.asarray(np.linalg.norm(np.cross(apart, self.directions[wire]), axis=-1))
+    def equations(self, wire: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Equations of positions in C on the wires with these numbers, shape (...).
+
+        Returns
+        -------
+        rows : ndarray, shape (..., 2, 3)
+        offsets : ndarray, shape (..., 2)
+            ``rows @ position - offsets`` are the two components, mm, of a position's distance from its wire.
+        """
+        rows = self.normals[wire]
+        return rows, np.asarray(np.einsum("...ri,...i->...r", rows, self.points_mm[wire]))
 
     @classmethod
     def from_ends(

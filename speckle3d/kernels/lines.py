@@ -14,7 +14,7 @@ _ROUNDS = 20
 def filter_columns(
     samples: Float32Array, spans: IntArray, middle: float, taps: Float32Array, sign: float, out: Float32Array
 ) -> None:
-    """Correlate each span of a column with an even or odd filter; beyond its ends it goes on at their level.
+    """Correlate each span of a column with an even or odd filter, the end values continued beyond the ends.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def echo_levels(
     ahead: int,
     out: Float32Array,
 ) -> None:
-    """How bright the echo is that begins at each maximum of the response.
+    """Fill in the brightness of the echo that begins at each maximum of the response.
 
     Parameters
     ----------
@@ -68,9 +68,9 @@ def echo_levels(
     least : float
         Response that a maximum must exceed.
     dark : float
-        Level to count from.
+        Level subtracted.
     ahead : int
-        Rows from the maximum in which the echo is brightest.
+        Rows below the maximum in which the brightest level is looked for.
     out : float32, shape (n, r)
         Zero where there is no maximum.
     """
@@ -93,7 +93,7 @@ def first_edges(
     largest: FloatArray,
     found: IntArray,
 ) -> None:
-    """First maximum of each column's response whose score exceeds a threshold, or else that of largest score.
+    """Find the first maximum of each column's response whose score exceeds a threshold, or else the best.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def echo_fronts(
     fronts: FloatArray,
     peaks: FloatArray,
 ) -> None:
-    """Where the echo behind each edge has risen half way, and where it is brightest.
+    """Find where the echo behind each edge has risen half way, and where it is brightest.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def echo_fronts(
     found : int64, shape (n,)
         The span each edge lies in; -1 where there is none.
     edges : float64, shape (n,)
-        Rows of the edges, seen through a Gaussian of `sigma` rows: up to so far above the echo.
+        Rows of the edges, found with a Gaussian of `sigma` rows: up to `sigma` above the echo.
     fronts, peaks : float64, shape (n,)
         Rows; NaN without an echo.
     """
@@ -182,7 +182,7 @@ def agreeing(
     tolerance: float,
     agree: BoolArray,
 ) -> tuple[int, int, float]:
-    """Which points lie within a tolerance above or below a line where the region holds it.
+    """Find the points within a tolerance above or below a line, where the line is inside the region.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def agreeing(
     Returns
     -------
     tuple of int, int and float
-        How many agree, how many could, and the sum of the squared deviations of those that do.
+        How many points agree, how many could, and the sum of squared deviations of those that agree.
     """
     agreed, possible, squares = 0, 0, 0.0
     for i in range(column.size):
@@ -218,7 +218,7 @@ def agreeing(
 def best_pair(
     column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float, agree: BoolArray
 ) -> tuple[float, float]:
-    """The line through two points that most points agree with, the closest of equals.
+    """Find the line through two points that most points agree with; of equals, the one closest to them.
 
     Parameters are those of `agreeing`; `agree` is overwritten.
 
@@ -246,7 +246,7 @@ def best_pair(
 def consensus_line(
     column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float, agree: BoolArray
 ) -> tuple[int, float, float]:
-    """Fit the best pair's line to the points that agree with it, until these stay the same.
+    """Fit a line to the points that agree with the best pair's line, until these stay the same.
 
     Parameters are those of `agreeing`.
 

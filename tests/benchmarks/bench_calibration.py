@@ -19,9 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from calibration_examples import PIXEL_MM, TRIAL_1, centre_of, scan_plane
 
-from calibration.chain import CHAIN, PROBE, Chain, ImagePoints, residuals_and_jacobian
-from calibration.plane import Plane, _refined, _three_stages, calibrate_plane, solve
-from calibration.solution import Solution
+from calibration.chain import CHAIN, PROBE, Chain, ChainSolution, ImagePoints, residuals_and_jacobian
+from calibration.plane import Plane, _refined, _three_stages, calibrate_plane, solve_chain
 
 LINES, TARGET_S = 700, 0.1
 FREE = (*PROBE, *Plane().determined)
@@ -42,9 +41,9 @@ def by_scipy(lines: ImagePoints, start: Chain) -> Chain:
     return Chain.from_parameters(found)
 
 
-def by_us(lines: ImagePoints, start: Chain) -> Solution:
+def by_us(lines: ImagePoints, start: Chain) -> ChainSolution:
     """Analytic derivatives; reweighted first, and frames that contradict the others are looked for."""
-    return solve(lines, Plane(), start)
+    return solve_chain(lines, Plane(), start)
 
 
 def by_us_once(lines: ImagePoints, start: Chain) -> Chain:

@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from calibration.job import Job, Recording, Seen, orientation_job, plane_job
+from calibration.job import JobSettings, Recording, Seen, orientation_job, plane_job
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.images import GreyImages
@@ -46,7 +46,7 @@ def trial(seed, frames, reflector):
     seen = Seen.lines(recording_of(sweep, sweep.orientation))
     found = {}
     for level in (False, True):
-        outcome = orientation_job(recording_of(sweep, sweep.orientation), seen, Job(), level)
+        outcome = orientation_job(recording_of(sweep, sweep.orientation), seen, JobSettings(), level)
         turn = simulated.orientation_from_image.inv() * outcome.calibration.rotation
         found[f"orientation sensor, {'level' if level else 'any'} plane"] = (
             np.rad2deg(turn.as_rotvec()),
@@ -54,7 +54,7 @@ def trial(seed, frames, reflector):
             None,
         )
     for fit in (True, False):
-        outcome = plane_job(recording_of(sweep, sweep.tracker), seen, Job(), fit)
+        outcome = plane_job(recording_of(sweep, sweep.tracker), seen, JobSettings(), fit)
         step = simulated.tracker_from_image.inv() * outcome.calibration.sensor_from_image
         centre = sweep.grid.centre_mm
         found[f"tracker, pixels {'fitted' if fit else 'held'}"] = (

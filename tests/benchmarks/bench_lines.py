@@ -7,10 +7,11 @@ import time
 
 import numpy as np
 import pytest
+from skimage import measure
 
-from calibration.detection.columns import lay_columns
 from calibration.detection.edges import first_echoes, take_profiles
 from calibration.detection.lines import detect_lines
+from calibration.detection.region import lay_columns
 from speckle3d.kernels.lines import consensus_line
 
 FRAMES, SHAPE, PIXEL_MM = 700, (640, 480), (0.08, 0.1)
@@ -54,7 +55,6 @@ def test_frames_per_second(benchmark, frames):
 
 
 def test_consensus_against_scikit_image(benchmark, frames):
-    measure = pytest.importorskip("skimage.measure")
     columns = lay_columns(SHAPE, 60, None)
     column = columns.column.astype(float)
     edges = []

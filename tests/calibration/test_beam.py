@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane
 
-from calibration.beam import bias_along_beam_mm, depth_error_mm, focal_width_mm, predict_bias
+from calibration.beam import bias_along_beam_mm, depth_error_mm, predict_bias
 from calibration.plane import calibrate_plane
 from speckle3d.core.errors import InvalidInputError
 
@@ -107,10 +107,3 @@ def test_no_thickness_no_bias():
     assert predicted.closed_form_mm == 0.0
     with pytest.raises(InvalidInputError, match="width_mm"):
         predict_bias(solution, -1.0)
-
-
-def test_focal_width_of_the_published_probe():
-    # TR 303, appendix D: 20 mm x 0.2 mm / 7 mm, printed as 0.6 mm.
-    assert focal_width_mm(20.0, 0.2, 7.0) == pytest.approx(0.571, abs=0.001)
-    with pytest.raises(InvalidInputError, match="above zero"):
-        focal_width_mm(20.0, 0.2, 0.0)

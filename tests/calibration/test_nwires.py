@@ -5,18 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
-from wire_scenes import PIXEL_MM, candidates, n_phantom, plus_results, scene
+from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
 from calibration.chain import ImagePoints
 from calibration.detection.dots import Dots, dots_in_frames
 from calibration.detection.labelling import LabelledDots
 from calibration.nwires import (
-    NWireErrors,
     label_and_start,
     middle_wires,
     nwire_errors_mm,
     pixel_matrix,
     start_from_nwires,
+    trimmed_mean_mm,
 )
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.metaimage import ImportSettings, read_metaimage, read_poses
@@ -70,30 +70,30 @@ def test_an_n_that_lacks_a_dot_says_nothing():
 def test_a_shift_of_the_calibration_is_the_error_of_every_n():
     shown = scene(2)
     points = points_of(shown)
-    assert nwire_errors_mm(points, shown.phantom, shown.pixel_matrix).error_mm.max() < 1e-9
+    place = shown.phantom.world_from_phantom
+    assert nwire_errors_mm(points, shown.phantom, shown.pixel_matrix, place).max() < 1e-9
     shifted = shown.pixel_matrix.copy()
     shifted[:3, 3] += [0.3, -0.4, 1.2]
-    errors = nwire_errors_mm(points, shown.phantom, shifted)
-    np.testing.assert_allclose(errors.error_mm, 1.3)
-    elsewhere = shown.phantom.world_from_phantom * RigidTransform.from_translation([0.0, 0.6, 0.8])
+    errors = nwire_errors_mm(points, shown.phantom, shifted, place)
+    np.testing.assert_allclose(errors, 1.3)
+    elsewhere = place * RigidTransform.from_translation([0.0, 0.6, 0.8])
     moved = nwire_errors_mm(points, shown.phantom, shown.pixel_matrix, elsewhere)
-    np.testing.assert_allclose(moved.error_mm, 1.0)
+    np.testing.assert_allclose(moved, 1.0)
 
 
 def test_the_largest_errors_can_be_left_out():
-    errors = NWireErrors(np.arange(20), np.ones(20, dtype=int), np.append(np.full(19, 0.5), 80.0))
-    assert errors.trimmed() == (0.5, 0.0)
-    assert errors.trimmed(1.0)[0] == pytest.approx((19 * 0.5 + 80) / 20)
-    with pytest.raises(InsufficientDataError, match="expected an N with all three dots, got none"):
-        NWireErrors(np.zeros(0, int), np.zeros(0, int), np.zeros(0)).trimmed()
+    errors = np.append(np.full(19, 0.5), 80.0)
+    assert trimmed_mean_mm(errors) == (0.5, 0.0)
+    assert trimmed_mean_mm(errors, 1.0)[0] == pytest.approx((19 * 0.5 + 80) / 20)
+    with pytest.raises(InsufficientDataError, match="three dots"):
+        trimmed_mean_mm(np.zeros(0))
 
 
-@pytest.mark.parametrize("by", ["middle", "all"])
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=8)
-def test_exact_dots_give_the_exact_calibration(by, seed):
+def test_exact_dots_give_the_exact_calibration(seed):
     shown = scene(seed)
-    start = start_from_nwires(points_of(shown), shown.phantom, by=by)
+    start = start_from_nwires(points_of(shown), shown.phantom)
     np.testing.assert_allclose(start.pixel_mm, PIXEL_MM, rtol=1e-7)
     np.testing.assert_allclose(pixel_matrix(start)[:, :2], shown.pixel_matrix[:, :2], atol=1e-7)
     assert apart(start, shown)[0] < 1e-5
@@ -110,21 +110,6 @@ def test_wrong_wires_hardly_move_the_start():
     assert apart(spoiled, shown)[0] < apart(clean, shown)[0] + 0.2
 
 
-def test_all_wires_determine_the_image_better_than_the_middle_ones():
-    shown = [scene(seed) for seed in range(6)]
-    turned = [
-        [
-            apart(start_from_nwires(points_of(s, 0.1, seed), s.phantom, by=by), s)[1]
-            for by in ("middle", "all")
-        ]
-        for seed, s in enumerate(shown)
-    ]
-    middle, every = np.median(turned, axis=0)
-    # 0.1 mm over 20 mm of image, thirty frames: about 0.1 degrees.
-    assert every < middle
-    assert every < 0.4
-
-
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_phantom_nobody_registered_is_found_by_turning_the_probe(seed):
     shown = scene(seed, frames=60, degrees=25.0)
@@ -139,26 +124,24 @@ def test_a_phantom_nobody_registered_is_found_by_turning_the_probe(seed):
 def test_a_probe_that_hardly_turned_does_not_say_where_the_phantom_is():
     shown = scene(3, degrees=2.0)
     unknown = replace(shown.phantom, world_from_phantom=None)
-    with pytest.raises(InsufficientDataError, match="the sensor turned too little"):
+    with pytest.raises(InsufficientDataError, match="turned"):
         start_from_nwires(points_of(shown), unknown, PIXEL_MM)
-    with pytest.raises(InvalidInputError, match="pixel_mm: expected a rough pixel size"):
+    with pytest.raises(InvalidInputError, match="pixel_mm"):
         start_from_nwires(points_of(shown), unknown)
 
 
 def test_what_is_too_little_or_nameless_is_refused():
     shown = scene(3)
     points = points_of(shown)
-    with pytest.raises(InsufficientDataError, match="expected at least 9 dots to start from, got 6"):
+    with pytest.raises(InsufficientDataError, match=r"9 .* 6"):
         start_from_nwires(points[points.frame < 2], shown.phantom)
-    still = points_of(scene(3, degrees=0.0))
-    with pytest.raises(InsufficientDataError, match="do not determine where the image is"):
-        start_from_nwires(still[still.wire == 1], shown.phantom, by="all")
-    with pytest.raises(InvalidInputError, match="points: expected the wire of each, got none"):
+    # All dots in one line of the image say nothing about the axis across it.
+    with pytest.raises(InsufficientDataError, match="determine"):
+        start_from_nwires(replace(points, pixels=points.pixels * [1.0, 0.0]), shown.phantom)
+    with pytest.raises(InvalidInputError, match="wire of each"):
         middle_wires(replace(points, wire=None), shown.phantom)
-    with pytest.raises(InvalidInputError, match="expected wires from 0 to 8, got others"):
+    with pytest.raises(InvalidInputError, match="0 to 8"):
         middle_wires(replace(points, wire=points.wire + 1), shown.phantom)
-    with pytest.raises(InvalidInputError, match="expected where the phantom is in the world, got none"):
-        nwire_errors_mm(points, n_phantom(), shown.pixel_matrix)
 
 
 def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():
@@ -175,7 +158,7 @@ def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():
 def test_a_sequence_without_wires_says_why():
     shown = scene(9, frames=3)
     few = Dots(np.array([0, 0, 2]), np.ones((3, 2)), np.ones(3), {1: "no dot"})
-    with pytest.raises(InsufficientDataError, match="expected frames that show all wires, got none: no "):
+    with pytest.raises(InsufficientDataError, match="all wires"):
         label_and_start(few, shown.phantom, shown.world_from_sensor, PIXEL_MM)
 
 
@@ -198,11 +181,11 @@ def fcal(realdata):
 @pytest.mark.parametrize("kind", ["Calibration", "Validation"])
 def test_published_errors_are_reproduced_for_every_frame(realdata, fcal, kind):
     points, errors, matrix = published(realdata / "plus", kind)
-    found = nwire_errors_mm(points, fcal.phantom, matrix)
+    found = nwire_errors_mm(points, fcal.phantom, matrix, fcal.phantom.world_from_phantom)
     assert (len(points) // 9, len(errors)) in {(184, 184), (103, 103)}
     # Six digits of pixels, poses and matrix leave 0.0002 mm.
-    np.testing.assert_allclose(found.error_mm.reshape(-1, 3), errors, atol=1e-3)
-    np.testing.assert_allclose(found.trimmed(), PUBLISHED[kind], atol=1e-4)
+    np.testing.assert_allclose(found.reshape(-1, 3), errors, atol=1e-3)
+    np.testing.assert_allclose(trimmed_mean_mm(found), PUBLISHED[kind], atol=1e-4)
 
 
 @pytest.mark.realdata
@@ -236,6 +219,7 @@ def test_dots_found_here_calibrate_real_images_for_others(realdata, fcal):
         assert np.median(away) < 1.0
         assert away.max() < 10.0
     points: ImagePoints = labelled["Validation"].points(poses)
-    errors = nwire_errors_mm(points, fcal.phantom, pixel_matrix(starts["Calibration"]))
+    place = fcal.phantom.world_from_phantom
+    errors = nwire_errors_mm(points, fcal.phantom, pixel_matrix(starts["Calibration"]), place)
     # PLUS, with its own points, has 0.540 mm; a tenth more for other dots in other frames (measured 0.575).
-    assert errors.trimmed()[0] < 0.6
+    assert trimmed_mean_mm(errors)[0] < 0.6

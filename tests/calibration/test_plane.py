@@ -1,5 +1,7 @@
 """Calibration with a plane, on the published simulation and on recordings that go wrong."""
 
+import re
+
 import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, about, centre_of, scan_plane
@@ -7,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import CHAIN, PROBE, TARGET, Chain, ImagePoints, residuals_and_jacobian
-from calibration.plane import Plane, calibrate_plane, condition_number, solve
+from calibration.chain import CHAIN, PROBE, TARGET, Chain, ImagePoints, free_jacobian, residuals_and_jacobian
+from calibration.identifiability import MOTIONS
+from calibration.plane import Plane, calibrate_plane, solve_chain
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.leastsquares import condition_number
 
 CENTRE = centre_of(TRIAL_1, PIXEL_MM)
 
@@ -52,8 +56,12 @@ def test_the_noise_column_is_as_published(seed):
 def test_fourteen_parameters_are_not_identifiable():
     scan = scan_plane(np.random.default_rng(0))
     solution = calibrate_plane(scan.lines, outlier_sigma=np.inf)
-    assert condition_number(scan.lines, Plane(), solution.chain, CHAIN) > 1e15
-    assert condition_number(scan.lines, Plane(), solution.chain, (*PROBE, *Plane().determined)) < 100
+    numbers = [
+        condition_number(free_jacobian(scan.lines, Plane(), solution.chain, free))
+        for free in (CHAIN, (*PROBE, *Plane().determined))
+    ]
+    assert numbers[0] > 1e15
+    assert numbers[1] < 100
 
 
 @pytest.mark.parametrize("stages", ["three", "one"])
@@ -143,13 +151,13 @@ def test_frames_paired_with_the_readings_of_others_are_refused():
 @pytest.mark.parametrize(
     ("missing", "named"),
     [
-        ({"tilt_deg": 0.0}, "tilt the probe to and fro"),
-        ({"roll_deg": 0.0}, "roll the probe from side to side"),
+        ({"tilt_deg": 0.0}, 0),
+        ({"roll_deg": 0.0}, 2),
     ],
 )
 def test_the_missing_motion_is_named_and_nothing_returned(missing, named):
     scan = scan_plane(np.random.default_rng(0), 200, line_noise_mm=0.1, **missing)
-    with pytest.raises(InsufficientDataError, match=named):
+    with pytest.raises(InsufficientDataError, match=re.escape(MOTIONS[named].advice)):
         calibrate_plane(scan.lines)
 
 
@@ -166,10 +174,11 @@ def test_a_probe_held_still_is_refused():
     still = ImagePoints.of_lines(
         np.arange(50), np.tile(one.pixels, (50, 1, 1)), one.world_from_sensor[np.zeros(50, dtype=int)]
     )
-    with pytest.raises(InsufficientDataError, match="does not determine"):
+    with pytest.raises(InsufficientDataError, match="determine"):
         calibrate_plane(still)
 
 
+@pytest.mark.slow
 def test_claimed_standard_errors_are_those_of_repetition():
     names = ("gamma", "beta", "alpha", "x", "y", "z")
     scores = []
@@ -228,7 +237,7 @@ def test_a_chain_survives_its_parameters():
 def test_parameters_that_are_held_stay():
     scan = scan_plane(np.random.default_rng(0), 60, line_noise_mm=0.1)
     start = calibrate_plane(scan.lines).chain
-    held = solve(scan.lines, Plane(), start, probe=())
+    held = solve_chain(scan.lines, Plane(), start, probe=())
     np.testing.assert_array_equal(held.chain.pixel_mm, start.pixel_mm)
     np.testing.assert_allclose(
         held.chain.sensor_from_image.as_matrix(), start.sensor_from_image.as_matrix(), atol=1e-12

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.chain import ImagePoints
 from calibration.plane import calibrate_plane
 from calibration.repeatability import repeatability, rotation_errors, validate
-from calibration.wires import calibrate_crossing
+from calibration.wires import calibrate_cross_wire
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 
@@ -101,12 +101,13 @@ def test_places_are_told_only_where_they_are_known():
 
 
 def test_one_alone_and_different_sensors_are_refused():
-    with pytest.raises(InsufficientDataError, match="at least two"):
+    with pytest.raises(InsufficientDataError, match="two"):
         repeatability([calibration()])
-    with pytest.raises(MismatchError, match="orientation and tracker"):
+    with pytest.raises(MismatchError, match=r"orientation.*tracker"):
         repeatability([calibration(), calibration(sensor="orientation")])
 
 
+@pytest.mark.slow
 def test_repeated_calibrations_scatter_as_much_as_is_claimed():
     solutions = [
         calibrate_plane(scan_plane(np.random.default_rng([seed, 3]), 150, line_noise_mm=0.2).lines)
@@ -164,7 +165,7 @@ def test_a_crossing_stays_where_it_was():
         pixels, readings = scan_wires(np.random.default_rng(seed), places, noise_mm=0.3)
         return ImagePoints(pixels, np.arange(60), readings)
 
-    solution = calibrate_crossing(scan(0))
+    solution = calibrate_cross_wire(scan(0))
     # 0.3 mm in two of three components; the solution's own error comes in a tenth of that.
     assert validate(solution, scan(1)).rms == pytest.approx(0.3 * np.sqrt(2 / 3), rel=0.2)
     # Somebody moved the phantom by 3 mm, along one of three components: that is an error, and is shown.

@@ -5,8 +5,8 @@ import oracles
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.detection.columns import Columns
 from calibration.detection.edges import first_echoes, take_profiles
+from calibration.detection.region import Columns
 from speckle3d.kernels.lines import agreeing, consensus_line, echo_fronts, echo_levels
 
 SEEDS = st.integers(0, 2**32 - 1)

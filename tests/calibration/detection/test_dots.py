@@ -136,15 +136,11 @@ def test_a_single_wire_is_its_frames_strongest_dot_if_that_is_clear():
 @pytest.mark.parametrize(
     ("image", "pixel_mm", "message"),
     [
-        (
-            np.zeros((5, 5, 5)),
-            PIXEL_MM,
-            r"image: expected real values \(column, row\), got float64 \(5, 5, 5\)",
-        ),
-        (np.zeros((50, 50), complex), PIXEL_MM, "image: expected real values"),
-        (np.zeros((50, 50)), (0.1, 0.0), "pixel_mm: expected two values above zero"),
-        (np.zeros((50, 50)), (0.1,), "pixel_mm: expected two values above zero"),
-        (np.full((50, 50), np.nan), PIXEL_MM, r"image\[\(0, 0\)\]: expected a finite value"),
+        (np.zeros((5, 5, 5)), PIXEL_MM, r"image.*\(5, 5, 5\)"),
+        (np.zeros((50, 50), complex), PIXEL_MM, "image.*complex"),
+        (np.zeros((50, 50)), (0.1, 0.0), "pixel_mm"),
+        (np.zeros((50, 50)), (0.1,), "pixel_mm"),
+        (np.full((50, 50), np.nan), PIXEL_MM, r"image\[\(0, 0\)\]"),
     ],
 )
 def test_images_that_are_none_are_refused(image, pixel_mm, message):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.mirror import canonical, wrapped
+from calibration.chain import canonical, wrapped
 from speckle3d.core.geometry import rotation_from_fixed_angles
 
 angle = st.floats(-20.0, 20.0)

@@ -1,4 +1,4 @@
-"""Where in an image to look for a line: columns at regular intervals, and which of their rows count."""
+"""Where in an image to look: the pixels of a polygon, and columns at regular intervals with their rows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
+from skimage.draw import polygon2mask
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
@@ -15,16 +16,16 @@ from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
 
 _GLANCES = 48
-"""Frames looked at for what stands still in all of them."""
+"""Frames compared to see what stands still in all of them."""
 DENSELY = 4
-"""How many times the columns asked for are looked at to learn which of them show anything."""
+"""Columns looked at to see which show anything, for each that is then sampled."""
 _LIVELY = 0.25
-"""Change that counts, as a part of the strongest change in nearly all columns."""
+"""Change that counts, as a share of the 90th percentile of the columns' strongest changes."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Sampled columns and their part in a region.
+    """Sampled columns and which of their rows are in a region.
 
     Attributes
     ----------
@@ -33,7 +34,7 @@ class Columns:
     inside : ndarray of bool, shape (n, r)
         Which rows of each are in the region.
     spans : ndarray of int, shape (s, 3)
-        The same as runs: place in `column`, first and last row.
+        Runs of rows inside: index in `column`, first and last row.
     """
 
     column: IntArray
@@ -47,7 +48,7 @@ class Columns:
         object.__setattr__(self, "spans", spans.astype(np.int64))
 
     def thinned(self, count: int) -> Columns:
-        """So many of the columns with rows in the region, evenly spread."""
+        """At most `count` of the columns with rows in the region, evenly spread."""
         place = np.flatnonzero(self.inside.any(axis=1))
         place = place[_spread(place.size, count)] if place.size else place
         return Columns(self.column[place], self.inside[place])
@@ -58,20 +59,18 @@ class Columns:
         return int(self.inside.any(axis=1).sum())
 
     def narrowed(self, inside: BoolArray) -> Columns:
-        """These columns with the rows that are in both regions."""
+        """The same columns with only those of their rows that are `inside`, shape (n, r), too."""
         return Columns(self.column, self.inside & inside)
 
 
-def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | None) -> Columns:
-    """Spread columns over an image, or over a polygon in it, symmetric about its middle.
+def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
+    """Which pixels of an image are in a polygon, its sides included.
 
     Parameters
     ----------
     shape : tuple of int
         Columns and rows of the image.
-    count : int
-        Columns to sample; fewer where there are not so many.
-    region_px : array_like, shape (k, 2), optional
+    region_px : array_like, shape (k, 2)
         Corners (column, row) of any simple polygon.
 
     Raises
@@ -79,25 +78,41 @@ def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | N
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    columns, rows = shape
-    region = None if region_px is None else _checked_region(region_px)
-    first, last = 0, columns - 1
-    if region is not None:
-        first = max(first, int(np.ceil(region[:, 0].min())))
-        last = min(last, int(np.floor(region[:, 0].max())))
-    column = first + _spread(max(last - first + 1, 1), count)
-    inside = np.ones((column.size, rows), dtype=bool)
-    if region is not None:
-        inside = np.array([_rows_inside(region, c, rows) for c in column])
-    if last <= first or not inside.any():
+    mask = np.asarray(polygon2mask(shape, _checked_region(region_px)))
+    if not mask.any():
         raise InvalidInputError(
-            f"region_px: expected a polygon that covers part of the {columns} x {rows} pixels, got none"
+            f"region_px: expected a polygon that covers part of the {shape[0]} x {shape[1]} pixels, got none"
         )
-    return Columns(column, inside)
+    return mask
+
+
+def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | None) -> Columns:
+    """Spread columns over an image, or over a polygon in it, symmetric about its middle.
+
+    Parameters
+    ----------
+    shape, region_px
+        See `region_mask`.
+    count : int
+        Columns to sample; fewer where there are not so many.
+
+    Raises
+    ------
+    InvalidInputError
+        If the region is not a polygon, or covers nothing.
+    """
+    if region_px is None:
+        column = _spread(shape[0], count)
+        return Columns(column, np.ones((column.size, shape[1]), dtype=bool))
+    mask = region_mask(shape, region_px)
+    reach = np.asarray(region_px, dtype=float)[:, 0]
+    first, last = max(0, int(np.ceil(reach.min()))), min(shape[0] - 1, int(np.floor(reach.max())))
+    column = first + _spread(last - first + 1, count)
+    return Columns(column, mask[column])
 
 
 def without_blank_sides(columns: Columns, image: npt.NDArray[Any]) -> Columns:
-    """Leave out columns of one level at the sides of an image (column, row): the fan does not reach them."""
+    """Leave out columns of one grey level at the sides of an image (column, row), beyond a fan."""
     sampled = np.asarray(image[columns.column], np.float32)
     blank = np.ptp(sampled, axis=1) == 0
     sides = np.logical_and.accumulate(blank) | np.logical_and.accumulate(blank[::-1])[::-1]
@@ -107,9 +122,9 @@ def without_blank_sides(columns: Columns, image: npt.NDArray[Any]) -> Columns:
 def without_standing(columns: Columns, frames: Frames, smoothing_rows: float) -> Columns:
     """Leave out columns in which nothing changes, and what is bright and stands still above all change.
 
-    The floor moves: lettering, a screen's border and the transducer's ring-down do not. Dark water stays in,
-    since the floor may come shallower in frames that were not looked at. Where all frames are alike, all
-    stays in.
+    The floor's echo moves; lettering, a screen's border and the transducer's ring-down do not. Dark water
+    stays in, since the floor may be shallower in frames that were not compared. If all frames are alike,
+    everything stays in.
     """
     glances = np.unique(np.linspace(0, frames.shape[0] - 1, _GLANCES).astype(int))
     low, high = np.full((2, *columns.inside.shape), np.nan, np.float32)
@@ -128,9 +143,17 @@ def without_standing(columns: Columns, frames: Frames, smoothing_rows: float) ->
 
 
 def _spread(size: int, count: int) -> IntArray:
-    """About `count` of the numbers below `size`, at regular intervals and symmetric about their middle."""
+    """About `count` of the numbers below `size`, at regular intervals and symmetric about the middle."""
     left = np.rint(np.linspace(0, size - 1, count)[: (count + 1) // 2]).astype(np.int64)
     return np.unique(np.concatenate([left, size - 1 - left]))
+
+
+def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
+    """Distances between columns and between rows as an array, shape (2,), if both are above zero."""
+    pixel = np.asarray(pixel_mm, dtype=float)
+    if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
+        raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
+    return pixel
 
 
 def _checked_region(region_px: npt.ArrayLike) -> FloatArray:
@@ -139,19 +162,3 @@ def _checked_region(region_px: npt.ArrayLike) -> FloatArray:
         raise InvalidInputError(f"region_px: expected shape (k, 2) with k of 3 or more, got {region.shape}")
     require_finite(region, "region_px")
     return region
-
-
-def _rows_inside(region: FloatArray, column: int, rows: int) -> BoolArray:
-    """Rows of a column within a polygon: between every other crossing of its sides."""
-    middle = (region[:, 0].min() + region[:, 0].max()) / 2
-    # A hair towards the middle, so that the first and the last column have rows however the corners lie.
-    u = column + 1e-9 * (middle - column)
-    (x0, y0), (x1, y1) = region.T, np.roll(region, -1, axis=0).T
-    crossed = (np.minimum(x0, x1) <= u) & (u < np.maximum(x0, x1))
-    x0, y0, x1, y1 = (values[crossed] for values in (x0, y0, x1, y1))
-    crossings = y0 + (u - x0) * (y1 - y0) / (x1 - x0)
-    row = np.arange(rows)[:, None]
-    # Counted from either end, so that rows exactly on a side are inside.
-    from_above = (crossings <= row + 1e-6).sum(axis=1) % 2 == 1
-    from_below = (crossings >= row - 1e-6).sum(axis=1) % 2 == 1
-    return np.asarray(from_above | from_below)
