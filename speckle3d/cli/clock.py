@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -54,7 +53,7 @@ def calibrate_clock(
     with the other sign.
     """
     from speckle3d.io.calibrations import read_calibration, write_calibration
-    from speckle3d.study.summary import plain
+    from speckle3d.study.results import json_text
 
     if out is not None and calibration is None:
         raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
@@ -85,7 +84,7 @@ def calibrate_clock(
             "followed": found.followed,
             "frames": frames,
         }
-        emit(json.dumps(plain(table), indent=2, allow_nan=False))
+        emit(json_text(table))
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)

@@ -28,7 +28,7 @@ def compare(
         list[str] | None,
         typer.Option(help="image+subset, orientation or pose; may be repeated. By default all possible."),
     ] = None,
-    reference: Annotated[str | None, typer.Option(help="tracker or truth: what to compare with.")] = None,
+    reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,
     curves_file: Annotated[
         Path | None,
         typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside each sweep."),

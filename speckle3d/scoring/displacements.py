@@ -1,4 +1,4 @@
-"""How far a reconstruction is from a reference: displacement of points, and drift of the image centre.
+"""Displacement of points and drift of the image centre against a reference, as table rows; TUS-REC's score.
 
 Both trajectories are first laid on each other at their first frame, so that neither world matters: with
 ``W_i`` the pose of frame i, ``T_i = W_0^-1 W_i`` takes points of frame i into frame 0, and
@@ -34,7 +34,9 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +47,10 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.challenge import Landmarks
+from speckle3d.scoring.references import Reference
+
+CHALLENGE_ERRORS = ("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm")
 
 
 @dataclass(frozen=True)
@@ -79,15 +85,6 @@ class DriftRates:
     sum_of_drift_mm: float
     hausdorff_mm: float
     mean_angle_deg: float
-
-
-def point_errors(
-    world_from_image: RigidTransform, reference: RigidTransform, points_mm: npt.ArrayLike
-) -> PointErrors:
-    """Displacement errors at the same points of every image, shape (p, 3)."""
-    points = np.asarray(points_mm, dtype=float)
-    whole, steps = _differences(world_from_image, reference)
-    return PointErrors(*(float(_displaced(each, points).mean()) for each in (whole, steps)))
 
 
 def pixel_errors(world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid) -> PointErrors:
@@ -159,6 +156,92 @@ def drift_rates(
     )
 
 
+def drift_rows(
+    grid: ImageGrid,
+    poses: Mapping[str, RigidTransform],
+    reference: Reference,
+    landmarks: Landmarks | None = None,
+) -> list[dict[str, Any]]:
+    """Drift rates and displacement errors of every mode over the frames that have a reference.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    poses : mapping of str to RigidTransform, each of length n
+        ``world_from_image`` by mode.
+    reference : Reference
+    landmarks : Landmarks, optional
+        Left out where the reference has gaps that landmarks could fall into.
+
+    Returns
+    -------
+    list of dict
+        ``mode``, and what `score_row` gives.
+    """
+    marks = landmarks if reference.covered.all() else None
+    return [
+        {"mode": mode, **score_row(each[reference.covered], reference.world_from_image, grid, marks)}
+        for mode, each in poses.items()
+    ]
+
+
+def score_row(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None = None
+) -> dict[str, Any]:
+    """Drift rates and displacement errors of one trajectory, under the names of the module's table.
+
+    Parameters
+    ----------
+    poses, true : RigidTransform, length n
+        Estimate and reference.
+    grid : ImageGrid or None
+        None where nothing is known of the images: the drift is then that of the poses' origin, and the errors
+        at pixels are None.
+    landmarks : Landmarks, optional
+        Without, the errors at landmarks are None.
+    """
+    rates = drift_rates(poses, true, np.zeros(3) if grid is None else grid.centre_mm)
+    pixels = None if grid is None else pixel_errors(poses, true, grid)
+    marks = None if landmarks is None else landmark_errors(poses, true, landmarks.frame, landmarks.points_mm)
+    return {
+        "FDR": rates.final_drift_rate,
+        "ADR": rates.average_drift_rate,
+        "MD_mm": rates.maximum_drift_mm,
+        "SD_mm": rates.sum_of_drift_mm,
+        "HD_mm": rates.hausdorff_mm,
+        "EA_deg": rates.mean_angle_deg,
+        "GPE_mm": pixels and pixels.global_mm,
+        "GLE_mm": marks and marks.global_mm,
+        "LPE_mm": pixels and pixels.local_mm,
+        "LLE_mm": marks and marks.local_mm,
+    }
+
+
+def challenge_score(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid, landmarks: Landmarks
+) -> float:
+    """The challenge's final score of one scan, as of 2025 [1]_: 1 if exact, 0 if as far off as resting poses.
+
+    The mean over the four errors of ``1 - error / error of identity poses``. Below zero where an estimate is
+    worse than none.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the reference rests, so that there is nothing to be better than.
+
+    References
+    ----------
+    .. [1] TUS-REC challenge 2025, assessment criteria, ranking method.
+    """
+    found = score_row(poses, true, grid, landmarks)
+    resting = score_row(RigidTransform.identity(len(true)), true, grid, landmarks)
+    for key in CHALLENGE_ERRORS:
+        if not resting[key] > 0:
+            raise InsufficientDataError(f"{key}: expected a reference that moves, got one that rests")
+    return float(np.mean([(resting[key] - found[key]) / resting[key] for key in CHALLENGE_ERRORS]))
+
+
 def _differences(
     world_from_image: RigidTransform, reference: RigidTransform
 ) -> tuple[FloatArray, FloatArray]:
@@ -168,12 +251,6 @@ def _differences(
     whole = [(each[0].inv() * each[1:]).as_matrix()[:, :3] for each in both]
     steps = [relative_poses(each).as_matrix()[:, :3] for each in both]
     return whole[0] - whole[1], steps[0] - steps[1]
-
-
-def _displaced(differences: FloatArray, points: FloatArray) -> FloatArray:
-    """Lengths of the differences at points, shape (n - 1, p)."""
-    moved = differences[:, :, :3] @ points.T + differences[:, :, 3:]
-    return np.asarray(np.linalg.norm(moved, axis=1))
 
 
 def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:

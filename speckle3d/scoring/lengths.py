@@ -1,12 +1,12 @@
-"""How far a reconstruction is from a reference: length, tilt, yaw and roll.
+"""Errors of length, tilt, yaw and roll of a reconstruction against a reference, part by part of the sweep.
 
 *Length* is the accumulated elevational travel of the image centre: every frame's centre, seen from the frame
 before it, moves by a signed z; length is the running sum. Tilt, yaw and roll are the running sums of the
 same relative poses' angles. They need no common world, so a reconstruction without any sensor can be
 compared, and they are the axes of figure 6 and of tables 3 and 4 of Housden et al. 2008.
 
-Because the steps are signed, a sensor's jitter does not add up: it telescopes, and only that of the first
-and the last frame remains. What remains is averaged away (see `compare_modes`).
+Because the steps are signed, a sensor's jitter does not add up: all but that of the first and the last frame
+cancels, and that is averaged away (see `compare_modes`).
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> A
 def monotone_parts(
     length_mm: npt.ArrayLike, hysteresis_mm: float = 0.5, jitter_frames: int = JITTER_FRAMES
 ) -> list[Part]:
-    """Split a sweep where the probe truly turns back.
+    """Split a sweep at the frames where the probe turns back.
 
     Parameters
     ----------
@@ -172,12 +172,41 @@ def compare_modes(
     Parameters
     ----------
     poses : mapping of str to RigidTransform, length n
-        ``world_from_image`` by mode, in any world; put a jitter-free one (`image`) first.
+        ``world_from_image`` by mode, mm, in any world; put a jitter-free one (`image`) first.
     reference : RigidTransform, length n or the number of covered frames
+    centre_mm : array_like, shape (3,)
+        Image centre in the image frame.
     covered : array_like of bool, shape (n,), optional
         Which frames have a reference; the others are left out of every sum.
     parts : list of Part, optional
         In covered frames; by default the reference's own.
+    end_frames : int
+        Frames of the line at each end of a part; 1 for an exact reference.
+
+    Returns
+    -------
+    list of ModeError
+        One for each part and mode.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are no modes.
+    MismatchError
+        If modes, reference and `covered` are not of the same frames.
+
+    Examples
+    --------
+    A straight sweep of 10 mm, reconstructed 5 % too long:
+
+    >>> import numpy as np
+    >>> import speckle3d as s3
+    >>> from scipy.spatial.transform import RigidTransform
+    >>> along_z = np.outer(np.linspace(0, 10, 51), [0, 0, 1])
+    >>> truth, image = (RigidTransform.from_translation(k * along_z) for k in (1.0, 1.05))
+    >>> (row,) = s3.compare_modes({"image": image}, truth, centre_mm=[19, 20, 0], end_frames=1)
+    >>> print(f"{row.mode}, part {row.part}: {row.length_error_mm:.2f} mm, {row.length_error_percent:.1f} %")
+    image, part f: 0.50 mm, 5.0 %
 
     References
     ----------
@@ -266,6 +295,8 @@ def _change(values: FloatArray, part: Part, end_frames: int) -> float:
 
 def _line_end(values: FloatArray) -> float:
     """Value at the last sample of a Theil-Sen line through `values`."""
+    # scipy.stats.theilslopes gives the same bits, but takes 200 microseconds in place of 40 (25 samples) and
+    # 0.5 s to import, which nothing else in a reconstruction needs.
     if values.size < 3:
         return float(values[-1])
     i, j = np.triu_indices(values.size, 1)

@@ -1,7 +1,7 @@
-"""How sure a study can be: intervals of means over sweeps, and modes compared in pairs.
+"""Confidence intervals of means over sweeps, and paired comparisons of two modes.
 
 A sweep is the unit: one number per sweep and mode. With fewer than `FEWEST` sweeps, or without any scatter,
-there is no interval to be had, and none is given.
+no interval is given.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 
 FEWEST = 3
-"""Below, a bootstrap only repeats the values themselves."""
+"""Sweeps that an interval needs: below, a bootstrap only repeats the values themselves."""
 
 _RESAMPLES = 9999
 _SEED = 20081
@@ -67,9 +67,9 @@ def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterv
     ----------
     .. [1] B. Efron and R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
     """
-    held = _held(np.asarray(values, dtype=float))
+    held = _present(np.asarray(values, dtype=float))
     mean = float(held.mean())
-    if not _tells(held):
+    if not _scatters(held):
         return MeanInterval(held.size, mean, None, None)
     interval = stats.bootstrap(
         (held,),
@@ -97,15 +97,17 @@ def paired_comparison(
     one, other = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     if one.shape != other.shape:
         raise MismatchError(f"second mode: expected values of shape {one.shape}, got {other.shape}")
-    differences = _held(one - other)
+    differences = _present(one - other)
     found = mean_interval(differences, confidence)
-    if not _tells(differences):
+    if not _scatters(differences):
         return PairedComparison(found, None)
     return PairedComparison(found, float(stats.wilcoxon(differences).pvalue))
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """Correct p values of several tests for their number [1]_; None stands for a test that was not made.
+
+    SciPy 1.18 corrects for false discoveries (Benjamini and Hochberg) but not for any error at all (Holm).
 
     References
     ----------
@@ -120,12 +122,12 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-def _held(values: FloatArray) -> FloatArray:
+def _present(values: FloatArray) -> FloatArray:
     held: FloatArray = values[np.isfinite(values)]
     if not held.size:
         raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
     return held
 
 
-def _tells(values: FloatArray) -> bool:
+def _scatters(values: FloatArray) -> bool:
     return values.size >= FEWEST and bool(np.ptp(values) > 0)
