@@ -201,8 +201,6 @@ def score_row(
         Without, the errors at landmarks are None.
     """
     rates = drift_rates(poses, true, np.zeros(3) if grid is None else grid.centre_mm)
-    pixels = None if grid is None else pixel_errors(poses, true, grid)
-    marks = None if landmarks is None else landmark_errors(poses, true, landmarks.frame, landmarks.points_mm)
     return {
         "FDR": rates.final_drift_rate,
         "ADR": rates.average_drift_rate,
@@ -210,10 +208,7 @@ def score_row(
         "SD_mm": rates.sum_of_drift_mm,
         "HD_mm": rates.hausdorff_mm,
         "EA_deg": rates.mean_angle_deg,
-        "GPE_mm": pixels and pixels.global_mm,
-        "GLE_mm": marks and marks.global_mm,
-        "LPE_mm": pixels and pixels.local_mm,
-        "LLE_mm": marks and marks.local_mm,
+        **_point_row(poses, true, grid, landmarks),
     }
 
 
@@ -234,12 +229,25 @@ def challenge_score(
     ----------
     .. [1] TUS-REC challenge 2025, assessment criteria, ranking method.
     """
-    found = score_row(poses, true, grid, landmarks)
-    resting = score_row(RigidTransform.identity(len(true)), true, grid, landmarks)
+    found = _point_row(poses, true, grid, landmarks)
+    resting = _point_row(RigidTransform.identity(len(true)), true, grid, landmarks)
     for key in CHALLENGE_ERRORS:
         if not resting[key] > 0:
             raise InsufficientDataError(f"{key}: expected a reference that moves, got one that rests")
     return float(np.mean([(resting[key] - found[key]) / resting[key] for key in CHALLENGE_ERRORS]))
+
+
+def _point_row(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None
+) -> dict[str, Any]:
+    pixels = None if grid is None else pixel_errors(poses, true, grid)
+    marks = None if landmarks is None else landmark_errors(poses, true, landmarks.frame, landmarks.points_mm)
+    return {
+        "GPE_mm": pixels and pixels.global_mm,
+        "GLE_mm": marks and marks.global_mm,
+        "LPE_mm": pixels and pixels.local_mm,
+        "LLE_mm": marks and marks.local_mm,
+    }
 
 
 def _differences(

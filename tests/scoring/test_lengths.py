@@ -92,7 +92,7 @@ def test_a_sweep_at_rest_is_one_part():
 
 
 def test_parts_of_a_length_that_is_not_finite_are_refused():
-    with pytest.raises(InvalidInputError, match=r"length_mm\[3\]: expected a finite value"):
+    with pytest.raises(InvalidInputError, match=r"length_mm\[3\]"):
         monotone_parts([0.0, 1.0, 2.0, np.nan])
 
 
@@ -174,13 +174,13 @@ def test_a_mirrored_reconstruction_is_turned_round_and_a_true_one_left():
 
 def test_inputs_that_do_not_belong_together_are_named():
     poses = straight(np.linspace(0, 1, 20))
-    with pytest.raises(InvalidInputError, match="at least one mode"):
+    with pytest.raises(InvalidInputError, match="poses"):
         compare_modes({}, poses, CENTRE_MM)
-    with pytest.raises(MismatchError, match="mode pose: expected 20 poses, got 19"):
+    with pytest.raises(MismatchError, match=r"mode pose.*20.*19"):
         compare_modes({"image": poses, "pose": poses[1:]}, poses, CENTRE_MM)
-    with pytest.raises(MismatchError, match="reference: expected 20 poses, got 19"):
+    with pytest.raises(MismatchError, match=r"reference.*20.*19"):
         compare_modes({"image": poses}, poses[1:], CENTRE_MM)
-    with pytest.raises(MismatchError, match=r"covered: expected shape \(20,\), got \(3,\)"):
+    with pytest.raises(MismatchError, match=r"covered.*\(20,\).*\(3,\)"):
         compare_modes({"image": poses}, poses, CENTRE_MM, [True] * 3)
-    with pytest.raises(InsufficientDataError, match="at least 2 poses, got 1"):
+    with pytest.raises(InsufficientDataError, match=r"2 poses.*1"):
         accumulated(poses[:1], CENTRE_MM)

@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.load import load_sweep
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.study import paper
-from speckle3d.study.published import MODES, PUBLISHED, beside, text_beside
+from speckle3d.study.paper import MODES, PUBLISHED, beside, text_beside
 
 
 def row(part, mode, percent, tilt):
@@ -33,7 +34,7 @@ def test_ours_stands_beside_theirs_part_by_part():
     line = next(each for each in text.splitlines() if each.startswith("beef-6 f"))
     assert line.split()[2:5] == ["+14.6", "|", "+2.0"]
     assert "missing" in next(each for each in text.splitlines() if each.startswith("beef-1 "))
-    found = {each.mode: each for each in beside({"truth": rows})}
+    found = {each.mode: each for each in beside({"truth": {"beef-6": rows}})}
     assert found["orientation"].length_percent["truth"].mean == pytest.approx(5.0)
     assert found["orientation"].tilt_deg["truth"].mean == pytest.approx(0.4)
 
@@ -71,5 +72,5 @@ def test_a_sweep_that_cannot_be_simulated_is_named(tiny, shipped, tmp_path, monk
         raise OSError("no space left")
 
     monkeypatch.setattr(paper, "simulate", broken)
-    with pytest.raises(Exception, match=r"beef-1\.h5: cannot be simulated: no space left"):
+    with pytest.raises(InvalidInputError, match=r"beef-1\.h5.*no space left"):
         paper.paper_study(tmp_path, shipped / "curves.h5")
