@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from speckle3d.cli.common import ConfigFile, Json, app, emit, note, progress_bar
 from speckle3d.cli.mounting import CalibrationFiles, mount
 from speckle3d.core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from speckle3d.study.job import JobResult
 
 ReconstructionFile = Annotated[
     Path,
@@ -65,6 +68,12 @@ def reconstruct(
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
         return
     emit(result.table)
+    _tell(result)
+    note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+
+
+def _tell(result: JobResult) -> None:
+    """Say on stderr what limits the results."""
     details = result.summary.details
     for line in details["flagged_frames"]:
         note(f"{line}: poses there are guesses")
@@ -79,7 +88,6 @@ def reconstruct(
         note(
             "nothing tells the sign of the elevational motion: taken as positive (setting sensors.direction)"
         )
-    note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
 
 
 def _find_curves(given: Path | None, sweep_file: Path) -> Path:

@@ -21,8 +21,7 @@ from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
-from speckle3d.scoring.references import Reference, find_reference
-from speckle3d.study.figures import SweepCurves, sweep_curves
+from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
 from speckle3d.study.results import FORMAT, VERSION
 
 Record = Mapping[str, Any]

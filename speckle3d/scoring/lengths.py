@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import mirrored, relative_poses, require_finite, roll_yaw_tilt
+from speckle3d.core.geometry import relative_poses, require_finite, roll_yaw_tilt
 
 JITTER_FRAMES = 9
 """Frames over which a sensor's jitter is averaged to find turning points: a third of a second."""
@@ -133,24 +133,6 @@ def monotone_parts(
     edges = [0, *_turning_frames(smooth, hysteresis_mm), length.size - 1]
     names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
     return [Part(name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)]
-
-
-def align_sign(
-    world_from_image: RigidTransform, reference: RigidTransform, centre_mm: npt.ArrayLike
-) -> RigidTransform:
-    """Mirror a sensorless reconstruction if it moves the other way than the reference.
-
-    Decorrelation measures distances without sign: images alone cannot tell a sweep from its mirror image in
-    the first frame's plane, (z, tilt, yaw) -> (-z, -tilt, -yaw). A comparison would then score the
-    convention and not the method, so it may choose the better of the two. For scoring only: a
-    reconstruction's own sign must come from a sensor or the user.
-    """
-    found, true = accumulated(world_from_image, centre_mm), accumulated(reference, centre_mm)
-    agreement = (found.length_mm - found.length_mm.mean()) @ (true.length_mm - true.length_mm.mean())
-    if agreement >= 0.0:
-        return world_from_image
-    first = world_from_image[0]
-    return first * mirrored(first.inv() * world_from_image)
 
 
 def compare_modes(

@@ -17,13 +17,11 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
-from speckle3d.scoring.references import REFERENCES, Reference
+from speckle3d.scoring.references import REFERENCES, SweepCurves
 
 DOTS_PER_INCH = 150
 CURVE_LABELS = ("length / mm", "tilt / °", "yaw / °", "roll / °")
@@ -107,31 +105,6 @@ class Panel:
     limits: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True)
-class SweepCurves:
-    """Accumulated length (mm), tilt, yaw and roll (degrees) over the frames.
-
-    Attributes
-    ----------
-    modes : dict of str to ndarray, shape (4, n)
-    reference : ndarray, shape (4, n), or None
-        NaN at frames without one.
-    reference_name : str
-    half_width : ndarray, shape (4, n), or None
-        Of the 95 % interval of mode `image`.
-    """
-
-    modes: Mapping[str, FloatArray]
-    reference: FloatArray | None = None
-    reference_name: str = "none"
-    half_width: FloatArray | None = None
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return int(next(iter(self.modes.values())).shape[1])
-
-
 def label_of(mode: str) -> str:
     """Words for a mode."""
     return _MODES[mode][0] if mode in _MODES else mode
@@ -145,39 +118,6 @@ def colour_of(mode: str, modes: Sequence[str] = ()) -> str:
         return _MODES[mode][1]
     others = [m for m in modes if m not in _MODES]
     return _SPARE_COLOURS[others.index(mode) % len(_SPARE_COLOURS) if mode in others else 0]
-
-
-def sweep_curves(
-    poses: Mapping[str, RigidTransform],
-    centre_mm: npt.ArrayLike,
-    reference: Reference | None = None,
-    covariance: FloatArray | None = None,
-) -> SweepCurves:
-    """Accumulate the motion of every mode and of the reference.
-
-    Parameters
-    ----------
-    poses : mapping of str to RigidTransform, length n
-        ``world_from_image`` by mode.
-    centre_mm : array_like, shape (3,)
-        Image centre in the image frame.
-    reference : Reference, optional
-    covariance : ndarray, shape (n, 6, 6), optional
-        Of the poses of mode `image`: (x, y, z) in mm and (tilt, yaw, roll) in radians.
-
-    Raises
-    ------
-    MismatchError
-        If the reference is not of the same frames.
-    """
-    modes = {mode: _accumulated(each, centre_mm) for mode, each in poses.items()}
-    half_width = None
-    if covariance is not None and "image" in modes:
-        half_width = 1.96 * _in_degrees(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:])
-    if reference is None:
-        return SweepCurves(modes, half_width=half_width)
-    shown = _reference_curves(reference, next(iter(modes.values())), centre_mm)
-    return SweepCurves(modes, shown, reference.name, half_width)
 
 
 def curve_panels(
@@ -355,36 +295,6 @@ def label_axes(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _accumulated(poses: RigidTransform, centre_mm: npt.ArrayLike) -> FloatArray:
-    motion = accumulated(poses, centre_mm)
-    return _in_degrees(np.stack([motion.length_mm, motion.tilt_rad, motion.yaw_rad, motion.roll_rad]))
-
-
-def _in_degrees(values: FloatArray) -> FloatArray:
-    """Turn all rows but the first, which is a length, from radians to degrees."""
-    return np.concatenate([values[:1], np.rad2deg(values[1:])])
-
-
-def _reference_curves(reference: Reference, estimate: FloatArray, centre_mm: npt.ArrayLike) -> FloatArray:
-    """Curves of the reference, NaN at frames without one.
-
-    Summed from the first reading on, a tracker's trace would carry that reading's jitter throughout, so it
-    starts at the estimate's level over the first few readings.
-    """
-    used, poses = reference.covered, reference.world_from_image
-    if used.shape != estimate.shape[1:] or len(poses) != used.sum():
-        raise MismatchError(
-            f"reference: expected {used.sum()} poses for {estimate.shape[1]} frames, got {len(poses)}"
-        )
-    curves = _accumulated(poses, centre_mm)
-    if reference.name != "truth":
-        start = (curves - estimate[:, used])[:, :JITTER_FRAMES]
-        curves -= np.median(start, axis=1, keepdims=True)
-    shown = np.full(estimate.shape, np.nan)
-    shown[:, used] = curves
-    return shown
 
 
 def _reslice_size(widths_mm: list[float], height_mm: float) -> tuple[float, float]:

@@ -119,7 +119,9 @@ def grey_images(
     >>> import speckle3d as s3
     >>> sweep = s3.load_sweep("data/phantom.h5")
     >>> images = s3.grey_images(sweep, dynamic_range_db=50.0)
-    >>> images.shape == (len(sweep), sweep.grid.vectors, sweep.grid.samples)
+    >>> images.shape == (len(sweep), images.grid.vectors, images.grid.samples)
+    True
+    >>> bool(0 <= images[0].min() and images[0].max() <= 255)
     True
     """
     settings = None

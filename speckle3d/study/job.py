@@ -26,9 +26,9 @@ from speckle3d.motion.direction import sensed_orientation
 from speckle3d.motion.estimate import Tracked
 from speckle3d.pipeline import Progress, correct, require_modes, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
-from speckle3d.scoring.references import Reference, find_reference
+from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
 from speckle3d.study.blockfiles import BlockFiles
-from speckle3d.study.figures import SweepCurves, figure_drift, figure_reslice, save_figure, sweep_curves
+from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.images import Strip, cut_frames, middle_plane
 from speckle3d.study.results import Summary, table_text, write_summary
 
@@ -180,12 +180,9 @@ def _summarise(
     reference: Reference | None,
     provenance: Provenance,
 ) -> Summary:
-    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
-    estimates: dict[str, dict[str, float]] = {
-        mode: dict(zip(names, curves[:, -1].tolist(), strict=True)) for mode, curves in moved.modes.items()
-    }
-    rows = [ModeError.of_estimate(mode, len(sweep), e["length_mm"]) for mode, e in estimates.items()]
-    if reference is not None:
+    if reference is None:
+        rows = [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
+    else:
         rows = compare_modes(
             poses,
             reference.world_from_image,
@@ -193,9 +190,25 @@ def _summarise(
             reference.covered,
             end_frames=1 if reference.name == "truth" else END_FRAMES,
         )
-    details: dict[str, Any] = {
+    return Summary(
+        sweep.name,
+        reference.name if reference else "none",
+        len(sweep),
+        float(reference.covered.mean()) if reference else 0.0,
+        rows,
+        _details(tracked, corrections, moved, provenance),
+    )
+
+
+def _details(
+    tracked: Tracked, corrections: dict[str, DriftCorrection], moved: SweepCurves, provenance: Provenance
+) -> dict[str, Any]:
+    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
+    return {
         "provenance": provenance,
-        "estimates": estimates,
+        "estimates": {
+            mode: dict(zip(names, c[:, -1].tolist(), strict=True)) for mode, c in moved.modes.items()
+        },
         "pairs": tracked.pairs,
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
@@ -205,14 +218,6 @@ def _summarise(
         "seconds_by_stage": tracked.times.seconds,
         "corrections": {mode: _fit_details(c) for mode, c in corrections.items()},
     }
-    return Summary(
-        sweep.name,
-        reference.name if reference else "none",
-        len(sweep),
-        float(reference.covered.mean()) if reference else 0.0,
-        rows,
-        details,
-    )
 
 
 def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:

@@ -27,7 +27,8 @@ from speckle3d.report.page import write_report
 from speckle3d.report.plots import plot_outlines, plot_panels, plot_rejected
 from speckle3d.report.reslices import cut_modes
 from speckle3d.report.tables import heading_of, intervals_table, paired_table, parts_table, records_table
-from speckle3d.study.figures import SweepCurves, curve_panels, label_of
+from speckle3d.scoring.references import SweepCurves
+from speckle3d.study.figures import curve_panels, label_of
 from speckle3d.study.overall import over_sweeps
 
 

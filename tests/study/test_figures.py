@@ -4,7 +4,7 @@ from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.scoring.lengths import accumulated
-from speckle3d.scoring.references import Reference
+from speckle3d.scoring.references import Reference, sweep_curves
 from speckle3d.study.figures import (
     colour_of,
     curve_panels,
@@ -12,7 +12,6 @@ from speckle3d.study.figures import (
     figure_reslice,
     label_of,
     save_figure,
-    sweep_curves,
     wrapped,
 )
 

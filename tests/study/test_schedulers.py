@@ -54,8 +54,9 @@ def test_jobs_blamed_for_a_death_are_tried_alone_and_only_what_waits_for_the_cau
 
 
 @pytest.mark.slow
-def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_others_are_not(client):
-    found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
+def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_others_are_not():
+    with local_cluster(2) as client:
+        found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
     assert (found[0], found[3]) == (0, 3)
     assert found[1] == found[2] == KILLED
 
@@ -72,19 +73,19 @@ def test_a_cluster_without_workers_does_not_hold_a_study_for_ever(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_killed_worker_costs_only_the_job_it_was_at(client, tmp_path):
-    client.wait_for_workers(2, timeout=120)
+def test_a_killed_worker_costs_only_the_job_it_was_at(tmp_path):
     for number in (0, 1):
         (tmp_path / f"{number}.go").touch()
-    results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost)
-    first = [next(results)[1], next(results)[1]]
-    assert sorted(first) == [0, 1]
-    while not (tmp_path / "2.runs").exists():
-        time.sleep(0.02)
-    os.kill(int((tmp_path / "2.runs").read_text()), signal.SIGKILL)
-    for number in (2, 3):
-        (tmp_path / f"{number}.go").touch()
-    assert sorted(number for _, number in results) == [2, 3]
+    with local_cluster(2) as client:
+        results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost)
+        first = [next(results)[1], next(results)[1]]
+        assert sorted(first) == [0, 1]
+        while not (tmp_path / "2.runs").exists():
+            time.sleep(0.02)
+        os.kill(int((tmp_path / "2.runs").read_text()), signal.SIGKILL)
+        for number in (2, 3):
+            (tmp_path / f"{number}.go").touch()
+        assert sorted(number for _, number in results) == [2, 3]
     runs = {number: len((tmp_path / f"{number}.runs").read_text().split()) for number in range(4)}
     assert runs == {0: 1, 1: 1, 2: 2, 3: 1}
 
