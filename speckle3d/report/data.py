@@ -207,7 +207,7 @@ def _share(part: npt.ArrayLike, whole: npt.ArrayLike) -> FloatArray:
 
 
 def _read_details(folder: Path) -> Record:
-    """Read the sweep's summary as a mapping; empty where it is missing or no longer to be read."""
+    """Read the sweep's summary as a mapping; empty where it is missing or cannot be read."""
     try:
         (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure as Plot
 
 _FIGURE = re.compile(r"(?P<stem>.+-[0-9a-f]{8})-(curves|outlines|reslices|patches)\.(png|svg)")
-"""What a sweep's figures are called: its folder's name, which ends in eight digits of its key, first."""
+"""Names of a sweep's figures: they begin with its folder's name, which ends in eight digits of its key."""
 
 
 @dataclass(frozen=True)

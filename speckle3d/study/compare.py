@@ -61,7 +61,7 @@ class StudyProgress:
     _matched: dict[str, float] = field(default_factory=dict)
 
     def add(self, outcome: SweepOutcome, frames: int, workers: int) -> None:
-        """Count a finished sweep; only those that took time say how long others take."""
+        """Count a finished sweep; skipped and failed ones do not count for the time left."""
         self.done += 1
         self.done_frames += frames - self._matched.pop(outcome.name, 0.0)
         self.failed += outcome.status == "failed"
@@ -173,12 +173,12 @@ def run_task(task: Task) -> TaskOutcome:
 
 
 def lost_task(task: Task, reason: str) -> TaskOutcome:
-    """Outcome of a job that has none of its own."""
+    """Outcome of a job that was lost with its workers."""
     return lost_block(task, reason) if isinstance(task, BlockJob) else lost(task, reason)
 
 
 def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[Task], dict[int, range]]:
-    """All jobs, and which come after which: a long sweep's own after those of its blocks."""
+    """All jobs, and which come after which: a long sweep's job comes after those of its blocks."""
     tasks: list[Task] = []
     after: dict[int, range] = {}
     for job in jobs:

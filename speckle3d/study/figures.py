@@ -57,7 +57,7 @@ _LETTER_IN = 0.085
 """Width of a letter of medium size."""
 
 _FEWEST_LETTERS = 12
-"""In a line of a title: the longest word."""
+"""Letters that a line of a title has at least: those of the longest word."""
 
 
 @dataclass(frozen=True)

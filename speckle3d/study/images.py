@@ -23,7 +23,7 @@ from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
 
 STRIP_MM = 2.4
 PIXEL_MM = 0.1
-"""Of a cut along the sweep, and of the depths that `Strip` keeps."""
+"""Pixel of a cut along the sweep, and spacing of the depths that `Strip` keeps."""
 
 _LARGEST_MM = (400.0, 200.0)
 _GLANCES = 24
@@ -140,7 +140,7 @@ def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Rec
     """
     reconstruction = read_reconstruction(path, with_pairs=False)
     stored = Path(reconstruction.provenance.input_path)
-    # As given, or from where the reconstruction lies.
+    # The stored path is tried as it is, then from the reconstruction's folder.
     source = sweep_file or (stored if stored.is_file() else path.parent / stored)
     if not source.is_file():
         raise InvalidInputError(f"{path}: expected its sweep at {source}, got none; say where it is: --sweep")

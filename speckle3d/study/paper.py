@@ -250,7 +250,7 @@ def _study(
 
 
 def _inputs(directory: Path, wanted: Mapping[str, SimulationSettings]) -> dict[str, _Input]:
-    """Where each sweep goes: a folder whose name says what it was made by."""
+    """File of each sweep, in a folder named by a hash of the settings and the version that make it."""
     settings = "".join(each.model_dump_json() for each in {**SWEEPS, **CURVE_SWEEPS}.values())
     key = hashlib.sha256(f"{settings}{version('speckle3d')}".encode()).hexdigest()[:8]
     folder = directory / "inputs" / key
@@ -274,7 +274,7 @@ def _simulate(
 
 
 def _write_input(job: _Input) -> str:
-    """Simulate one sweep into its file; returned is what went wrong, if anything did."""
+    """Simulate one sweep into its file; returns what went wrong, or an empty string."""
     try:
         made = simulate(job.settings)[0]
         sweep = _with_tracked_orientation(made.sweep) if job.as_published else made.sweep

@@ -58,7 +58,7 @@ class Scheduler(Protocol):
 
 @dataclass(frozen=True)
 class InProcess:
-    """One job after another, here."""
+    """Runs one job after another in this process."""
 
     def run(
         self,
@@ -79,7 +79,7 @@ class InProcess:
 
 @dataclass(frozen=True)
 class OnCluster:
-    """On the workers that a Dask client reaches.
+    """Runs jobs on the workers of a Dask client.
 
     Each job is one task, given to a worker when it is free; a job that comes after others depends on their
     tasks. The task of a worker that dies is given to another; a task that has taken several workers with it
@@ -195,7 +195,7 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Any]:
-    """Client of so many worker processes of one thread each on this machine, ended with the block."""
+    """Client of a cluster of single-threaded worker processes on this machine; both end with the block."""
     with _without_interrupts():
         cluster = _start_local(workers)
     with cluster, _dask().Client(cluster) as client:
@@ -285,7 +285,7 @@ def _failure(future: Any) -> str | None:
 
 
 def _dask() -> Any:
-    """Dask's distributed part, an extra."""
+    """Import Dask's distributed part, which is an extra."""
     try:
         return importlib.import_module("distributed")
     except ImportError as error:

@@ -36,7 +36,7 @@ from speckle3d.study.job import available_modes, require_possible, run_job
 from speckle3d.study.results import SweepOutcome, json_text
 
 DONE = "job.json"
-"""Written last into a sweep's folder."""
+"""File that is written last into a sweep's folder: with it the folder is whole."""
 
 _TEMPORARY = re.compile(r"\.part-[0-9a-f]{8}-")
 """Prefix of temporary names."""
@@ -146,7 +146,7 @@ def run_block(job: BlockJob) -> BlockOutcome:
 
 
 def lost_block(job: BlockJob, reason: str) -> BlockOutcome:
-    """Outcome of a block that has none of its own."""
+    """Outcome of a block that failed or was lost with its workers."""
     return BlockOutcome(job.sweep.name, job.block.stop - job.block.first, reason)
 
 
@@ -204,7 +204,7 @@ def _reconstruct(job: SweepJob, part: Path, files: BlockFiles) -> None:
 
 
 def _modes(job: SweepJob, sweep: Sweep, settings: Config) -> list[str]:
-    """Modes beside `image`, which is there in any case."""
+    """Modes beside `image`, which every job has."""
     modes = available_modes(sweep, settings) if job.modes is None else job.modes
     return [mode for mode in modes if mode != "image"]
 
@@ -256,7 +256,7 @@ def _done(job: SweepJob, seconds: float, skipped: bool = False) -> SweepOutcome:
 
 
 def lost(job: SweepJob, reason: str) -> SweepOutcome:
-    """Outcome of a job that has none of its own; the reason names what was wanted, not temporary files."""
+    """Outcome of a job that failed or was lost with its workers; the reason leaves out temporary names."""
     told = _TEMPORARY.sub("", reason)
     return SweepOutcome(job.name, job.path, "failed", told, job.sha256, job.key, frames=job.frames)
 
