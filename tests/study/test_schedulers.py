@@ -2,6 +2,7 @@ import os
 import signal
 import time
 
+import dask
 import pytest
 from cluster_jobs import double, lost, noted, suicide
 
@@ -55,7 +56,8 @@ def test_jobs_blamed_for_a_death_are_tried_alone_and_only_what_waits_for_the_cau
 
 @pytest.mark.slow
 def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_others_are_not():
-    with local_cluster(2) as client:
+    # A job is given up after its second worker, not its fourth: each takes seconds to be replaced.
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), local_cluster(2) as client:
         found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
     assert (found[0], found[3]) == (0, 3)
     assert found[1] == found[2] == KILLED
