@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
@@ -71,6 +70,8 @@ def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterv
     mean = float(held.mean())
     if not _scatters(held):
         return MeanInterval(held.size, mean, None, None)
+    from scipy import stats  # takes 0.3 s to import, which a single reconstruction does without
+
     interval = stats.bootstrap(
         (held,),
         np.mean,
@@ -101,6 +102,8 @@ def paired_comparison(
     found = mean_interval(differences, confidence)
     if not _scatters(differences):
         return PairedComparison(found, None)
+    from scipy import stats
+
     return PairedComparison(found, float(stats.wilcoxon(differences).pvalue))
 
 
