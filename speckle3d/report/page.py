@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
@@ -79,7 +79,7 @@ class Section:
     quiet: str = ""
 
 
-def write_report(directory: Path, progress: Callable[[int, int], None] | None = None) -> Path:
+def write_report(directory: Path) -> Path:
     """Write ``report.html`` and the folder ``figures`` from a study's ``study.json`` and its sweeps' folders.
 
     The page is one file that needs no network: with scripts its curves, outlines and maps can be turned and
@@ -91,8 +91,6 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
     ----------
     directory : path
         The study's folder.
-    progress : callable, optional
-        Called with the number of sweeps done and of all.
 
     Returns
     -------
@@ -109,11 +107,7 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
     study = read_study(directory)
     with only_run(directory):
         overview = _overview(study)
-        sections = []
-        for i, entry in enumerate(study.done):
-            sections.append(_section(study, entry, f"sweep-{i + 1}"))
-            if progress:
-                progress(i + 1, len(study.done))
+        sections = [_section(study, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
         stems = {str(entry.get("folder", "")).rpartition("/")[2] for entry in study.done}
         _clear_figures(directory / "figures", stems)
         target = directory / "report.html"

@@ -23,6 +23,7 @@ _DETAIL_SHARE = 0.4
 """Largest width of the detail as a share of the shortest reslice."""
 
 NEAR_FIELD_MM = 4.0
+_DYNAMIC_RANGE_DB = 55.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class _Strip:
         return self._images[index].astype(np.float32)
 
 
-def cut_modes(view: SweepView, dynamic_range_db: float = 55.0) -> Cuts | None:
+def cut_modes(view: SweepView) -> Cuts | None:
     """Reslice the sweep at its middle vector in every mode; None where the sweep itself is gone.
 
     The detail shows the place of most contrast in the most trusted trajectory (the reference, else the last
@@ -78,7 +79,7 @@ def cut_modes(view: SweepView, dynamic_range_db: float = 55.0) -> Cuts | None:
     """
     if view.sweep is None:
         return None
-    images = grey_images(view.sweep, dynamic_range_db, reconstruction=view.reconstruction)
+    images = grey_images(view.sweep, _DYNAMIC_RANGE_DB, reconstruction=view.reconstruction)
     strip = _Strip(images)
     left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
     poses = {mode: each * left for mode, each in view.own_poses.items()}

@@ -26,6 +26,9 @@ from speckle3d.core.geometry import relative_poses, require_finite, roll_yaw_til
 JITTER_FRAMES = 9
 """Frames over which a sensor's jitter is averaged to find turning points: a third of a second."""
 
+HYSTERESIS_MM = 0.5
+"""How far the probe must come back for a turn to count."""
+
 END_FRAMES = 25
 """Frames of the line that reads a jittery reference at the ends of a part. On simulated hand sweeps of 20 mm
 with a tracker's 0.15 mm and 0.1 degrees per axis, 1, 9, 25 and 51 frames leave 0.29, 0.16, 0.10 and 0.08 mm
@@ -105,17 +108,13 @@ def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> A
     return Accumulated(length, tilts, yaws, rolls)
 
 
-def monotone_parts(
-    length_mm: npt.ArrayLike, hysteresis_mm: float = 0.5, jitter_frames: int = JITTER_FRAMES
-) -> list[Part]:
+def monotone_parts(length_mm: npt.ArrayLike, jitter_frames: int = JITTER_FRAMES) -> list[Part]:
     """Split a sweep at the frames where the probe turns back.
 
     Parameters
     ----------
     length_mm : array_like, shape (n,)
         Accumulated length of the reference.
-    hysteresis_mm : float
-        A turn counts once the probe has come back by more than this.
     jitter_frames : int
         Width of the median and of the mean that remove a sensor's spikes and jitter first; 1 for none.
 
@@ -130,7 +129,7 @@ def monotone_parts(
         raise InvalidInputError(f"length_mm: expected shape (n,) with n > 1, got {length.shape}")
     width = min(jitter_frames, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
-    edges = [0, *_turning_frames(smooth, hysteresis_mm), length.size - 1]
+    edges = [0, *_turning_frames(smooth), length.size - 1]
     names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
     return [Part(name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)]
 
@@ -140,7 +139,6 @@ def compare_modes(
     reference: RigidTransform,
     centre_mm: npt.ArrayLike,
     covered: npt.ArrayLike | None = None,
-    parts: list[Part] | None = None,
     end_frames: int = END_FRAMES,
 ) -> list[ModeError]:
     """Errors of length, tilt, yaw and roll of every mode in every monotone part.
@@ -160,8 +158,6 @@ def compare_modes(
         Image centre in the image frame.
     covered : array_like of bool, shape (n,), optional
         Which frames have a reference; the others are left out of every sum.
-    parts : list of Part, optional
-        In covered frames; by default the reference's own.
     end_frames : int
         Frames of the line at each end of a part; 1 for an exact reference.
 
@@ -196,7 +192,7 @@ def compare_modes(
     """
     estimates, true = _accumulated_together(poses, reference, centre_mm, covered)
     rows: list[ModeError] = []
-    for part in parts if parts is not None else monotone_parts(true.length_mm):
+    for part in monotone_parts(true.length_mm):
         carrier = next(iter(estimates.values())).length_mm
         reference_mm = _change(carrier, part, 1) + _change(true.length_mm - carrier, part, end_frames)
         rows += [
@@ -206,18 +202,18 @@ def compare_modes(
     return rows
 
 
-def _turning_frames(length: FloatArray, hysteresis: float) -> list[int]:
-    """Frames of the extremes after which `length` comes back by more than `hysteresis`."""
+def _turning_frames(length: FloatArray) -> list[int]:
+    """Frames of the extremes after which `length` comes back by more than `HYSTERESIS_MM`."""
     turns: list[int] = []
     highest = lowest = 0
     direction = 0
     for i, value in enumerate(length):
         highest = i if value > length[highest] else highest
         lowest = i if value < length[lowest] else lowest
-        if direction >= 0 and length[highest] - value > hysteresis:
+        if direction >= 0 and length[highest] - value > HYSTERESIS_MM:
             turns += [highest] if direction else []
             direction, lowest = -1, i
-        elif direction <= 0 and value - length[lowest] > hysteresis:
+        elif direction <= 0 and value - length[lowest] > HYSTERESIS_MM:
             turns += [lowest] if direction else []
             direction, highest = 1, i
     return turns

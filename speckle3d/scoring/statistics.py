@@ -52,8 +52,8 @@ class PairedComparison:
     wilcoxon_p: float | None
 
 
-def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterval:
-    """Mean of one value per sweep, with its percentile bootstrap interval [1]_; seeded, so it repeats.
+def mean_interval(values: npt.ArrayLike) -> MeanInterval:
+    """Mean of one value per sweep, with its 95 % percentile bootstrap interval [1]_; seeded, so it repeats.
 
     NaN stands for a sweep without a value and is left out.
 
@@ -76,16 +76,14 @@ def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterv
         (held,),
         np.mean,
         n_resamples=_RESAMPLES,
-        confidence_level=confidence,
+        confidence_level=0.95,
         method="percentile",
         rng=np.random.default_rng(_SEED),
     ).confidence_interval
     return MeanInterval(held.size, mean, float(interval.low), float(interval.high))
 
 
-def paired_comparison(
-    first: npt.ArrayLike, second: npt.ArrayLike, confidence: float = 0.95
-) -> PairedComparison:
+def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> PairedComparison:
     """Compare two modes by their differences, sweep by sweep; sweeps that lack either are left out.
 
     Raises
@@ -99,7 +97,7 @@ def paired_comparison(
     if one.shape != other.shape:
         raise MismatchError(f"second mode: expected values of shape {one.shape}, got {other.shape}")
     differences = _present(one - other)
-    found = mean_interval(differences, confidence)
+    found = mean_interval(differences)
     if not _scatters(differences):
         return PairedComparison(found, None)
     from scipy import stats
