@@ -65,28 +65,6 @@ class PointErrors:
     local_mm: float
 
 
-@dataclass(frozen=True)
-class DriftRates:
-    """Drift of the image centre with both first frames aligned, as the module's table defines it.
-
-    Attributes
-    ----------
-    final_drift_rate, average_drift_rate : float
-        FDR and ADR, shares of the true path length so far.
-    maximum_drift_mm, sum_of_drift_mm, hausdorff_mm : float
-        MD, SD and HD.
-    mean_angle_deg : float
-        EA.
-    """
-
-    final_drift_rate: float
-    average_drift_rate: float
-    maximum_drift_mm: float
-    sum_of_drift_mm: float
-    hausdorff_mm: float
-    mean_angle_deg: float
-
-
 def pixel_errors(world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid) -> PointErrors:
     """GPE and LPE: displacement errors over every pixel of the images."""
     whole, steps = _differences(world_from_image, reference)
@@ -128,8 +106,20 @@ def landmark_errors(
 
 def drift_rates(
     world_from_image: RigidTransform, reference: RigidTransform, centre_mm: npt.ArrayLike
-) -> DriftRates:
-    """Relate the drift of the image centre to the path it travelled; see `DriftRates`.
+) -> dict[str, float]:
+    """Relate the drift of the image centre to the path it travelled.
+
+    Parameters
+    ----------
+    world_from_image, reference : RigidTransform, length n
+    centre_mm : array_like, shape (3,)
+        Image centre in the image frame.
+
+    Returns
+    -------
+    dict
+        ``FDR`` and ``ADR`` (shares), ``MD_mm``, ``SD_mm``, ``HD_mm`` and ``EA_deg``, as the module's table
+        defines them.
 
     Raises
     ------
@@ -146,14 +136,14 @@ def drift_rates(
     drift = np.linalg.norm(estimated - path, axis=1)[1:]
     moved = travelled > 0
     angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * found.rotation).magnitude())[1:])
-    return DriftRates(
-        final_drift_rate=float(drift[-1] / travelled[-1]),
-        average_drift_rate=float(np.mean(drift[moved] / travelled[moved])),
-        maximum_drift_mm=float(drift.max()),
-        sum_of_drift_mm=float(drift.sum()),
-        hausdorff_mm=max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
-        mean_angle_deg=float(angle.mean()),
-    )
+    return {
+        "FDR": float(drift[-1] / travelled[-1]),
+        "ADR": float(np.mean(drift[moved] / travelled[moved])),
+        "MD_mm": float(drift.max()),
+        "SD_mm": float(drift.sum()),
+        "HD_mm": max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
+        "EA_deg": float(angle.mean()),
+    }
 
 
 def drift_rows(
@@ -201,15 +191,7 @@ def score_row(
         Without, the errors at landmarks are None.
     """
     rates = drift_rates(poses, true, np.zeros(3) if grid is None else grid.centre_mm)
-    return {
-        "FDR": rates.final_drift_rate,
-        "ADR": rates.average_drift_rate,
-        "MD_mm": rates.maximum_drift_mm,
-        "SD_mm": rates.sum_of_drift_mm,
-        "HD_mm": rates.hausdorff_mm,
-        "EA_deg": rates.mean_angle_deg,
-        **_point_row(poses, true, grid, landmarks),
-    }
+    return {**rates, **_point_row(poses, true, grid, landmarks)}
 
 
 def challenge_score(
