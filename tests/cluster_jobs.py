@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from speckle3d.study.compare import run_task
-from speckle3d.study.strip import Strip
+from speckle3d.study.images import Strip
 from speckle3d.study.sweepjob import BlockJob
 
 

@@ -1,4 +1,5 @@
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -48,6 +49,34 @@ def back(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("back") / "back.h5"
     write_sweep(path, simulate(settings)[0].sweep)
     return path
+
+
+@pytest.fixture(scope="session")
+def small_sweeps(tmp_path_factory, shipped) -> Path:
+    """Folder of s5.h5 and s6.h5, simulated tissue of 24 frames, and the curves for them."""
+    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.simulation.presets import SimulationSettings, simulate
+
+    folder = tmp_path_factory.mktemp("small-sweeps")
+    shutil.copy(shipped / "curves.h5", folder)
+    for seed in (5, 6):
+        settings = SimulationSettings(
+            preset="tissue", vectors=26, samples=1000, seed=seed, length_mm=3.0, frames=24
+        )
+        write_sweep(folder / f"s{seed}.h5", simulate(settings)[0].sweep)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def report_study(tmp_path_factory, small_sweeps) -> Path:
+    """Folder of a small study with its report."""
+    from report_examples import small_study
+
+    from speckle3d.report.page import write_report
+
+    folder = small_study(tmp_path_factory.mktemp("report-study"), small_sweeps)
+    write_report(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

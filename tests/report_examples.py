@@ -1,4 +1,7 @@
-"""A small study in a folder: a sweep that is there, one whose file is gone, and one that failed."""
+"""A small study in a folder: a sweep that is there, one whose file is gone, and one that failed.
+
+The second sweep and the reason of the third are what a careless page would take for HTML.
+"""
 
 import json
 import shutil
@@ -8,26 +11,21 @@ from speckle3d.config import Config
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.job import run_job
 
 MODES = ["image", "orientation", "pose"]
 REASON = "torn.h5: /rf: expected <three> axes & more, got none"
+HOSTILE = "<script>alert('gone')</script>"
 
 
-def small_study(folder, curves_file):
-    """Make the study, once for all who ask for this folder; returns the folder."""
-    if (folder / "study.json").is_file():
-        return folder
-    folder.mkdir(exist_ok=True)
+def small_study(folder, sweeps):
+    """Make the study in a folder; returns the folder."""
     source = folder / "forward.h5"
-    settings = SimulationSettings(preset="tissue", vectors=26, samples=1000, seed=5, length_mm=3.0, frames=24)
-    write_sweep(source, simulate(settings)[0].sweep)
-    curves = read_curves(curves_file)
+    shutil.copy(sweeps / "s5.h5", source)
+    curves = read_curves(sweeps / "curves.h5")
     job = run_job(load_sweep(source), source, curves, folder / "sweeps" / "forward-0a", MODES[1:])
     shutil.copytree(folder / "sweeps" / "forward-0a", folder / "sweeps" / "gone-0b")
-    rows = [{"sweep": name, **asdict(row)} for name in ("forward", "gone") for row in job.summary.rows]
+    rows = [{"sweep": name, **asdict(row)} for name in ("forward", HOSTILE) for row in job.summary.rows]
     done = {"sha256": sha256_of(source), "key": "0a", "status": "done", "reason": "", "seconds": 1.25}
     study = {
         "format": "speckle3d.study",
@@ -36,7 +34,7 @@ def small_study(folder, curves_file):
         "modes": MODES,
         "sweeps": [
             {"name": "forward", "path": str(source), "folder": "sweeps/forward-0a", **done},
-            {"name": "gone", "path": str(folder / "gone.h5"), "folder": "sweeps/gone-0b", **done},
+            {"name": HOSTILE, "path": str(folder / "gone.h5"), "folder": "sweeps/gone-0b", **done},
             {"name": "torn", "path": "torn.h5", "sha256": "", "key": "", "status": "failed", "reason": REASON,
              "folder": "sweeps/torn-0c", "seconds": 0.1},
         ],

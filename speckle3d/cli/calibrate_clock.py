@@ -19,7 +19,6 @@ from speckle3d.cli.common import (
     Region,
     calibrate,
     emit,
-    emit_json,
     note,
     progress_bar,
 )
@@ -64,7 +63,7 @@ def calibrate_clock(
     with the other sign.
     """
     from speckle3d.io.calibrations import write_calibration
-    from speckle3d.study.summary import plain
+    from speckle3d.study.results import json_text
 
     if out is not None:
         require_free(out, images, poses, calibration)
@@ -85,7 +84,7 @@ def calibrate_clock(
             "followed": found.followed,
             "frames": frames,
         }
-        emit_json(plain(table))
+        emit(json_text(table))
         return
     emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
     emit(told)

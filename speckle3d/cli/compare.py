@@ -23,6 +23,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.study.compare import StudyProgress
+    from speckle3d.study.results import Study
 
 
 @app.command()
@@ -36,7 +37,7 @@ def compare(
         list[str] | None,
         typer.Option(help="image+subset, orientation or pose; may be repeated. By default all possible."),
     ] = None,
-    reference: Annotated[str | None, typer.Option(help="tracker or truth: what to compare with.")] = None,
+    reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,
     curves_file: Annotated[
         Path | None,
         typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside each sweep."),
@@ -62,7 +63,6 @@ def compare(
     from speckle3d.report.page import write_report
     from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study
-    from speckle3d.study.results import copy_lines
     from speckle3d.study.schedulers import scheduler_for
 
     settings = load_settings(config_file)
@@ -83,15 +83,23 @@ def compare(
             )
     write_report(out)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
+    _tell(study, copies=as_json or table is not None)
+
+
+def _tell(study: Study, copies: bool) -> None:
+    """Say on stderr what became of the sweeps; fail if all did."""
+    from speckle3d.study.results import copy_lines
+
     failed = [each for each in study.outcomes if each.status == "failed"]
     skipped = sum(each.skipped for each in study.outcomes)
     if skipped:
         note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
-    if as_json or table:
+    if copies:
         for line in copy_lines(study.copies):
             note(line)
     for each in failed:
         note(f"{each.name}: failed: {each.reason}")
+    out = study.directory
     note(f"results in {out}; the report is {out / 'report.html'}")
     if len(failed) == len(study.outcomes):
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")

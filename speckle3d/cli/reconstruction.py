@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +20,19 @@ from speckle3d.cli.common import (
 )
 from speckle3d.core.errors import InvalidInputError
 
+if TYPE_CHECKING:
+    from speckle3d.study.job import JobResult
+
+ReconstructionFile = Annotated[
+    Path,
+    typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder."),
+]
+Mode = Annotated[str, typer.Option(help="Which poses to use: image, orientation, pose.")]
+SweepFile = Annotated[
+    Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
+]
+DynamicRange = Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")]
+
 
 @app.command()
 def reconstruct(
@@ -29,9 +42,10 @@ def reconstruct(
         Path | None, typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside SWEEP.")
     ] = None,
     drift: Annotated[
-        list[str] | None, typer.Option(help="Correction mode: orientation or pose; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Correction mode: orientation, pose or image+subset; may be repeated."),
     ] = None,
-    reference: Annotated[str | None, typer.Option(help="tracker or truth: what to compare with.")] = None,
+    reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,
     consistent_subset: Annotated[
         bool | None,
         typer.Option(help="In mode orientation, drop distances that the sensed orientation contradicts."),
@@ -63,6 +77,12 @@ def reconstruct(
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
         return
     emit(result.table)
+    _tell(result)
+    note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+
+
+def _tell(result: JobResult) -> None:
+    """Say on stderr what limits the results."""
     details = result.summary.details
     for line in details["flagged_frames"]:
         note(f"{line}: poses there are guesses")
@@ -77,7 +97,6 @@ def reconstruct(
         note(
             "nothing tells the sign of the elevational motion: taken as positive (setting sensors.direction)"
         )
-    note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
 
 
 def _find_curves(given: Path | None, sweep_file: Path) -> Path:
@@ -95,51 +114,49 @@ def _find_curves(given: Path | None, sweep_file: Path) -> Path:
 
 @app.command()
 def volume(
-    reconstruction_file: Annotated[Path, typer.Argument(metavar="RECONSTRUCTION")],
+    reconstruction_file: ReconstructionFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha or .nii.gz to write.")],
-    mode: Annotated[str, typer.Option(help="image, orientation, pose: which poses to use.")] = "image",
+    mode: Mode = "image",
     voxel_mm: Annotated[float, typer.Option(help="Side of a voxel.")] = 0.2,
-    sweep_file: Annotated[
-        Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
-    ] = None,
-    dynamic_range_db: Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")] = 60.0,
+    sweep_file: SweepFile = None,
+    dynamic_range_db: DynamicRange = 60.0,
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode."""
     from speckle3d.imaging.volume import compound
     from speckle3d.io.volumes import write_volume
+    from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.images import grey_images, open_reconstruction
 
     reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
     with progress_bar(f"compounding {out.name}") as progress:
         images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
-        voxels = compound(images, images.grid, _poses(reconstruction, mode), voxel_mm, voxel_type="uint8")
+        voxels = compound(images, images.grid, poses_of(reconstruction, mode), voxel_mm, voxel_type="uint8")
     write_volume(out, voxels)
 
 
 @app.command()
 def reslice(
-    reconstruction_file: Annotated[Path, typer.Argument(metavar="RECONSTRUCTION")],
+    reconstruction_file: ReconstructionFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="PNG to write.")],
-    mode: Annotated[str, typer.Option(help="image, orientation, pose: which poses to use.")] = "image",
+    mode: Mode = "image",
     lateral_mm: Annotated[
         float | None, typer.Option(help="Cut along the sweep at this lateral position (middle).")
     ] = None,
     depth_mm: Annotated[float | None, typer.Option(help="Cut parallel to the skin at this depth.")] = None,
     reach_mm: Annotated[float, typer.Option(help="Frames farther from a pixel do not count.")] = 0.5,
-    sweep_file: Annotated[
-        Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
-    ] = None,
-    dynamic_range_db: Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")] = 60.0,
+    sweep_file: SweepFile = None,
+    dynamic_range_db: DynamicRange = 60.0,
 ) -> None:
     """Cut a plane straight from the frames, at the poses of one mode."""
     from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames, surface_plane
+    from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.figures import figure_reslice, save_figure
     from speckle3d.study.images import grey_images, open_reconstruction
 
     if lateral_mm is not None and depth_mm is not None:
         raise InvalidInputError("expected --lateral-mm or --depth-mm, got both")
     reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
-    poses = _poses(reconstruction, mode)
+    poses = poses_of(reconstruction, mode)
     with progress_bar(f"reslicing {out.name}") as progress:
         images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
         if depth_mm is not None:
@@ -154,10 +171,3 @@ def reslice(
     decibel = cut / 255 * dynamic_range_db
     figure = figure_reslice({mode: decibel}, {mode: extent}, dynamic_range_db, sweep.name, labels)
     save_figure(figure, out)
-
-
-def _poses(reconstruction: Any, mode: str) -> Any:
-    if mode not in reconstruction.poses:
-        held = ", ".join(reconstruction.poses)
-        raise InvalidInputError(f"--mode: expected one of {held}, got {mode!r}")
-    return reconstruction.poses[mode]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
 from speckle3d.cli.common import Json, app, emit, note, require_own_place
+from speckle3d.cli.reconstruction import Mode, ReconstructionFile
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 trajectory = typer.Typer(help="Trajectories as TUM text, and scores of them.", no_args_is_help=True)
 app.add_typer(trajectory, name="trajectory")
 
-Unit = Annotated[str, typer.Option("--length-unit", help="m or mm: of TUM text.")]
+Unit = Annotated[str, typer.Option("--length-unit", help="Unit of lengths in TUM text: m or mm.")]
 
 _LABELS = (
     ("FDR", "final drift rate (FDR)", "{:.2%}"),
@@ -36,9 +36,9 @@ _LABELS = (
 
 @trajectory.command()
 def export(
-    reconstruction_file: Annotated[Path, typer.Argument(metavar="RECONSTRUCTION")],
+    reconstruction_file: ReconstructionFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="Text file to write.")],
-    mode: Annotated[str, typer.Option(help="image, orientation, pose: which poses to use.")] = "image",
+    mode: Mode = "image",
     length_unit: Unit = "m",
 ) -> None:
     """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""
@@ -58,17 +58,18 @@ def score(
         Path, typer.Argument(metavar="REFERENCE", help="TUM text, sweep, TUS-REC scan or reconstruction.")
     ],
     mode: Annotated[
-        str | None, typer.Option(help="image (by default), orientation, pose: of a reconstruction.")
+        str | None,
+        typer.Option(help="Poses of a reconstruction: image (by default), orientation, pose."),
     ] = None,
-    reference: Annotated[str | None, typer.Option(help="tracker or truth: of a sweep.")] = None,
+    reference: Annotated[str | None, typer.Option(help="Which poses of a sweep: tracker or truth.")] = None,
     length_unit: Annotated[
-        str | None, typer.Option(help="m or mm: of TUM text that does not say; else metres.")
+        str | None, typer.Option(help="Unit of lengths in TUM text that does not say: m (by default) or mm.")
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Score a trajectory: pose errors as evo has them, drift rates, displacement of pixels and landmarks."""
     from speckle3d.scoring.trajectories import compare_trajectories, load_estimate, load_reference
-    from speckle3d.study.summary import plain
+    from speckle3d.study.results import json_text
 
     _require_meaning(estimate_file, reference_file, mode, reference, length_unit)
     unit, chosen = cast("LengthUnit | None", length_unit), mode or "image"
@@ -80,10 +81,9 @@ def score(
             "the scores mean nothing unless both hold the same recording"
         )
     if as_json:
-        emit(json.dumps(plain(found), indent=2, allow_nan=False))
+        emit(json_text(found))
         return
-    for line in _lines(found):
-        emit(line)
+    emit(_table(found))
     if found["left_out"]:
         note(f"{found['left_out']} poses of {estimate.name} have no reference and were left out")
     if found["GPE_mm"] is None:
@@ -93,7 +93,7 @@ def score(
 def _require_meaning(
     estimate: Path, of: Path, mode: str | None, reference: str | None, length_unit: str | None
 ) -> None:
-    """Refuse options that nothing would be done with."""
+    """Refuse options that would have no effect on these files."""
     from speckle3d.scoring.trajectories import kind_of
 
     kinds = kind_of(estimate), kind_of(of)
@@ -108,7 +108,9 @@ def _require_meaning(
             raise InvalidInputError(f"{name} {value}: is of {words}, expected none with {where}")
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
+def _table(found: dict[str, Any]) -> str:
+    from speckle3d.core.tables import text_table
+
     rows = [("poses", str(found["poses"]))]
     for name, words in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
         each = found[name]
@@ -117,5 +119,4 @@ def _lines(found: dict[str, Any]) -> list[str]:
             (f"{words}, largest", f"{each.max_mm:.4f} mm, {each.max_deg:.4f} deg"),
         ]
     rows += [(words, form.format(found[key])) for key, words, form in _LABELS if found[key] is not None]
-    width = max(len(words) for words, _ in rows)
-    return [f"{words.ljust(width)}  {value}" for words, value in rows]
+    return text_table(rows, (0, 1), heading=False)

@@ -1,4 +1,4 @@
-"""What the report shows of one sweep, gathered from its folder and, where it is still there, the sweep."""
+"""What the report shows: the study's numbers, and of each sweep what its folder and the sweep itself hold."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
 from speckle3d.core.sweep import Sweep
@@ -20,42 +21,56 @@ from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
-from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
-from speckle3d.study.job import Reference, find_reference
+from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
+from speckle3d.study.results import FORMAT, VERSION
 
-FORMAT = "speckle3d.study"
-VERSION = 1
-
-QUANTITIES = ("length", "tilt", "yaw", "roll")
-"""What the curves show, in millimetres and then degrees."""
-
-_COVARIANCE_AXES = [2, 3, 4, 5]
-"""Where those are in (x, y, z, tilt, yaw, roll)."""
+Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class SweepCurves:
-    """Accumulated length (mm), tilt, yaw and roll (degrees) over the frames.
+class StudyData:
+    """What ``study.json`` holds.
 
     Attributes
     ----------
-    modes : dict of str to ndarray, shape (4, n)
-    reference : ndarray, shape (4, n), or None
-        NaN at frames without one.
-    reference_name : str
-    half_width : ndarray, shape (4, n), or None
-        Of the 95 % interval of mode `image`.
+    directory : path
+        The study's folder.
+    modes : list of str
+        In the study's order.
+    done, broken : list of mapping
+        Entries of the sweeps with and without results.
+    rows : list of mapping
+        Errors by sweep, part and mode.
+    drift, intervals, paired : list of mapping
+        Drift by sweep and mode, means over sweeps, and modes compared in pairs.
+    settings_toml : str
     """
 
-    modes: dict[str, FloatArray]
-    reference: FloatArray | None
-    reference_name: str
-    half_width: FloatArray | None
+    directory: Path
+    modes: list[str]
+    done: list[Record]
+    broken: list[Record]
+    rows: list[Record]
+    drift: list[Record]
+    intervals: list[Record]
+    paired: list[Record]
+    settings_toml: str
 
     @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return int(next(iter(self.modes.values())).shape[1])
+    def copies(self) -> dict[str, str]:
+        """Sweeps whose bytes are those of an earlier one, and that one's name."""
+        return {entry["name"]: entry["copy_of"] for entry in self.done if entry.get("copy_of")}
+
+    @property
+    def single(self) -> list[Record]:
+        """Rows of all sweeps but copies."""
+        copies = self.copies
+        return [row for row in self.rows if row["sweep"] not in copies]
+
+    @property
+    def references(self) -> dict[str, str]:
+        """What each sweep was compared with, copies left out."""
+        return {row["sweep"]: row["reference"] for row in self.single if row.get("reference")}
 
 
 @dataclass(frozen=True)
@@ -98,11 +113,11 @@ class SweepView:
     own_poses: dict[str, RigidTransform]
     rejected: RejectedPatches | None
     sweep: Sweep | None
-    details: Mapping[str, Any]
+    details: Record
     notes: list[str] = field(default_factory=list)
 
 
-def read_study(directory: Path) -> dict[str, Any]:
+def read_study(directory: Path) -> StudyData:
     """Read ``study.json``.
 
     Raises
@@ -121,10 +136,21 @@ def read_study(directory: Path) -> dict[str, Any]:
         raise InvalidInputError(f"{path}: expected format {FORMAT!r}, got another")
     if found.get("version") != VERSION:
         raise InvalidInputError(f"{path}: expected version {VERSION}, got {found.get('version')!r}")
-    return found
+    rows: list[Record] = [row for row in found.get("rows", []) if isinstance(row, dict)]
+    return StudyData(
+        directory,
+        list(dict.fromkeys([*found.get("modes", []), *(row["mode"] for row in rows)])),
+        [entry for entry in found["sweeps"] if entry.get("status") == "done"],
+        [entry for entry in found["sweeps"] if entry.get("status") != "done"],
+        rows,
+        found.get("drift") or [],
+        found.get("intervals") or [],
+        found.get("paired") or [],
+        str(found.get("settings_toml", "")),
+    )
 
 
-def load_view(directory: Path, entry: Mapping[str, Any]) -> SweepView:
+def load_view(directory: Path, entry: Record) -> SweepView:
     """Gather what there is to show of a sweep that is done.
 
     Parameters
@@ -148,13 +174,14 @@ def load_view(directory: Path, entry: Mapping[str, Any]) -> SweepView:
     own = dict(found.poses)
     if reference is not None and reference.covered.all():
         own[reference.name] = reference.world_from_image
+    covariance = None if found.trust is None else found.trust.covariance
     if found.trust is not None:
         notes += [f"{line}: poses there are guesses" for line in describe(found.trust.flags)]
     return SweepView(
         name=str(entry["name"]),
         folder=folder,
         reconstruction=found,
-        curves=_curves(found, reference),
+        curves=sweep_curves(found.poses, found.grid.centre_mm, reference, covariance),
         poses={mode: each[0].inv() * each for mode, each in own.items()},
         own_poses=own,
         rejected=None if found.pairs is None else rejected_patches(found.pairs, found.frame_time_s.size),
@@ -174,13 +201,13 @@ def rejected_patches(pairs: FramePairs, frames: int) -> RejectedPatches:
     )
 
 
-def _share(part: Any, whole: Any) -> FloatArray:
+def _share(part: npt.ArrayLike, whole: npt.ArrayLike) -> FloatArray:
     counts = np.asarray(whole, dtype=float)
     return np.asarray(np.divide(part, counts, out=np.full(counts.shape, np.nan), where=counts > 0))
 
 
-def _read_details(folder: Path) -> Mapping[str, Any]:
-    """Read the sweep's summary as a mapping; empty where it is missing or no longer to be read."""
+def _read_details(folder: Path) -> Record:
+    """Read the sweep's summary as a mapping; empty where it is missing or cannot be read."""
     try:
         (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -188,9 +215,7 @@ def _read_details(folder: Path) -> Mapping[str, Any]:
     return summary if isinstance(summary, dict) else {}
 
 
-def _open_sweep(
-    directory: Path, entry: Mapping[str, Any], found: Reconstruction, notes: list[str]
-) -> Sweep | None:
+def _open_sweep(directory: Path, entry: Record, found: Reconstruction, notes: list[str]) -> Sweep | None:
     stored = Path(str(entry["path"]))
     path = stored if stored.is_file() else directory / stored
     missing = "so there is no reference in its curves and there are no reslices"
@@ -207,7 +232,7 @@ def _open_sweep(
         return None
 
 
-def _open_reference(sweep: Sweep | None, details: Mapping[str, Any], notes: list[str]) -> Reference | None:
+def _open_reference(sweep: Sweep | None, details: Record, notes: list[str]) -> Reference | None:
     wanted = details.get("reference")
     if sweep is None or wanted == "none":
         return None
@@ -216,36 +241,3 @@ def _open_reference(sweep: Sweep | None, details: Mapping[str, Any], notes: list
     except Speckle3DError as error:
         notes.append(f"The reference cannot be read: {error}")
         return None
-
-
-def _curves(found: Reconstruction, reference: Reference | None) -> SweepCurves:
-    centre = found.grid.centre_mm
-    modes = {mode: _accumulated(each, centre) for mode, each in found.poses.items()}
-    half_width = None
-    if found.trust is not None:
-        deviation = np.sqrt(np.diagonal(found.trust.covariance, axis1=1, axis2=2)).T[_COVARIANCE_AXES]
-        half_width = 1.96 * _in_degrees(deviation)
-    shown = None if reference is None else _reference_curves(reference, modes["image"], centre)
-    return SweepCurves(modes, shown, reference.name if reference else "none", half_width)
-
-
-def _reference_curves(reference: Reference, estimate: FloatArray, centre_mm: FloatArray) -> FloatArray:
-    """Reference's curves; a jittery one starts at the estimate's level over its first few readings."""
-    used: BoolArray = reference.covered
-    poses = reference.world_from_image
-    curves = _accumulated(poses[used] if len(poses) == used.size else poses, centre_mm)
-    if reference.name != "truth":
-        start = (curves - estimate[:, used])[:, :JITTER_FRAMES]
-        curves -= np.median(start, axis=1, keepdims=True)
-    shown = np.full(estimate.shape, np.nan)
-    shown[:, used] = curves
-    return shown
-
-
-def _accumulated(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    motion = accumulated(poses, centre_mm)
-    return _in_degrees(np.stack([motion.length_mm, motion.tilt_rad, motion.yaw_rad, motion.roll_rad]))
-
-
-def _in_degrees(values: FloatArray) -> FloatArray:
-    return np.concatenate([values[:1], np.rad2deg(values[1:])])

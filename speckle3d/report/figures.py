@@ -1,4 +1,4 @@
-"""The report's figures as they are printed and filed: PNG and SVG, drawn without a window system."""
+"""The report's figures: what is drawn, and how matplotlib draws it into PNG, SVG and JPEG files."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -22,10 +21,23 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.report.data import RejectedPatches, SweepCurves
+from speckle3d.report.data import Record, RejectedPatches
 from speckle3d.report.reslices import Cut, Cuts
-from speckle3d.study.figures import DOTS_PER_INCH, MODE_COLOURS, MODE_LABELS, wrapped
-from speckle3d.study.job import REFERENCES
+from speckle3d.scoring.references import REFERENCES
+from speckle3d.study.figures import (
+    DOTS_PER_INCH,
+    Panel,
+    Series,
+    Style,
+    colour_of,
+    draw_panel,
+    figure_panels,
+    label_axes,
+    label_of,
+    new_figure,
+    show_grey,
+    wrapped,
+)
 from speckle3d.study.overall import mean_over_sweeps
 
 MOST_POINTS = 240
@@ -34,26 +46,7 @@ MOST_POINTS = 240
 OUTLINES = 20
 """Frames whose outlines are drawn."""
 
-CURVE_LABELS = ("length / mm", "tilt / °", "yaw / °", "roll / °")
-
-_SPARE_COLOURS = ("#CC79A7", "#56B4E9", "#E69F00", "#F0E442")
-_DASHES = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)))
-_BLANK = "#33415c"
-
-
-def label_of(mode: str) -> str:
-    """Words for a mode."""
-    return MODE_LABELS.get(mode, mode)
-
-
-def colour_of(mode: str, modes: Sequence[str] = ()) -> str:
-    """Colour of a mode, the same wherever it appears; the reference is black."""
-    if mode in REFERENCES:
-        return "#000000"
-    if mode in MODE_COLOURS:
-        return MODE_COLOURS[mode]
-    others = [m for m in modes if m not in MODE_COLOURS]
-    return _SPARE_COLOURS[others.index(mode) % len(_SPARE_COLOURS) if mode in others else 0]
+_DETAIL_COLOUR = "#ffd000"
 
 
 def decimated(frames: int) -> npt.NDArray[np.int64]:
@@ -61,84 +54,67 @@ def decimated(frames: int) -> npt.NDArray[np.int64]:
     return np.unique(np.linspace(0, frames - 1, min(frames, MOST_POINTS)).round().astype(np.int64))
 
 
-def outline(poses: RigidTransform, grid: ImageGrid) -> FloatArray:
-    """Outlines of some frames as one broken line, shape (m, 3), mm: NaN between them."""
-    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), OUTLINES)).round().astype(int))
-    closed = grid.corners_mm[[0, 1, 2, 3, 0]]
-    breaks = np.full((1, 3), np.nan)
-    return np.concatenate([np.concatenate([poses[int(i)].apply(closed), breaks]) for i in chosen])
-
-
-def figure_overview(rows: Sequence[Mapping[str, Any]], modes: Sequence[str]) -> Figure:
+def overview_panels(rows: Sequence[Record], modes: Sequence[str]) -> list[Panel]:
     """Errors of length and tilt: a point for every part of every sweep, a bar at the mean magnitude."""
-    figure = _figure(9.0, 1.3 + 0.5 * len(modes))
-    panels = figure.subplots(1, 2, sharey=True)
-    for panel, key, name in zip(
-        panels,
-        ("length_error_percent", "tilt_error_deg"),
-        ("length error / %", "tilt error / °"),
-        strict=True,
-    ):
-        panel.axvline(0.0, color="0.6", linewidth=0.8)
+    panels = []
+    for key, name in (("length_error_percent", "length error / %"), ("tilt_error_deg", "tilt error / °")):
+        series = []
         for level, mode in enumerate(modes):
             mine = [row for row in rows if row["mode"] == mode and row.get(key) is not None]
-            values = [row[key] for row in mine]
-            spread = level + 0.3 * (np.arange(len(values)) / max(len(values) - 1, 1) - 0.5)
-            panel.plot(values, spread, "o", color=colour_of(mode, modes), markersize=4, alpha=0.7)
-            if values:
-                size = mean_over_sweeps(mine, key)
-                panel.plot(
-                    [-size, size], [level, level], color=colour_of(mode, modes), linewidth=6, alpha=0.25
-                )
-        _label(panel, name, "")
-    panels[0].set_yticks(range(len(modes)), [label_of(mode) for mode in modes])
-    panels[0].invert_yaxis()
-    return figure
+            if not mine:
+                continue
+            size, look = mean_over_sweeps(mine, key), (label_of(mode), colour_of(mode, modes))
+            spread = level + 0.3 * (np.arange(len(mine)) / max(len(mine) - 1, 1) - 0.5)
+            points = np.column_stack([[row[key] for row in mine], spread])
+            words = [f"{row['sweep']}, part {row['part']}" for row in mine]
+            series.append(Series(*look, np.array([[-size, level], [size, level]]), "bar"))
+            series.append(Series(*look, points, "points", words=words))
+        panels.append(Panel(series, (name, ""), [label_of(mode) for mode in modes]))
+    return panels
 
 
-def figure_curves(curves: SweepCurves) -> Figure:
-    """Draw accumulated length, tilt, yaw and roll over the frames, for every mode and the reference.
-
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
-    """
-    figure = _figure(9.0, 6.0)
-    panels = figure.subplots(2, 2, sharex=True).ravel()
-    frames = decimated(curves.frames)
-    for q, panel in enumerate(panels):
-        if curves.reference is not None:
-            panel.plot(frames, curves.reference[q][frames], color="black", linewidth=2.4, alpha=0.5,
-                       label=curves.reference_name)  # fmt: skip
-        if curves.half_width is not None:
-            middle, half = curves.modes["image"][q][frames], curves.half_width[q][frames]
-            panel.fill_between(frames, middle - half, middle + half, color=colour_of("image"), alpha=0.15,
-                               linewidth=0, label=f"95 % of {label_of('image')}")  # fmt: skip
-        for i, (mode, values) in enumerate(curves.modes.items()):
-            panel.plot(frames, values[q][frames], color=colour_of(mode, [*curves.modes]), linewidth=1.3,
-                       linestyle=_DASHES[i % len(_DASHES)], label=label_of(mode))  # fmt: skip
-        _label(panel, "frame" if q > 1 else "", CURVE_LABELS[q])
-    panels[0].legend(frameon=False, fontsize="small")
-    return figure
+def outline_series(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> list[Series]:
+    """Outlines of some frames of every mode in space, shape (n, 3), mm, the reference first."""
+    closed = grid.corners_mm[[0, 1, 2, 3, 0]]
+    breaks = np.full((1, 3), np.nan)
+    found = []
+    for mode in sorted(poses, key=lambda name: name not in REFERENCES):
+        frames = np.linspace(0, len(poses[mode]) - 1, min(len(poses[mode]), OUTLINES)).round().astype(int)
+        lines = [np.concatenate([poses[mode][int(i)].apply(closed), breaks]) for i in np.unique(frames)]
+        style: Style = "reference" if mode in REFERENCES else "line"
+        found.append(Series(label_of(mode), colour_of(mode, list(poses)), np.concatenate(lines), style))
+    return found
 
 
-def figure_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid, reference: str) -> Figure:
-    """Draw the frames' outlines of every mode in space, the reference's in grey behind each."""
-    shown = [mode for mode in poses if mode != reference] or list(poses)
-    figure = _figure(3.1 * len(shown), 3.5)
-    lines = {mode: outline(each, grid) for mode, each in poses.items()}
-    everything = np.concatenate(list(lines.values()))
-    low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
+def rejected_panel(rejected: RejectedPatches) -> Panel:
+    """Share of the patches that were left out, over the frames."""
+    frames = decimated(rejected.frame_share.size)
+    line = Series("", "#404040", np.column_stack([frames, 100.0 * rejected.frame_share[frames]]), "dotted")
+    return Panel([line], ("frame", "patches left out / %"), limits=(0.0, 100.0))
+
+
+def figure_overview(panels: Sequence[Panel]) -> Figure:
+    """Draw `overview_panels` side by side."""
+    return figure_panels(panels, 2, (9.0, 1.3 + 0.5 * len(panels[0].levels)))
+
+
+def figure_outlines(series: Sequence[Series]) -> Figure:
+    """Draw the outlines of every mode in space side by side, the reference's in grey behind each."""
+    behind = [each for each in series if each.style == "reference"]
+    shown = [each for each in series if each.style != "reference"]
+    figure = new_figure(3.1 * len(shown), 3.5)
+    everything = np.concatenate([each.points for each in series])
+    extent = np.nanmax(everything, axis=0) - np.nanmin(everything, axis=0)
     for i, mode in enumerate(shown):
         axes: Any = figure.add_subplot(1, len(shown), i + 1, projection="3d")
-        if reference in lines:
-            _outline(axes, lines[reference], color="0.55", linewidth=0.8)
-        _outline(axes, lines[mode], color=colour_of(mode, shown), linewidth=0.9)
+        for each in (*behind, mode):
+            colour = "0.55" if each in behind else each.colour
+            axes.plot(*each.points[:, [2, 0, 1]].T, color=colour, linewidth=0.9)
         for axis, name in ((axes.xaxis, "elevational"), (axes.yaxis, "lateral"), (axes.zaxis, "depth")):
             axis.set_label_text(f"{name} / mm", fontsize="small")
             axis.set_major_locator(MaxNLocator(4))
-        axes.set_title(wrapped(label_of(mode), 3.1), fontsize="medium", color=colour_of(mode, shown), y=0.95)
-        axes.set_box_aspect(np.maximum(high - low, 0.15 * (high - low).max())[[2, 0, 1]], zoom=0.62)
+        axes.set_title(wrapped(mode.label, 3.1), fontsize="medium", color=mode.colour, y=0.95)
+        axes.set_box_aspect(np.maximum(extent, 0.15 * extent.max())[[2, 0, 1]], zoom=0.62)
         axes.tick_params(labelsize=6)
         axes.invert_zaxis()
         axes.view_init(elev=22, azim=-62)
@@ -152,7 +128,7 @@ def figure_cuts(cuts: Cuts) -> Figure:
     tall = max(cut.extent_mm[1] for cut in cuts.by_mode.values())
     scale = min(9.0 / sum(widths), 5.5 / tall)
     below = min(w * scale for w in widths) * 0.8
-    figure = _figure(max(scale * sum(widths) + 1.2, 5.0), scale * tall + below + 1.4, "compressed")
+    figure = new_figure(max(scale * sum(widths) + 1.2, 5.0), scale * tall + below + 1.4, "compressed")
     panels = figure.subplots(2, len(modes), squeeze=False, width_ratios=widths,
                              height_ratios=[scale * tall, below])  # fmt: skip
     for i, (mode, cut) in enumerate(cuts.by_mode.items()):
@@ -173,7 +149,7 @@ def figure_rejected(rejected: RejectedPatches, cuts: Cuts | None, grid: ImageGri
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 4.
     """
-    figure = _figure(9.0, 4.0)
+    figure = new_figure(9.0, 4.0)
     image, sweep = figure.subplots(1, 2, width_ratios=[1.0, 1.5])
     if cuts is not None:
         right = (0.0, cuts.grid.width_mm, cuts.grid.depth_mm, cuts.grid.first_sample_depth_mm)
@@ -190,11 +166,8 @@ def figure_rejected(rejected: RejectedPatches, cuts: Cuts | None, grid: ImageGri
     image.add_collection(boxes)
     image.set(xlim=(0.0, grid.width_mm), ylim=(grid.depth_mm, grid.first_sample_depth_mm), aspect="equal")
     figure.colorbar(boxes, ax=image, label="left out / % of the pairs")
-    _label(image, "lateral / mm", "depth / mm", grid=False)
-    frames = decimated(rejected.frame_share.size)
-    sweep.plot(frames, 100.0 * rejected.frame_share[frames], ".-", color="0.25", linewidth=0.8, markersize=3)
-    sweep.set_ylim(0.0, 100.0)
-    _label(sweep, "frame", "patches left out / %")
+    label_axes(image, "lateral / mm", "depth / mm")
+    draw_panel(sweep, rejected_panel(rejected))
     return figure
 
 
@@ -205,17 +178,17 @@ def patch_size(centre_mm: FloatArray) -> tuple[float, float]:
     return sides[0], sides[1]
 
 
-def save_both(figure: Figure, stem: Path) -> list[Path]:
-    """Write ``stem.png`` and ``stem.svg``; each appears whole or not at all."""
+def save_both(figure: Figure, stem: Path) -> bytes:
+    """Write ``stem.png`` and ``stem.svg``, each whole or not at all; returns the SVG."""
     make_folder(stem.parent)
     figure.draw_without_rendering()
     # The layout is settled once, not for every format.
     figure.set_layout_engine("none")
-    paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
-    for path in paths:
-        with atomic_path(path) as part:
-            part.write_bytes(rendered(figure, path.suffix[1:]))
-    return paths
+    pictures = {kind: rendered(figure, kind) for kind in ("png", "svg")}
+    for kind, picture in pictures.items():
+        with atomic_path(stem.with_name(f"{stem.name}.{kind}")) as part:
+            part.write_bytes(picture)
+    return pictures["svg"]
 
 
 def rendered(figure: Figure, kind: str, dots_per_inch: float = DOTS_PER_INCH) -> bytes:
@@ -232,37 +205,12 @@ def rendered(figure: Figure, kind: str, dots_per_inch: float = DOTS_PER_INCH) ->
     return re.sub(rb"(\d\.\d\d)\d+", rb"\1", data.getvalue())
 
 
-def _figure(
-    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
-) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout=layout)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _outline(axes: Any, line: FloatArray, **style: Any) -> None:
-    axes.plot(line[:, 2], line[:, 0], line[:, 1], **style)
-
-
 def _draw_cut(above: Axes, below: Axes, cut: Cut) -> None:
-    greys = colormaps["gray"].with_extremes(bad=_BLANK)
     width, height = cut.extent_mm
-    above.imshow(cut.image, cmap=greys, vmin=0, vmax=255, extent=(0.0, width, height, 0.0),
-                 interpolation="nearest")  # fmt: skip
-    above.add_patch(
-        Rectangle((cut.corner_mm[0], cut.corner_mm[1]), *cut.size_mm, fill=False, edgecolor="#ffd000")
-    )
     left, top = cut.corner_mm
-    below.imshow(cut.detail, cmap=greys, vmin=0, vmax=255, interpolation="nearest",
-                 extent=(left, left + cut.size_mm[0], top + cut.size_mm[1], top))  # fmt: skip
+    show_grey(above, cut.image, (0.0, width, height, 0.0), (0, 255))
+    above.add_patch(Rectangle((left, top), *cut.size_mm, fill=False, edgecolor=_DETAIL_COLOUR))
+    show_grey(below, cut.detail, (left, left + cut.size_mm[0], top + cut.size_mm[1], top), (0, 255))
     below.tick_params(labelsize="small")
     for spine in below.spines.values():
-        spine.set(color="#ffd000", linewidth=2)
-
-
-def _label(axes: Axes, x: str, y: str, grid: bool = True) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    if grid:
-        axes.grid(visible=True, alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+        spine.set(color=_DETAIL_COLOUR, linewidth=2)

@@ -2,82 +2,95 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from html import escape
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import jinja2
 import numpy as np
+from markupsafe import Markup
 
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
 from speckle3d.report import plots as interactive
-from speckle3d.report.data import SweepView, load_view, read_study
-from speckle3d.report.html import (
-    Figure,
+from speckle3d.report.data import Record, StudyData, SweepView, load_view, read_study
+from speckle3d.report.lead import best_of, counted, scored_means, summary_lines
+from speckle3d.report.reslices import Cuts, cut_modes
+from speckle3d.report.tables import (
+    intervals_table,
     modes_table,
-    page,
-    paragraphs,
+    paired_table,
     parts_table,
     records_table,
 )
-from speckle3d.report.reslices import Cuts, cut_modes
-from speckle3d.report.statistics import (
-    best_of,
-    counted,
-    intervals_table,
-    paired_table,
-    scored_means,
-    summary_lines,
-)
-from speckle3d.study.lock import only_run
+from speckle3d.study.figures import curve_panels, figure_panels
+from speckle3d.study.folder import only_run
 from speckle3d.study.results import copy_lines
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from plotly.graph_objects import Figure as Plot
+
 _FIGURE = re.compile(r"(?P<stem>.+-[0-9a-f]{8})-(curves|outlines|reslices|patches)\.(png|svg)")
-"""What a sweep's figures are called: its folder's name, which ends in eight digits of its key, first."""
-
-_NOTHING = '<p class="quiet">There is nothing to compare.</p>'
-
-_TABLES = {
-    "drift": (
-        "Drift",
-        "The final (FDR) and average drift rate (ADR) are shares of the true path's length. Maximum (MD) and "
-        "sum of drift (SD), Hausdorff distance (HD), and the mean shift of the image's points against the "
-        "first frame (global: GPE, GLE) and the frame before (local: LPE, LLE) are in millimetres, the mean "
-        "error of angle (EA) in degrees.",
-    ),
-    "intervals": (
-        "Means over sweeps",
-        "One number per sweep: of the errors of its parts, the mean magnitude. In brackets the 95 % interval "
-        "over sweeps, by bootstrap. Where modes are of different numbers of sweeps, they do not compare side "
-        "by side, but in pairs.",
-    ),
-    "paired": (
-        "Modes compared in pairs",
-        "Mean difference on the same sweeps and its 95 % interval. Bold where the modes are told apart: the "
-        "interval leaves out zero, and a signed-rank test corrected for the number of pairs (Holm) agrees at "
-        "0.05, which takes six sweeps for two modes and eight for four.",
-    ),
-}
-
-_WRITERS = {"intervals": intervals_table, "paired": paired_table}
+"""Names of a sweep's figures: they begin with its folder's name, which ends in eight digits of its key."""
 
 
-def write_report(directory: Path, progress: Callable[[int, int], None] | None = None) -> Path:
+@dataclass(frozen=True)
+class PageFigure:
+    """A figure of the page: a picture for print, and what draws it where scripts run.
+
+    Attributes
+    ----------
+    name : str
+        Unique on the page.
+    source : str
+        The picture as a data URL.
+    caption : str
+        Also read aloud in place of the picture.
+    plot : str
+        Data and layout for plotly.js as JSON, "<" and "/" escaped; empty for a picture alone.
+    width : int or None
+        On paper, in CSS pixels; None to let the picture tell.
+    """
+
+    name: str
+    source: str
+    caption: str
+    plot: Markup
+    width: int | None = None
+
+
+@dataclass(frozen=True)
+class Section:
+    """One sweep on the page; `broken` says why it cannot be shown, `quiet` what it does not hold."""
+
+    anchor: str
+    name: str
+    notes: Sequence[str] = ()
+    figures: Sequence[PageFigure] = ()
+    broken: str = ""
+    quiet: str = ""
+
+
+def write_report(directory: Path) -> Path:
     """Write ``report.html`` and the folder ``figures`` from a study's ``study.json`` and its sweeps' folders.
 
     The page is one file that needs no network: with scripts its curves, outlines and maps can be turned and
     read off; without, and in print, it shows the same figures as pictures. A sweep that cannot be shown is
-    told with its reason, and does not stop the others. Figures of sweeps that are no longer in the study go.
+    listed with its reason, and does not stop the others. Figures of sweeps that are no longer in the study
+    are removed.
 
     Parameters
     ----------
     directory : path
         The study's folder.
-    progress : callable, optional
-        Called with the number of sweeps done and of all.
 
     Returns
     -------
@@ -93,50 +106,51 @@ def write_report(directory: Path, progress: Callable[[int, int], None] | None = 
     """
     study = read_study(directory)
     with only_run(directory):
-        return _write(directory, study, progress)
+        overview = _overview(study)
+        sections = [_section(study, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
+        stems = {str(entry.get("folder", "")).rpartition("/")[2] for entry in study.done}
+        _clear_figures(directory / "figures", stems)
+        target = directory / "report.html"
+        with atomic_path(target) as part:
+            part.write_text(_page(study, overview, sections), encoding="utf-8")
+        return target
 
 
-def _write(directory: Path, study: Mapping[str, Any], progress: Callable[[int, int], None] | None) -> Path:
-    rows = [row for row in study.get("rows", []) if isinstance(row, dict)]
-    modes = list(dict.fromkeys([*study.get("modes", []), *(row["mode"] for row in rows)]))
-    done = [entry for entry in study["sweeps"] if entry.get("status") == "done"]
-    broken = [entry for entry in study["sweeps"] if entry.get("status") != "done"]
-    anchors = {entry["name"]: f"sweep-{i + 1}" for i, entry in enumerate(done)}
-    copies = {entry["name"]: entry["copy_of"] for entry in done if entry.get("copy_of")}
-    single = [row for row in rows if row["sweep"] not in copies]
-    scored = [row for row in single if row.get("length_error_mm") is not None]
-    found = scored_means(single, modes)
-    references = {row["sweep"]: row["reference"] for row in single if row.get("reference")}
-    figures: list[Figure] = []
-    overview = _overview(directory, scored, modes, figures)
-    sections = []
-    for i, entry in enumerate(done):
-        sections.append(_section(directory, entry, f"sweep-{i + 1}", figures))
-        if progress:
-            progress(i + 1, len(done))
-    shown = counted(len(done) - len(copies) or len(broken), "sweep")
-    parts = {
-        "title": f"Drift-correction modes compared on {shown}",
-        "lead": paragraphs(
-            summary_lines(found, len(done), len(broken), study.get("paired") or [], references)
-            + [f"{line}." for line in copy_lines(copies)]
-        ),
-        "broken": _broken(broken),
-        "modes": modes_table(found.means, best_of(found.means, "length_percent") if found.together else None)
-        + overview
-        or _NOTHING,
-        "parts": parts_table(rows, anchors),
-        "tables": _tables(study, anchors),
-        "buttons": _buttons(done),
-        "sweeps": "\n".join(sections) or _NOTHING,
-        "configuration": escape(str(study.get("settings_toml", ""))),
-        "provenance": _provenance(study),
-    }
-    _clear_figures(directory / "figures", {str(entry.get("folder", "")).rpartition("/")[2] for entry in done})
-    target = directory / "report.html"
-    with atomic_path(target) as part:
-        part.write_text(page(parts, figures), encoding="utf-8")
-    return target
+def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Section]) -> str:
+    """Fill the template."""
+    from plotly.offline import get_plotlyjs
+
+    anchors = {each.name: each.anchor for each in sections}
+    found = scored_means(study.single, study.modes)
+    lead = summary_lines(found, len(study.done), len(study.broken), study.paired, study.references)
+    keys = ("name", "path", "sha256", "key", "seconds")
+    best = best_of(found.means, "length_percent") if found.together else None
+    scripts = [get_plotlyjs(), files("speckle3d.report").joinpath("script.js").read_text(encoding="utf-8")]
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("speckle3d", "report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html").render(
+        shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
+        lead=lead + [f"{line}." for line in copy_lines(study.copies)],
+        broken=records_table([_part(entry, ("name", "status", "reason")) for entry in study.broken]),
+        modes=modes_table(found.means, best),
+        overview=overview,
+        parts=parts_table(study.rows, anchors),
+        drift=records_table(study.drift, anchors),
+        intervals=intervals_table(study.intervals),
+        paired=paired_table(study.paired),
+        sections=sections,
+        figures=[*([overview] if overview else []), *(each for some in sections for each in some.figures)],
+        configuration=study.settings_toml,
+        version=version("speckle3d"),
+        provenance=records_table([_part(entry, keys) for entry in (*study.done, *study.broken)]),
+        scripts=[Markup(text) for text in scripts],
+        script_hashes=" ".join(_hash(text) for text in scripts),
+    )
 
 
 def _clear_figures(folder: Path, stems: Collection[str]) -> None:
@@ -147,79 +161,74 @@ def _clear_figures(folder: Path, stems: Collection[str]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _overview(
-    directory: Path, scored: Sequence[Mapping[str, Any]], modes: Sequence[str], figures: list[Figure]
-) -> str:
+def _overview(study: StudyData) -> PageFigure | None:
+    scored = [row for row in study.single if row.get("length_error_mm") is not None]
     if not scored:
-        for path in (directory / "figures").glob("overview.*"):
+        for path in (study.directory / "figures").glob("overview.*"):
             path.unlink()
-        return ""
-    shown = [mode for mode in modes if any(row["mode"] == mode for row in scored)]
+        return None
+    modes = [mode for mode in study.modes if any(row["mode"] == mode for row in scored)]
+    panels = draw.overview_panels(scored, modes)
     caption = (
         "Errors of length and tilt: a point for every part of every sweep, a bar from minus to plus the mean "
         "magnitude over the mode's sweeps."
     )
-    plot = interactive.plot_overview(scored, shown)
-    return _vector(directory, "overview", draw.figure_overview(scored, shown), caption, figures, plot)
+    plot = interactive.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
+    return _vector(study.directory, "overview", draw.figure_overview(panels), caption, plot)
 
 
-def _section(directory: Path, entry: Mapping[str, Any], anchor: str, figures: list[Figure]) -> str:
-    title = f"<h3>{escape(str(entry['name']))}</h3>"
+def _section(study: StudyData, entry: Record, anchor: str) -> Section:
+    name = str(entry["name"])
     try:
-        view = load_view(directory, entry)
-        content = _sweep(directory, view, anchor, figures)
+        view = load_view(study.directory, entry)
+        cuts = cut_modes(view)
+        figures = [_curves(study.directory, view), _outlines(study.directory, view)]
+        if cuts is not None:
+            figures.append(_reslices(study.directory, view, cuts))
+        patches = _patches(study.directory, view, cuts)
     except Speckle3DError as error:
-        content = paragraphs([f"This sweep's results cannot be shown: {error}"], "note")
-    return f'<section class="sweep" id="{anchor}" role="tabpanel">{title}{content}</section>'
+        return Section(anchor, name, broken=str(error))
+    if patches is None:
+        return Section(anchor, name, view.notes, figures, quiet="The file of this sweep holds no patches.")
+    return Section(anchor, name, view.notes, [*figures, patches])
 
 
-def _sweep(directory: Path, view: SweepView, anchor: str, figures: list[Figure]) -> str:
-    cuts = cut_modes(view)
-    stem = view.folder.name
-    grid = view.reconstruction.grid
-    pieces = [paragraphs(view.notes, "note")]
-    pieces.append(
-        _vector(directory, f"{stem}-curves", draw.figure_curves(view.curves), _curves_caption(view), figures,
-                interactive.plot_curves(view.curves))
-    )  # fmt: skip
+def _curves(directory: Path, view: SweepView) -> PageFigure:
+    curves, frames = view.curves, draw.decimated(view.curves.frames)
+    panels = curve_panels(curves, frames=frames)
+    views = {"accumulated": panels}
+    if curves.reference is not None:
+        minus = curve_panels(curves, frames=frames, minus_reference=True)
+        views[f"minus {curves.reference_name}"] = minus
+    caption = "Accumulated length of travel, tilt, yaw and roll."
+    if curves.half_width is not None:
+        caption += " The band is the 95 % interval of the uncorrected trajectory, from its covariance."
+    drawn = figure_panels(panels, 2, (9.0, 6.0))
+    plot = interactive.plot_panels(views, 2, 620)
+    return _vector(directory, f"{view.folder.name}-curves", drawn, caption, plot)
+
+
+def _outlines(directory: Path, view: SweepView) -> PageFigure:
+    series = draw.outline_series(view.poses, view.reconstruction.grid)
     caption = (
         f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other"
         f"{'; in print the reference is grey' if view.curves.reference_name in view.poses else ''}."
     )
-    outlines = draw.figure_outlines(view.poses, grid, view.curves.reference_name)
-    plot = interactive.plot_outlines(view.poses, grid)
-    pieces.append(_vector(directory, f"{stem}-outlines", outlines, caption, figures, plot))
-    if cuts is not None:
-        pieces.append(_reslices(directory, f"{stem}-reslices", cuts, figures))
-    pieces.append(_patches(directory, f"{stem}-patches", view, cuts, figures))
-    return "".join(pieces)
+    drawn, plot = draw.figure_outlines(series), interactive.plot_outlines(series)
+    return _vector(directory, f"{view.folder.name}-outlines", drawn, caption, plot)
 
 
-def _curves_caption(view: SweepView) -> str:
-    caption = "Accumulated length of travel, tilt, yaw and roll."
-    if view.curves.half_width is not None:
-        caption += " The band is the 95 % interval of the uncorrected trajectory, from its covariance."
-    return caption
-
-
-def _reslices(directory: Path, name: str, cuts: Cuts, figures: list[Figure]) -> str:
-    drawn = draw.figure_cuts(cuts)
-    draw.save_both(drawn, directory / "figures" / name)
-    width_in = drawn.get_size_inches()[0]
+def _reslices(directory: Path, view: SweepView, cuts: Cuts) -> PageFigure:
     caption = (
         "The sweep cut along its travel at the middle vector, at the poses of every mode, and the same place "
         f"of the same frame enlarged ({cuts.depth_mm:.0f} mm deep). Blue: no frame reached."
     )
-    figure = Figure(
-        f"plot-{name}", draw.rendered(drawn, "jpg", 110), "image/jpeg", caption, width_in=width_in
-    )
-    figures.append(figure)
-    return figure.html()
+    return _raster(directory, f"{view.folder.name}-reslices", draw.figure_cuts(cuts), caption, 110)
 
 
-def _patches(directory: Path, name: str, view: SweepView, cuts: Cuts | None, figures: list[Figure]) -> str:
+def _patches(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure | None:
     if view.rejected is None or not np.isfinite(view.rejected.share).any():
-        return paragraphs(["The file of this sweep holds no patches."], "quiet")
+        return None
     sensed = view.details.get("details", {}).get("rejected_patch_share") is not None
     caption = (
         "Patches left out because the sensed orientation contradicts their distances"
@@ -228,53 +237,34 @@ def _patches(directory: Path, name: str, view: SweepView, cuts: Cuts | None, fig
     )
     caption += ": where in the image, in how many of the pairs, and how many over the sweep."
     drawn = draw.figure_rejected(view.rejected, cuts, view.reconstruction.grid)
-    draw.save_both(drawn, directory / "figures" / name)
-    # The image beneath would make a vector picture large.
-    picture = draw.rendered(drawn, "jpg", 90)
     plot = interactive.plot_rejected(view.rejected)
-    figures.append(Figure(f"plot-{name}", picture, "image/jpeg", caption, plot, drawn.get_size_inches()[0]))
-    return figures[-1].html()
+    return _raster(directory, f"{view.folder.name}-patches", drawn, caption, 90, plot)
 
 
-def _vector(
-    directory: Path, name: str, drawn: Any, caption: str, figures: list[Figure], plot: dict[str, Any]
-) -> str:
+def _vector(directory: Path, name: str, drawn: Figure, caption: str, plot: Plot) -> PageFigure:
     """File a figure and put it on the page as a vector picture, with its interactive twin."""
-    _, vector = draw.save_both(drawn, directory / "figures" / name)
-    figures.append(Figure(f"plot-{name}", vector.read_bytes(), "image/svg+xml", caption, plot))
-    return figures[-1].html()
+    picture = draw.save_both(drawn, directory / "figures" / name)
+    return PageFigure(f"plot-{name}", _data_url("svg+xml", picture), caption, Markup(plot.to_json()))
 
 
-def _broken(entries: Sequence[Mapping[str, Any]]) -> str:
-    if not entries:
-        return ""
-    records = [{key: entry.get(key) for key in ("name", "status", "reason")} for entry in entries]
-    return f'<h2 id="broken">Sweeps without a result</h2><div class="broken">{records_table(records)}</div>'
+def _raster(
+    directory: Path, name: str, drawn: Figure, caption: str, dots_per_inch: int, plot: Plot | None = None
+) -> PageFigure:
+    """File a figure with an image in it and put it on the page as JPEG: a vector picture would be large."""
+    draw.save_both(drawn, directory / "figures" / name)
+    source = _data_url("jpeg", draw.rendered(drawn, "jpg", dots_per_inch))
+    data = Markup("" if plot is None else plot.to_json())
+    return PageFigure(f"plot-{name}", source, caption, data, round(96 * drawn.get_size_inches()[0]))
 
 
-def _tables(study: Mapping[str, Any], anchors: Mapping[str, str]) -> str:
-    shown = []
-    for key, (title, words) in _TABLES.items():
-        records = study.get(key) or []
-        if records:
-            write = _WRITERS.get(key)
-            table = write(records) if write else records_table(records, anchors)
-            shown.append(f'<h2 id="{key}">{title}</h2><p class="quiet">{words}</p>{table}')
-    return "".join(shown)
+def _data_url(kind: str, picture: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
 
 
-def _buttons(done: Sequence[Mapping[str, Any]]) -> str:
-    return "".join(
-        f'<button role="tab" type="button" data-sweep="sweep-{i + 1}" aria-controls="sweep-{i + 1}" '
-        f'aria-selected="false">{escape(str(entry["name"]))}</button>'
-        for i, entry in enumerate(done)
-    )
+def _part(entry: Record, keys: Sequence[str]) -> dict[str, Any]:
+    return {key: entry.get(key) for key in keys}
 
 
-def _provenance(study: Mapping[str, Any]) -> str:
-    from importlib.metadata import version
-
-    keys = ("name", "path", "sha256", "key", "seconds")
-    records = [{key: entry.get(key) for key in keys} for entry in study["sweeps"]]
-    made = f"Report made by speckle3d {version('speckle3d')}."
-    return paragraphs([made], "quiet") + records_table(records)
+def _hash(text: str) -> str:
+    digest = base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
+    return f"'sha256-{digest}'"

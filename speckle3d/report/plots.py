@@ -1,4 +1,4 @@
-"""The report's interactive plots, as the plain data that plotly.js draws."""
+"""The report's figures as plotly draws them where scripts run: to turn, enlarge and read off."""
 
 from __future__ import annotations
 
@@ -7,239 +7,150 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
+from plotly import graph_objects as go
+from plotly.colors import hex_to_rgb
+from plotly.subplots import make_subplots
 
-from speckle3d.core.sweep import ImageGrid
-from speckle3d.report.data import QUANTITIES, RejectedPatches, SweepCurves
-from speckle3d.report.figures import CURVE_LABELS, colour_of, decimated, label_of, outline
-from speckle3d.study.job import REFERENCES
-from speckle3d.study.overall import mean_over_sweeps
-
-Plot = dict[str, Any]
+from speckle3d.report.data import RejectedPatches
+from speckle3d.report.figures import rejected_panel
+from speckle3d.study.figures import Panel, Series
 
 _DASHES = ("solid", "dash", "dashdot", "dot", "longdash")
-_DOMAINS = tuple((across, up) for up in ((0.57, 1.0), (0.0, 0.43)) for across in ((0.0, 0.45), (0.55, 1.0)))
-"""Of the four curves' panels: horizontal, vertical."""
+_LOOKS: Mapping[str, Mapping[str, Any]] = {
+    "line": {"mode": "lines", "line": {"width": 1.8}},
+    "reference": {"mode": "lines", "line": {"width": 4}, "opacity": 0.5},
+    "points": {"mode": "markers", "marker": {"size": 9}, "opacity": 0.65},
+    "dotted": {"mode": "lines+markers", "line": {"width": 1}, "marker": {"size": 4}},
+    "bar": {"mode": "lines", "line": {"width": 10}, "opacity": 0.25, "hoverinfo": "skip"},
+}
+_LAYOUT: Mapping[str, Any] = {
+    "template": "none",
+    "font": {"family": "system-ui, sans-serif", "size": 13},
+    "margin": {"l": 60, "r": 20, "t": 20, "b": 50},
+}
 
 
-def plot_overview(rows: Sequence[Mapping[str, Any]], modes: Sequence[str]) -> Plot:
-    """Errors of length and tilt of every part of every sweep, named under the pointer."""
-    traces = []
-    for i, (key, unit) in enumerate((("length_error_percent", " %"), ("tilt_error_deg", " °"))):
-        for mode in modes:
-            mine = [row for row in rows if row["mode"] == mode and row.get(key) is not None]
-            size = mean_over_sweeps(mine, key) if mine else 0.0
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "x": [-size, size],
-                    "y": [label_of(mode)] * 2,
-                    "line": {"color": colour_of(mode, modes), "width": 10},
-                    "opacity": 0.25,
-                    "hoverinfo": "skip",
-                    "xaxis": f"x{i + 1}",
-                    "yaxis": f"y{i + 1}",
-                }
-            )
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "x": [row[key] for row in mine],
-                    "y": [label_of(mode)] * len(mine),
-                    "text": [f"{row['sweep']}, part {row['part']}" for row in mine],
-                    "hovertemplate": "%{text}: %{x:.2f}" + unit + "<extra></extra>",
-                    "marker": {"color": colour_of(mode, modes), "size": 9, "opacity": 0.65},
-                    "xaxis": f"x{i + 1}",
-                    "yaxis": f"y{i + 1}",
-                }
-            )
-    layout = {
-        "showlegend": False,
-        "xaxis": {"title": {"text": "length error / %"}, "domain": [0.0, 0.47], "anchor": "y"},
-        "xaxis2": {"title": {"text": "tilt error / °"}, "domain": [0.53, 1.0], "anchor": "y2"},
-        "yaxis": {"autorange": "reversed", "automargin": True, "anchor": "x"},
-        "yaxis2": {"autorange": "reversed", "showticklabels": False, "anchor": "x2"},
-    }
-    return _plot(traces, layout, 140 + 50 * len(modes))
+def plot_panels(views: Mapping[str, Sequence[Panel]], columns: int, height: int) -> go.Figure:
+    """Panels in rows of `columns`.
+
+    Parameters
+    ----------
+    views : mapping of str to sequence of Panel
+        By the name of the button that shows them, the first at once; a single view has no button.
+    height : int
+        Pixels.
+    """
+    first, *_ = views.values()
+    rows, levels = -(-len(first) // columns), first[0].levels
+    figure = make_subplots(
+        rows, columns, shared_xaxes="all" if rows > 1 else False, shared_yaxes=bool(levels),
+        horizontal_spacing=0.08, vertical_spacing=0.12,
+    )  # fmt: skip
+    figure.update_layout(
+        _LAYOUT, height=height, showlegend=not levels, legend={"orientation": "h", "y": 1.12}
+    )
+    shown: list[str] = []
+    for view, panels in views.items():
+        for i, panel in enumerate(panels):
+            for trace in _traces(panel, named=i == 0):
+                trace.visible = view == next(iter(views))
+                figure.add_trace(trace, i // columns + 1, i % columns + 1)
+                shown.append(view)
+    for i, panel in enumerate(first):
+        place = {"row": i // columns + 1, "col": i % columns + 1}
+        figure.update_xaxes(title_text=panel.axes[0] if i + columns >= len(first) else "", **place)
+        figure.update_yaxes(title_text=panel.axes[1], **place)
+    if levels:
+        ticks = {"tickvals": list(range(len(levels))), "ticktext": list(levels)}
+        figure.update_yaxes(autorange="reversed", automargin=True, **ticks)
+    else:
+        figure.update_layout(hovermode="x unified")
+    if len(views) > 1:
+        buttons = [
+            {"label": view, "method": "restyle", "args": [{"visible": [each == view for each in shown]}]}
+            for view in views
+        ]
+        menu = {"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.2,
+                "yanchor": "bottom", "buttons": buttons}  # fmt: skip
+        figure.update_layout(updatemenus=[menu], margin_t=60)
+    return figure
 
 
-def plot_curves(curves: SweepCurves) -> Plot:
-    """Accumulated length, tilt, yaw and roll; with a reference, also as differences from it."""
-    traces: list[Plot] = []
-    absolute: list[bool] = []
-    for subtract in (False, True) if curves.reference is not None else (False,):
-        for q in range(len(QUANTITIES)):
-            added = _panel_traces(curves, q, subtract)
-            traces += added
-            absolute += [not subtract] * len(added)
-    for trace, shown in zip(traces, absolute, strict=True):
-        trace["visible"] = shown
-    layout: Plot = {"legend": {"orientation": "h", "y": 1.12}, "hovermode": "x unified"}
-    for q, (across, up) in enumerate(_DOMAINS):
-        layout[f"xaxis{q + 1}"] = {
-            "domain": across,
-            "anchor": f"y{q + 1}",
-            "matches": "x" if q else None,
-            "title": {"text": "frame" if q > 1 else ""},
-        }
-        layout[f"yaxis{q + 1}"] = {"domain": up, "anchor": f"x{q + 1}", "title": {"text": CURVE_LABELS[q]}}
-    if curves.reference is not None:
-        layout["updatemenus"] = [_choice(absolute, curves.reference_name)]
-    return _plot(traces, layout, 620)
-
-
-def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> Plot:
+def plot_outlines(series: Sequence[Series]) -> go.Figure:
     """Outlines of the frames in space, seen from the first frame; modes come and go by the legend."""
-    traces = []
-    # The reference first and broad and grey: the modes lie on it, not under it.
-    for mode in sorted(poses, key=lambda name: name not in REFERENCES):
-        line = outline(poses[mode], grid)
-        is_reference = mode in REFERENCES
-        traces.append(
-            {
-                "type": "scatter3d",
-                "mode": "lines",
-                "name": label_of(mode),
-                "x": _numbers(line[:, 2]),
-                "y": _numbers(line[:, 0]),
-                "z": _numbers(line[:, 1]),
-                "line": {
-                    "color": "#9aa0a8" if is_reference else colour_of(mode, list(poses)),
-                    "width": 6 if is_reference else 3,
-                },
-                "connectgaps": False,
-                "hoverinfo": "name",
-            }
-        )
+    figure = go.Figure(layout=_LAYOUT)
+    for each in series:
+        # The reference is broad and grey: the modes lie on it, not under it.
+        behind = each.style == "reference"
+        line = {"color": "#9aa0a8" if behind else each.colour, "width": 6 if behind else 3}
+        x, y, z = (_numbers(each.points[:, axis]) for axis in (2, 0, 1))
+        figure.add_scatter3d(x=x, y=y, z=z, mode="lines", name=each.label, line=line, hoverinfo="name")
     names = ("elevational / mm", "lateral / mm", "depth / mm")
-    scene: Plot = {f"{axis}axis": {"title": {"text": name}} for axis, name in zip("xyz", names, strict=True)}
+    scene: dict[str, Any] = {
+        f"{axis}axis": {"title": {"text": name}} for axis, name in zip("xyz", names, strict=True)
+    }
     scene["zaxis"]["autorange"] = "reversed"
     scene |= {"aspectmode": "data", "camera": {"eye": {"x": 1.7, "y": -2.4, "z": 1.2}}}
-    return _plot(traces, {"scene": scene, "legend": {"orientation": "h"}}, 520)
+    return figure.update_layout(scene=scene, legend={"orientation": "h"}, height=520)
 
 
-def plot_rejected(rejected: RejectedPatches) -> Plot:
+def plot_rejected(rejected: RejectedPatches) -> go.Figure:
     """Share of the pairs in which each patch was left out, and of the patches over the sweep."""
-    across, down = (np.unique(np.round(column, 6)) for column in rejected.centre_mm.T)
+    centres = np.round(rejected.centre_mm, 6)
+    (across, column), (down, row) = (np.unique(each, return_inverse=True) for each in centres.T)
     table = np.full((down.size, across.size), np.nan)
-    columns = np.searchsorted(across, np.round(rejected.centre_mm[:, 0], 6))
-    table[np.searchsorted(down, np.round(rejected.centre_mm[:, 1], 6)), columns] = 100.0 * rejected.share
-    frames = decimated(rejected.frame_share.size)
-    heat = {
-        "type": "heatmap",
-        "x": _numbers(across),
-        "y": _numbers(down),
-        "z": [_numbers(row) for row in table],
-        "zmin": 0,
-        "zmax": 100,
-        "colorscale": "Viridis",
-        "colorbar": {"title": {"text": "left out / %"}, "x": 0.36, "thickness": 14},
-        "hovertemplate": "lateral %{x:.1f} mm, depth %{y:.1f} mm: %{z:.0f} %<extra></extra>",
-    }
-    line = {
-        "type": "scatter",
-        "x": frames.tolist(),
-        "y": _numbers(100.0 * rejected.frame_share[frames]),
-        "mode": "lines+markers",
-        "marker": {"size": 4},
-        "line": {"color": "#444", "width": 1},
-        "xaxis": "x2",
-        "yaxis": "y2",
-        "hovertemplate": "frame %{x}: %{y:.0f} %<extra></extra>",
-    }
-    layout = {
-        "showlegend": False,
-        "xaxis": {"title": {"text": "lateral / mm"}, "domain": [0.0, 0.35], "anchor": "y"},
-        "yaxis": {"title": {"text": "depth / mm"}, "autorange": "reversed"},
-        "xaxis2": {"title": {"text": "frame"}, "domain": [0.53, 1.0], "anchor": "y2"},
-        "yaxis2": {"title": {"text": "patches left out / %"}, "range": [0, 100], "anchor": "x2"},
-    }
-    return _plot([heat, line], layout, 400)
+    table[row, column] = 100.0 * rejected.share
+    panel = rejected_panel(rejected)
+    figure = make_subplots(1, 2, column_widths=[0.4, 0.6], horizontal_spacing=0.18)
+    figure.update_layout(_LAYOUT, height=400, showlegend=False)
+    figure.add_heatmap(
+        x=_numbers(across),
+        y=_numbers(down),
+        z=_numbers(table),
+        zmin=0,
+        zmax=100,
+        colorscale="Viridis",
+        colorbar={"title": {"text": "left out / %"}, "x": 0.34, "thickness": 14},
+        hovertemplate="lateral %{x:.1f} mm, depth %{y:.1f} mm: %{z:.0f} %<extra></extra>",
+        row=1,
+        col=1,
+    )
+    for trace in _traces(panel, named=False):
+        figure.add_trace(trace, 1, 2)
+    figure.update_xaxes(title_text="lateral / mm", row=1, col=1)
+    figure.update_yaxes(title_text="depth / mm", autorange="reversed", row=1, col=1)
+    figure.update_xaxes(title_text=panel.axes[0], row=1, col=2)
+    return figure.update_yaxes(title_text=panel.axes[1], range=panel.limits, row=1, col=2)
 
 
-def _panel_traces(curves: SweepCurves, q: int, subtract: bool) -> list[Plot]:
-    frames = decimated(curves.frames)
-    zero = curves.reference[q] if subtract and curves.reference is not None else np.zeros(curves.frames)
-    axes = {
-        "xaxis": f"x{q + 1}",
-        "yaxis": f"y{q + 1}",
-        "showlegend": q == 0,
-        "type": "scatter",
-        "mode": "lines",
-        "x": frames.tolist(),
-        "hovertemplate": "%{y:.2f}",
-    }
-    traces: list[Plot] = []
-    if curves.reference is not None:
-        style = {"color": "rgba(0,0,0,0.5)", "width": 4}
-        traces.append(
-            {
-                **axes,
-                "name": curves.reference_name,
-                "y": _numbers((curves.reference[q] - zero)[frames]),
-                "line": style,
-                "legendgroup": "reference",
-            }
-        )
-    if curves.half_width is not None:
-        middle = curves.modes["image"][q] - zero
-        traces += _band(
-            axes, (middle - curves.half_width[q])[frames], (middle + curves.half_width[q])[frames]
-        )
-    for i, (mode, values) in enumerate(curves.modes.items()):
-        line = {"color": colour_of(mode, list(curves.modes)), "width": 1.8, "dash": _DASHES[i % len(_DASHES)]}
-        traces.append(
-            {
-                **axes,
-                "name": label_of(mode),
-                "y": _numbers((values[q] - zero)[frames]),
-                "line": line,
-                "legendgroup": mode,
-            }
-        )
+def _traces(panel: Panel, named: bool) -> list[go.Scatter]:
+    """What draws a panel's series; `named` in the legend."""
+    traces = []
+    for each in panel.series:
+        x, y = (_numbers(column) for column in each.points.T)
+        shared = {"x": x, "name": each.label, "legendgroup": each.label}
+        if each.low is not None:
+            faint = f"rgba{(*hex_to_rgb(each.colour), 0.16)}"
+            edge = {**shared, "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
+            traces.append(go.Scatter(y=_numbers(each.low), showlegend=False, **edge))
+            traces.append(go.Scatter(y=y, fill="tonexty", fillcolor=faint, showlegend=named, **edge))
+            continue
+        trace = go.Scatter(y=y, showlegend=named, **shared, **_LOOKS[each.style])
+        if each.style == "points":
+            unit = panel.axes[0].rpartition(" / ")[2]
+            trace.update(
+                marker_color=each.colour, text=list(each.words),
+                hovertemplate="%{text}: %{x:.2f} " + unit + "<extra></extra>",
+            )  # fmt: skip
+        elif each.style == "bar":
+            trace.update(line_color=each.colour)
+        else:
+            dash = _DASHES[each.dash % len(_DASHES)]
+            trace.update(line_color=each.colour, line_dash=dash, hovertemplate="%{y:.2f}")
+        traces.append(trace)
     return traces
 
 
-def _band(axes: Plot, low: npt.NDArray[Any], high: npt.NDArray[Any]) -> list[Plot]:
-    shared = {**axes, "line": {"width": 0}, "hoverinfo": "skip", "legendgroup": "band"}
-    shared.pop("hovertemplate")
-    name = f"95 % of {label_of('image')}"
-    return [
-        {**shared, "y": _numbers(low), "showlegend": False, "name": name},
-        {**shared, "y": _numbers(high), "fill": "tonexty", "fillcolor": "rgba(213,94,0,0.16)", "name": name},
-    ]
-
-
-def _choice(absolute: Sequence[bool], reference: str) -> Plot:
-    buttons = [
-        {"label": text, "method": "restyle", "args": [{"visible": [shown == first for shown in absolute]}]}
-        for text, first in (("accumulated", True), (f"minus {reference}", False))
-    ]
-    return {
-        "type": "buttons",
-        "direction": "right",
-        "x": 0,
-        "xanchor": "left",
-        "y": 1.2,
-        "yanchor": "bottom",
-        "showactive": True,
-        "buttons": buttons,
-    }
-
-
-def _plot(traces: list[Plot], layout: Plot, height: int) -> Plot:
-    common = {
-        "height": height,
-        "margin": {"l": 60, "r": 20, "t": 60 if "updatemenus" in layout else 20, "b": 50},
-        "paper_bgcolor": "#fff",
-        "plot_bgcolor": "#fff",
-        "font": {"family": "system-ui, sans-serif", "size": 13},
-    }
-    return {"data": traces, "layout": common | layout}
-
-
-def _numbers(values: npt.NDArray[Any]) -> list[float | None]:
-    """Turn values to what JSON holds: three decimals (micrometres), null where there is none."""
-    return [round(float(v), 3) if np.isfinite(v) else None for v in values]
+def _numbers(values: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Values as plotly writes them shortest."""
+    return np.asarray(values, dtype=np.float32)

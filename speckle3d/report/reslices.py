@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
@@ -10,21 +10,19 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.reslice import ReslicePlane, along_sweep_plane, reslice_frames
+from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.report.data import SweepView
-from speckle3d.study.images import GreyImages, grey_images
+from speckle3d.study.images import PIXEL_MM, GreyImages, cut_frames, grey_images, middle_plane, middle_vectors
 
-PIXEL_MM = 0.1
 DETAIL_PIXEL_MM = 0.04
 DETAIL_MM = 5.0
 """Widest enlarged detail; four fifths as high."""
 
 _DETAIL_SHARE = 0.4
-"""Of the shortest reslice: a detail as wide as the sweep is no enlargement."""
+"""Largest width of the detail as a share of the shortest reslice."""
 
 NEAR_FIELD_MM = 4.0
-_STRIP_MM = 2.4
-_LARGEST_MM = (400.0, 200.0)
+_DYNAMIC_RANGE_DB = 55.0
 
 
 @dataclass(frozen=True)
@@ -58,15 +56,12 @@ class Cuts:
 
 
 class _Strip:
-    """A few vectors about the middle of every frame, made once for all modes."""
+    """The middle vectors of every grey image, made once for all modes."""
 
     def __init__(self, images: GreyImages) -> None:
-        whole = images.grid
-        width = min(whole.vectors, 2 * int(_STRIP_MM / 2 / whole.vector_pitch_mm) + 1)
-        first = (whole.vectors - width) // 2
-        self.left_mm = first * whole.vector_pitch_mm
-        self.grid = replace(whole, vectors=width)
-        chosen = slice(first, first + width)
+        first, self.grid = middle_vectors(images.grid)
+        self.left_mm = first * self.grid.vector_pitch_mm
+        chosen = slice(first, first + self.grid.vectors)
         # Each frame is made only to be cut: a sweep of a thousand whole images need not fit in memory.
         self._images = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(images.shape[0])]
         self.shape = (len(self._images), *self._images[0].shape)
@@ -75,20 +70,20 @@ class _Strip:
         return self._images[index].astype(np.float32)
 
 
-def cut_modes(view: SweepView, dynamic_range_db: float = 55.0) -> Cuts | None:
+def cut_modes(view: SweepView) -> Cuts | None:
     """Reslice the sweep at its middle vector in every mode; None where the sweep itself is gone.
 
-    The detail is the place of most contrast in the most trusted trajectory (the reference, else the last
-    mode), and the same place of the same frame in all of them.
+    The detail shows the place of most contrast in the most trusted trajectory (the reference, else the last
+    mode), and the same place of the same frame in all others.
     """
     if view.sweep is None:
         return None
-    images = grey_images(view.sweep, dynamic_range_db, reconstruction=view.reconstruction)
+    images = grey_images(view.sweep, _DYNAMIC_RANGE_DB, reconstruction=view.reconstruction)
     strip = _Strip(images)
     left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
     poses = {mode: each * left for mode, each in view.own_poses.items()}
-    planes = {mode: _plane(each, strip.grid) for mode, each in poses.items()}
-    whole = {mode: _reslice(strip, poses[mode], planes[mode]) for mode in poses}
+    planes = {mode: middle_plane(each, strip.grid) for mode, each in poses.items()}
+    whole = {mode: cut_frames(strip, strip.grid, poses[mode], planes[mode]) for mode in poses}
     width_mm = min(DETAIL_MM, _DETAIL_SHARE * min(plane.width_mm for plane in planes.values()))
     size_mm = np.array([1.0, 0.8]) * max(width_mm, 10 * DETAIL_PIXEL_MM)
     last = list(planes)[-1]
@@ -98,26 +93,14 @@ def cut_modes(view: SweepView, dynamic_range_db: float = 55.0) -> Cuts | None:
         point = np.array([strip.grid.width_mm / 2, depth_mm, 0.0])
         centre = plane.world_from_plane.inv().apply(poses[mode][frame].apply(point))[:2]
         corner = centre - size_mm / 2
-        detail = _reslice(strip, poses[mode], _window(plane, corner, size_mm))
+        detail = cut_frames(strip, strip.grid, poses[mode], _window(plane, corner, size_mm))
         by_mode[mode] = Cut(whole[mode], (plane.width_mm, plane.height_mm), detail, corner, size_mm)
     return Cuts(by_mode, depth_mm, images[len(view.sweep) // 2], images.grid)
-
-
-def _plane(poses: RigidTransform, grid: ImageGrid) -> ReslicePlane:
-    plane = along_sweep_plane(poses, grid, grid.width_mm / 2, PIXEL_MM)
-    width, height = _LARGEST_MM
-    return replace(plane, width_mm=min(plane.width_mm, width), height_mm=min(plane.height_mm, height))
 
 
 def _window(plane: ReslicePlane, corner_mm: FloatArray, size_mm: FloatArray) -> ReslicePlane:
     shift = RigidTransform.from_translation([*corner_mm, 0.0])
     return ReslicePlane(plane.world_from_plane * shift, float(size_mm[0]), float(size_mm[1]), DETAIL_PIXEL_MM)
-
-
-def _reslice(strip: _Strip, poses: RigidTransform, plane: ReslicePlane) -> Float32Array:
-    steps = np.abs(np.diff((poses[0].inv() * poses).translation[:, 2]))
-    reach = max(0.3, 2.0 * float(np.percentile(steps, 99)))
-    return reslice_frames(strip, strip.grid, poses, plane, reach)
 
 
 def _detail_place(
@@ -127,13 +110,13 @@ def _detail_place(
     seen = np.isfinite(image)
     if not seen.any():
         return len(poses) // 2, float(grid.centre_mm[1])
-    # The mean where nothing was seen, or the rim would be the greatest contrast.
+    # Where nothing was seen, the mean stands in, or the rim would have the greatest contrast.
     smooth = gaussian_filter(np.where(seen, image, image[seen].mean()), 0.4 / PIXEL_MM)
     size = [max(1, round(side / PIXEL_MM)) for side in size_mm[::-1]]
     spread = uniform_filter(smooth**2, size) - uniform_filter(smooth, size) ** 2
-    # Only windows that lie wholly on images: the rim of the reslice is all contrast and no content.
+    # Only windows that lie wholly on images: the rim of the reslice has contrast but no content.
     inside = uniform_filter(seen.astype(float), size, mode="constant") > 0.999
-    # Nor the near field, whose contrast is the probe's own.
+    # The contrast of the near field is the probe's own.
     inside[: int((NEAR_FIELD_MM + size_mm[1] / 2) / PIXEL_MM)] = False
     if not inside.any():
         return len(poses) // 2, float(grid.centre_mm[1])

@@ -1,4 +1,4 @@
-"""How far a reconstruction is from a reference: displacement of points, and drift of the image centre.
+"""Displacement of points and drift of the image centre against a reference, as table rows; TUS-REC's score.
 
 Both trajectories are first laid on each other at their first frame, so that neither world matters: with
 ``W_i`` the pose of frame i, ``T_i = W_0^-1 W_i`` takes points of frame i into frame 0, and
@@ -34,7 +34,9 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +47,10 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.challenge import Landmarks
+from speckle3d.scoring.references import Reference
+
+CHALLENGE_ERRORS = ("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm")
 
 
 @dataclass(frozen=True)
@@ -57,37 +63,6 @@ class PointErrors:
 
     global_mm: float
     local_mm: float
-
-
-@dataclass(frozen=True)
-class DriftRates:
-    """Drift of the image centre with both first frames aligned, as the module's table defines it.
-
-    Attributes
-    ----------
-    final_drift_rate, average_drift_rate : float
-        FDR and ADR, shares of the true path length so far.
-    maximum_drift_mm, sum_of_drift_mm, hausdorff_mm : float
-        MD, SD and HD.
-    mean_angle_deg : float
-        EA.
-    """
-
-    final_drift_rate: float
-    average_drift_rate: float
-    maximum_drift_mm: float
-    sum_of_drift_mm: float
-    hausdorff_mm: float
-    mean_angle_deg: float
-
-
-def point_errors(
-    world_from_image: RigidTransform, reference: RigidTransform, points_mm: npt.ArrayLike
-) -> PointErrors:
-    """Displacement errors at the same points of every image, shape (p, 3)."""
-    points = np.asarray(points_mm, dtype=float)
-    whole, steps = _differences(world_from_image, reference)
-    return PointErrors(*(float(_displaced(each, points).mean()) for each in (whole, steps)))
 
 
 def pixel_errors(world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid) -> PointErrors:
@@ -131,8 +106,20 @@ def landmark_errors(
 
 def drift_rates(
     world_from_image: RigidTransform, reference: RigidTransform, centre_mm: npt.ArrayLike
-) -> DriftRates:
-    """Relate the drift of the image centre to the path it travelled; see `DriftRates`.
+) -> dict[str, float]:
+    """Relate the drift of the image centre to the path it travelled.
+
+    Parameters
+    ----------
+    world_from_image, reference : RigidTransform, length n
+    centre_mm : array_like, shape (3,)
+        Image centre in the image frame.
+
+    Returns
+    -------
+    dict
+        ``FDR`` and ``ADR`` (shares), ``MD_mm``, ``SD_mm``, ``HD_mm`` and ``EA_deg``, as the module's table
+        defines them.
 
     Raises
     ------
@@ -149,14 +136,100 @@ def drift_rates(
     drift = np.linalg.norm(estimated - path, axis=1)[1:]
     moved = travelled > 0
     angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * found.rotation).magnitude())[1:])
-    return DriftRates(
-        final_drift_rate=float(drift[-1] / travelled[-1]),
-        average_drift_rate=float(np.mean(drift[moved] / travelled[moved])),
-        maximum_drift_mm=float(drift.max()),
-        sum_of_drift_mm=float(drift.sum()),
-        hausdorff_mm=max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
-        mean_angle_deg=float(angle.mean()),
-    )
+    return {
+        "FDR": float(drift[-1] / travelled[-1]),
+        "ADR": float(np.mean(drift[moved] / travelled[moved])),
+        "MD_mm": float(drift.max()),
+        "SD_mm": float(drift.sum()),
+        "HD_mm": max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
+        "EA_deg": float(angle.mean()),
+    }
+
+
+def drift_rows(
+    grid: ImageGrid,
+    poses: Mapping[str, RigidTransform],
+    reference: Reference,
+    landmarks: Landmarks | None = None,
+) -> list[dict[str, Any]]:
+    """Drift rates and displacement errors of every mode over the frames that have a reference.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    poses : mapping of str to RigidTransform, each of length n
+        ``world_from_image`` by mode.
+    reference : Reference
+    landmarks : Landmarks, optional
+        Left out where the reference has gaps that landmarks could fall into.
+
+    Returns
+    -------
+    list of dict
+        ``mode``, and what `score_row` gives.
+    """
+    marks = landmarks if reference.covered.all() else None
+    return [
+        {"mode": mode, **score_row(each[reference.covered], reference.world_from_image, grid, marks)}
+        for mode, each in poses.items()
+    ]
+
+
+def score_row(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None = None
+) -> dict[str, Any]:
+    """Drift rates and displacement errors of one trajectory, under the names of the module's table.
+
+    Parameters
+    ----------
+    poses, true : RigidTransform, length n
+        Estimate and reference.
+    grid : ImageGrid or None
+        None where nothing is known of the images: the drift is then that of the poses' origin, and the errors
+        at pixels are None.
+    landmarks : Landmarks, optional
+        Without, the errors at landmarks are None.
+    """
+    rates = drift_rates(poses, true, np.zeros(3) if grid is None else grid.centre_mm)
+    return {**rates, **_point_row(poses, true, grid, landmarks)}
+
+
+def challenge_score(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid, landmarks: Landmarks
+) -> float:
+    """The challenge's final score of one scan, as of 2025 [1]_: 1 if exact, 0 if as far off as resting poses.
+
+    The mean over the four errors of ``1 - error / error of identity poses``. Below zero where an estimate is
+    worse than none.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the reference rests, so that there is nothing to be better than.
+
+    References
+    ----------
+    .. [1] TUS-REC challenge 2025, assessment criteria, ranking method.
+    """
+    found = _point_row(poses, true, grid, landmarks)
+    resting = _point_row(RigidTransform.identity(len(true)), true, grid, landmarks)
+    for key in CHALLENGE_ERRORS:
+        if not resting[key] > 0:
+            raise InsufficientDataError(f"{key}: expected a reference that moves, got one that rests")
+    return float(np.mean([(resting[key] - found[key]) / resting[key] for key in CHALLENGE_ERRORS]))
+
+
+def _point_row(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None
+) -> dict[str, Any]:
+    pixels = None if grid is None else pixel_errors(poses, true, grid)
+    marks = None if landmarks is None else landmark_errors(poses, true, landmarks.frame, landmarks.points_mm)
+    return {
+        "GPE_mm": pixels and pixels.global_mm,
+        "GLE_mm": marks and marks.global_mm,
+        "LPE_mm": pixels and pixels.local_mm,
+        "LLE_mm": marks and marks.local_mm,
+    }
 
 
 def _differences(
@@ -168,12 +241,6 @@ def _differences(
     whole = [(each[0].inv() * each[1:]).as_matrix()[:, :3] for each in both]
     steps = [relative_poses(each).as_matrix()[:, :3] for each in both]
     return whole[0] - whole[1], steps[0] - steps[1]
-
-
-def _displaced(differences: FloatArray, points: FloatArray) -> FloatArray:
-    """Lengths of the differences at points, shape (n - 1, p)."""
-    moved = differences[:, :, :3] @ points.T + differences[:, :, 3:]
-    return np.asarray(np.linalg.norm(moved, axis=1))
 
 
 def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:

@@ -1,7 +1,7 @@
-"""How sure a study can be: intervals of means over sweeps, and modes compared in pairs.
+"""Confidence intervals of means over sweeps, and paired comparisons of two modes.
 
 A sweep is the unit: one number per sweep and mode. With fewer than `FEWEST` sweeps, or without any scatter,
-there is no interval to be had, and none is given.
+no interval is given.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 
 FEWEST = 3
-"""Below, a bootstrap only repeats the values themselves."""
+"""Sweeps that an interval needs: below, a bootstrap only repeats the values themselves."""
 
 _RESAMPLES = 9999
 _SEED = 20081
@@ -53,8 +52,8 @@ class PairedComparison:
     wilcoxon_p: float | None
 
 
-def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterval:
-    """Mean of one value per sweep, with its percentile bootstrap interval [1]_; seeded, so it repeats.
+def mean_interval(values: npt.ArrayLike) -> MeanInterval:
+    """Mean of one value per sweep, with its 95 % percentile bootstrap interval [1]_; seeded, so it repeats.
 
     NaN stands for a sweep without a value and is left out.
 
@@ -67,24 +66,24 @@ def mean_interval(values: npt.ArrayLike, confidence: float = 0.95) -> MeanInterv
     ----------
     .. [1] B. Efron and R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
     """
-    held = _held(np.asarray(values, dtype=float))
+    held = _present(np.asarray(values, dtype=float))
     mean = float(held.mean())
-    if not _tells(held):
+    if not _scatters(held):
         return MeanInterval(held.size, mean, None, None)
+    from scipy import stats  # takes 0.3 s to import, which a single reconstruction does without
+
     interval = stats.bootstrap(
         (held,),
         np.mean,
         n_resamples=_RESAMPLES,
-        confidence_level=confidence,
+        confidence_level=0.95,
         method="percentile",
         rng=np.random.default_rng(_SEED),
     ).confidence_interval
     return MeanInterval(held.size, mean, float(interval.low), float(interval.high))
 
 
-def paired_comparison(
-    first: npt.ArrayLike, second: npt.ArrayLike, confidence: float = 0.95
-) -> PairedComparison:
+def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> PairedComparison:
     """Compare two modes by their differences, sweep by sweep; sweeps that lack either are left out.
 
     Raises
@@ -97,15 +96,19 @@ def paired_comparison(
     one, other = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     if one.shape != other.shape:
         raise MismatchError(f"second mode: expected values of shape {one.shape}, got {other.shape}")
-    differences = _held(one - other)
-    found = mean_interval(differences, confidence)
-    if not _tells(differences):
+    differences = _present(one - other)
+    found = mean_interval(differences)
+    if not _scatters(differences):
         return PairedComparison(found, None)
+    from scipy import stats
+
     return PairedComparison(found, float(stats.wilcoxon(differences).pvalue))
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """Correct p values of several tests for their number [1]_; None stands for a test that was not made.
+
+    SciPy 1.18 corrects for false discoveries (Benjamini and Hochberg) but not for any error at all (Holm).
 
     References
     ----------
@@ -120,12 +123,12 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-def _held(values: FloatArray) -> FloatArray:
+def _present(values: FloatArray) -> FloatArray:
     held: FloatArray = values[np.isfinite(values)]
     if not held.size:
         raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
     return held
 
 
-def _tells(values: FloatArray) -> bool:
+def _scatters(values: FloatArray) -> bool:
     return values.size >= FEWEST and bool(np.ptp(values) > 0)

@@ -1,6 +1,7 @@
-"""One trajectory against another, whatever files they come from: absolute and relative pose errors.
+"""Score one trajectory against another, read from TUM text, a reconstruction or a sweep.
 
-As `evo` computes them [1]_, the first poses laid on each other (``--align_origin``), no scale and no fit.
+Pose errors are computed as by `evo` with the first poses laid on each other (``--align_origin``), without
+scale or fit.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses
+from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.challenge import Landmarks
@@ -22,12 +24,12 @@ from speckle3d.io.hdf5 import file_format, open_hdf5, reading, sha256_of
 from speckle3d.io.load import load_landmarks, load_sweep, sniff
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import LengthUnit, read_tum
-from speckle3d.scoring.displacements import drift_rates
-from speckle3d.scoring.scores import challenge_score, score_row
-from speckle3d.study.job import find_reference
+from speckle3d.scoring.displacements import challenge_score, score_row
+from speckle3d.scoring.references import find_reference
 
 _ROUNDING_S = 0.5e-6
-"""What six decimals, the fewest in common use, take from a time. A probe at 100 mm/s moves 50 nm in it."""
+"""Rounding error of a time printed with six decimals, the fewest in common use. A probe at 100 mm/s moves
+50 nm in this time."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,10 @@ class Trajectory:
     poses : RigidTransform, length n
         ``world_from_image``, in any world.
     grid : ImageGrid or None
-        None where the file tells nothing of images; the poses' origin then stands for the image centre.
+        None where the file does not describe the images; the poses' origin then stands for the image centre.
     landmarks : Landmarks or None
     sweep_sha256 : str
-        Of the sweep that the poses are of; empty where the file does not tell.
+        SHA-256 of the sweep that the poses belong to; empty where the file does not say.
     """
 
     name: str
@@ -82,9 +84,31 @@ def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> Pos
     return _pose_error(relative_poses(reference).inv() * relative_poses(poses))
 
 
+def kind_of(path: Path) -> str:
+    """Kind of a file by its content: "reconstruction", "sweep" or "text" (anything unknown)."""
+    try:
+        kind = sniff(path)
+    except InvalidInputError:
+        return "text"
+    if kind != "hdf5":
+        return "sweep"
+    with reading(path), open_hdf5(path) as file:
+        is_reconstruction = "format" in file.attrs and file_format(file) == FORMAT
+    return "reconstruction" if is_reconstruction else "sweep"
+
+
 def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | None = None) -> Trajectory:
-    """Read TUM text, or one mode of a reconstruction."""
-    if _is_hdf5(path):
+    """Read TUM text, or one mode of a reconstruction.
+
+    Parameters
+    ----------
+    path : path
+    mode : str
+        Which poses of a reconstruction.
+    length_unit : {"m", "mm"}, optional
+        Of text that does not say; else metres.
+    """
+    if kind_of(path) != "text":
         return load_reconstructed(path, mode)
     held = read_tum(path, length_unit)
     return Trajectory(path.name, held.time_s, held.world_from_sensor)
@@ -99,10 +123,15 @@ def load_reconstructed(path: Path, mode: str) -> Trajectory:
         If the reconstruction has no such mode.
     """
     found = read_reconstruction(path, with_pairs=False)
-    if mode not in found.poses:
-        raise InvalidInputError(f"--mode: expected one of {', '.join(found.poses)}, got {mode!r}")
     name, of = f"{path.name}, mode {mode}", found.provenance.input_sha256
-    return Trajectory(name, found.frame_time_s, found.poses[mode], found.grid, sweep_sha256=of)
+    return Trajectory(name, found.frame_time_s, poses_of(found, mode), found.grid, sweep_sha256=of)
+
+
+def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:
+    """Poses of one mode, or an `InvalidInputError` that lists the modes there are."""
+    if mode not in reconstruction.poses:
+        raise InvalidInputError(f"--mode: expected one of {', '.join(reconstruction.poses)}, got {mode!r}")
+    return reconstruction.poses[mode]
 
 
 def load_reference(
@@ -110,12 +139,20 @@ def load_reference(
 ) -> Trajectory:
     """Read TUM text, a reconstruction, or the truth or tracker of a sweep.
 
+    Parameters
+    ----------
+    path : path
+    wanted : {"tracker", "truth"}, optional
+        Of a sweep; by default the truth if stored, else the tracker.
+    mode, length_unit
+        As for `load_estimate`.
+
     Raises
     ------
     InsufficientDataError
         If the sweep has no reference.
     """
-    if not _is_known(path) or _is_reconstruction(path):
+    if kind_of(path) != "sweep":
         return load_estimate(path, mode, length_unit)
     sweep = load_sweep(path)
     held = find_reference(sweep, wanted)
@@ -127,24 +164,27 @@ def load_reference(
     return Trajectory(name, times, held.world_from_image, sweep.grid, marks, sha256_of(path))
 
 
-def kind_of(path: Path) -> str:
-    """Whether a file is taken for a "reconstruction", another "sweep", or "text"."""
-    if not _is_known(path):
-        return "text"
-    return "reconstruction" if _is_reconstruction(path) else "sweep"
-
-
 def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
-    """Score an estimate: ``poses`` compared, ``APE``, ``RPE``, and the metrics of `study.points`.
+    """Score an estimate against a reference, matched by time.
 
-    Poses belong together by time: the reference is interpolated at the estimate's times, and times it does
-    not cover are left out. Metrics that need pixels or landmarks are None where the files tell of none.
-    ``same_sweep`` is whether both are of the same bytes, None where a file does not tell.
+    The reference is interpolated at the estimate's times, and times it does not cover are left out.
+
+    Parameters
+    ----------
+    estimate, reference : Trajectory
+
+    Returns
+    -------
+    dict
+        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, ``same_sweep``
+        (whether both are of the same bytes, None where a file does not say), ``APE`` and ``RPE`` as
+        `PoseError`, what `speckle3d.scoring.displacements.score_row` gives, and the TUS-REC ``score``, None
+        without landmarks.
 
     Raises
     ------
     MismatchError
-        If the two share less than two times, or are of different images.
+        If the two share fewer than two times, or their images differ in size.
     """
     grid = estimate.grid or reference.grid
     if estimate.grid and reference.grid and estimate.grid != reference.grid:
@@ -159,6 +199,7 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     whole = bool(shared.all()) and len(true) == len(reference.poses)
     marks = reference.landmarks if whole else None
     of = estimate.sweep_sha256, reference.sweep_sha256
+    score = challenge_score(found, true, grid, marks) if grid is not None and marks is not None else None
     return {
         "estimate": estimate.name,
         "reference": reference.name,
@@ -167,34 +208,17 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
         "same_sweep": of[0] == of[1] if all(of) else None,
         "APE": absolute_pose_error(found, true),
         "RPE": relative_pose_error(found, true),
-        **_scores(found, true, grid, marks),
+        **score_row(found, true, grid, marks),
+        "score": score,
     }
 
 
 def _snapped(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
-    """Times with those that are a time of `onto_s` but for rounding set to it: the ends count, too."""
+    """Set times that equal a time of `onto_s` but for rounding to it, so that its ends are covered."""
     right = np.clip(np.searchsorted(onto_s, time_s), 1, max(onto_s.size - 1, 1))
     near = [onto_s[np.minimum(each, onto_s.size - 1)] for each in (right - 1, right)]
     nearest = np.where(np.abs(near[0] - time_s) <= np.abs(near[1] - time_s), *near)
     return np.where(np.abs(nearest - time_s) <= _ROUNDING_S + np.spacing(nearest), nearest, time_s)
-
-
-def _scores(
-    found: RigidTransform, true: RigidTransform, grid: ImageGrid | None, marks: Landmarks | None
-) -> dict[str, Any]:
-    if grid is not None:
-        row = score_row(found, true, grid, marks)
-        return row | {"score": None if marks is None else challenge_score(found, true, grid, marks)}
-    rates = drift_rates(found, true, np.zeros(3))
-    row = {
-        "FDR": rates.final_drift_rate,
-        "ADR": rates.average_drift_rate,
-        "MD_mm": rates.maximum_drift_mm,
-        "SD_mm": rates.sum_of_drift_mm,
-        "HD_mm": rates.hausdorff_mm,
-        "EA_deg": rates.mean_angle_deg,
-    }
-    return row | dict.fromkeys(("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm", "score"))
 
 
 def _pose_error(errors: RigidTransform) -> PoseError:
@@ -206,23 +230,3 @@ def _pose_error(errors: RigidTransform) -> PoseError:
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _is_known(path: Path) -> bool:
-    """Whether a file is of a kind that says so itself; text does not."""
-    try:
-        sniff(path)
-    except InvalidInputError:
-        return False
-    return True
-
-
-def _is_hdf5(path: Path) -> bool:
-    return _is_known(path) and sniff(path) == "hdf5"
-
-
-def _is_reconstruction(path: Path) -> bool:
-    if not _is_hdf5(path):
-        return False
-    with reading(path), open_hdf5(path) as file:
-        return "format" in file.attrs and file_format(file) == FORMAT

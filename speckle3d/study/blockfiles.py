@@ -1,4 +1,4 @@
-"""Matched blocks of a sweep on disk, from which the sweep's own job goes on; gone when the sweep is done.
+"""Files of the matched blocks of a sweep, which its own job reads, and removes when the sweep is done.
 
 One ``.npz`` for each block: ``key`` (of the sweep's job), ``frame`` (n,), ``strip`` (n, vector, sample), one
 array for each field of `FrameFeatures`, and of e pairs, latest earlier frame first, ``first`` and ``second``
@@ -24,10 +24,10 @@ from speckle3d.matching.blocks import Block, MatchedBlock, MatchedFrame
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.quality import FrameFeatures
 from speckle3d.matching.table import MatchedPair
-from speckle3d.study.strip import Strip
+from speckle3d.study.images import Strip
 
 _BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile)
-"""What NumPy raises, by place, when the bytes of a file do not make sense."""
+"""What NumPy raises on a damaged file, depending on where the damage is."""
 _NO_COVARIANCE = np.full((3, 3), np.nan)
 
 Arrays = Mapping[str, npt.NDArray[Any]]

@@ -1,9 +1,9 @@
-"""Sweeps in, a study's folder out: what ``speckle3d compare`` does.
+"""Compare modes over many sweeps, and write a study's folder: what ``speckle3d compare`` does.
 
 Every sweep is one job with a folder of its own, which appears whole or not at all under a name that holds a
 hash of everything that determines its content. Before a long sweep come jobs for blocks of its frames, whose
 results are kept in ``blocks/`` until the sweep is done. A study started again finds folders and blocks and
-skips what they hold; a worker that is killed leaves nothing behind but the work it was at.
+skips what they hold; of a worker that is killed only the unfinished job is lost.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder
-from speckle3d.study.job import REFERENCES, SUBSET
-from speckle3d.study.lock import only_run
-from speckle3d.study.naming import named
-from speckle3d.study.results import Study, write_study
+from speckle3d.scoring.references import require_reference
+from speckle3d.study.folder import named, only_run
+from speckle3d.study.job import SUBSET
+from speckle3d.study.results import Study, SweepOutcome, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
 from speckle3d.study.sweepjob import (
     BlockJob,
     BlockOutcome,
     SweepJob,
-    SweepOutcome,
     block_files,
     finished,
     lost,
@@ -39,7 +38,9 @@ from speckle3d.study.sweepjob import (
 )
 
 MATCHING_SHARE = 0.5
-"""Of a sweep's time: half with frames of 127 x 3818 samples, less with small ones."""
+"""Share of a sweep's time that matching its blocks takes: half with frames of 127 x 3818 samples, less with
+small ones."""
+
 Task = SweepJob | BlockJob
 TaskOutcome = SweepOutcome | BlockOutcome
 KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
@@ -47,7 +48,7 @@ KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
 
 @dataclass
 class StudyProgress:
-    """How far a study is, and how long the rest will take by what is finished."""
+    """How far a study is, and how long the rest will take judging by what is finished."""
 
     sweeps: int
     frames: int
@@ -60,7 +61,7 @@ class StudyProgress:
     _matched: dict[str, float] = field(default_factory=dict)
 
     def add(self, outcome: SweepOutcome, frames: int, workers: int) -> None:
-        """Count a finished sweep; only those that took time say how long others take."""
+        """Count a finished sweep; skipped and failed ones do not count for the time left."""
         self.done += 1
         self.done_frames += frames - self._matched.pop(outcome.name, 0.0)
         self.failed += outcome.status == "failed"
@@ -172,12 +173,12 @@ def run_task(task: Task) -> TaskOutcome:
 
 
 def lost_task(task: Task, reason: str) -> TaskOutcome:
-    """Outcome of a job that has none of its own."""
+    """Outcome of a job that was lost with its workers."""
     return lost_block(task, reason) if isinstance(task, BlockJob) else lost(task, reason)
 
 
 def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[Task], dict[int, range]]:
-    """All jobs, and which come after which: a long sweep's own after those of its blocks."""
+    """All jobs, and which come after which: a long sweep's job comes after those of its blocks."""
     tasks: list[Task] = []
     after: dict[int, range] = {}
     for job in jobs:
@@ -188,19 +189,18 @@ def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[Task], dict[int, range]]:
 
 
 def _require_here(outcome: SweepOutcome, job: SweepJob) -> SweepOutcome:
-    """Fail a sweep whose results a worker wrote to a disk that is not seen from here."""
+    """Fail a sweep whose results a worker wrote to a disk that this process does not see."""
     if outcome.status == "done" and finished(job) is None:
         return lost(job, f"{job.folder}: expected a folder that workers and the study share, got none here")
     return outcome
 
 
 def _require_known(modes: tuple[str, ...] | None, reference: str | None) -> None:
-    """Refuse what would be wrong for every sweep before any work is done."""
+    """Refuse, before any work is done, what would be wrong for every sweep."""
     for mode in modes or ():
         if mode not in KNOWN_MODES:
             raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
-    if reference is not None and reference not in REFERENCES:
-        raise InvalidInputError(f"expected a reference among {', '.join(REFERENCES)}; got {reference!r}")
+    require_reference(reference)
 
 
 def _clear(jobs: Sequence[SweepJob]) -> None:

@@ -1,11 +1,15 @@
-"""Figures of a study, drawn without pyplot: no window system, no global state."""
+"""Figures of a reconstruction: what is drawn (series, labels, colours), and how matplotlib draws it.
+
+The report draws the same series by plotly as well. Nothing here needs pyplot or a window system.
+"""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,96 +17,193 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
+from speckle3d.scoring.references import REFERENCES, SweepCurves
 
 DOTS_PER_INCH = 150
+CURVE_LABELS = ("length / mm", "tilt / °", "yaw / °", "roll / °")
 
-MODE_COLOURS = {
-    "image": "#D55E00",
-    "image+subset": "#E69F00",
-    "orientation": "#0072B2",
-    "pose": "#009E73",
-    "crossed": "#CC79A7",
+_MODES = {
+    "image": ("image-based", "#D55E00"),
+    "image+subset": ("image-based, consistent subset", "#E69F00"),
+    "orientation": ("orientation correction", "#0072B2"),
+    "pose": ("six DOF correction", "#009E73"),
+    "crossed": ("crossed-sweep correction", "#CC79A7"),
 }
-"""Okabe and Ito's palette, told apart with any colour vision; the reference is black."""
+"""Label and colour of each mode, from Okabe and Ito's palette, told apart with any colour vision."""
 
-MODE_LABELS = {
-    "image": "image-based",
-    "image+subset": "image-based, consistent subset",
-    "orientation": "orientation correction",
-    "pose": "six DOF correction",
-    "crossed": "crossed-sweep correction",
-}
+_SPARE_COLOURS = ("#56B4E9", "#F0E442", "#999999")
+_REFERENCE_COLOUR = "#000000"
+_UNSEEN = "#33415c"
+"""Blue-grey of a reslice's pixels that no frame reached."""
 
-_MODE_STYLES = {"image": "-", "orientation": "--", "pose": "-.", "crossed": (0, (1, 1))}
+_DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)))
 """A second cue beside colour: corrected curves often lie on each other."""
+
+_STYLES: Mapping[str, Mapping[str, Any]] = {
+    "line": {"linewidth": 1.3},
+    "reference": {"linewidth": 2.4, "alpha": 0.5},
+    "band": {"linewidth": 0, "alpha": 0.15},
+    "points": {"linestyle": "none", "marker": "o", "markersize": 4, "alpha": 0.7},
+    "dotted": {"linewidth": 0.8, "marker": ".", "markersize": 3},
+    "bar": {"linewidth": 6, "alpha": 0.25},
+}
+Style = Literal["line", "reference", "band", "points", "dotted", "bar"]
 
 _LETTER_IN = 0.085
 """Width of a letter of medium size."""
 
 _FEWEST_LETTERS = 12
-"""In a line: the longest word."""
+"""Letters that a line of a title has at least: those of the longest word."""
 
 
-def figure_drift(
-    poses: Mapping[str, RigidTransform],
-    centre_mm: npt.ArrayLike,
-    reference: RigidTransform | None = None,
-    covered: npt.ArrayLike | None = None,
-    reference_name: str = "reference",
-    title: str = "",
-    covariance: FloatArray | None = None,
-) -> Figure:
-    """Draw accumulated elevational offset and tilt over the frames, for every mode and the reference.
+@dataclass(frozen=True)
+class Series:
+    """One thing that a panel shows.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 2) or (n, 3)
+        NaN breaks a line.
+    low : ndarray, shape (n,), optional
+        Lower edge of a band; `points` are the upper one.
+    dash : int
+        Which pattern of dashes a line has.
+    words : sequence of str
+        What each point is.
+    """
+
+    label: str
+    colour: str
+    points: FloatArray
+    style: Style = "line"
+    low: FloatArray | None = None
+    dash: int = 0
+    words: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Series on the same axes.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Name and unit of each coordinate.
+    levels : sequence of str
+        Names of the heights 0, 1, ... from the top, in place of numbers.
+    limits : (low, high), optional
+        Of the vertical axis.
+    """
+
+    series: Sequence[Series]
+    axes: tuple[str, ...]
+    levels: Sequence[str] = ()
+    limits: tuple[float, float] | None = None
+
+
+def label_of(mode: str) -> str:
+    """Words for a mode."""
+    return _MODES[mode][0] if mode in _MODES else mode
+
+
+def colour_of(mode: str, modes: Sequence[str] = ()) -> str:
+    """Colour of a mode, the same in all figures; the reference is black."""
+    if mode in REFERENCES:
+        return _REFERENCE_COLOUR
+    if mode in _MODES:
+        return _MODES[mode][1]
+    others = [m for m in modes if m not in _MODES]
+    return _SPARE_COLOURS[others.index(mode) % len(_SPARE_COLOURS) if mode in others else 0]
+
+
+def curve_panels(
+    curves: SweepCurves,
+    count: int = len(CURVE_LABELS),
+    frames: npt.NDArray[np.integer] | None = None,
+    minus_reference: bool = False,
+) -> list[Panel]:
+    """Panels of length, tilt, yaw and roll over the frames, for every mode and the reference.
 
     Parameters
     ----------
-    poses : mapping of str to RigidTransform, length n
-        ``world_from_image`` by mode.
-    reference : RigidTransform, length n or the number of covered frames, optional
-    covered : array_like of bool, shape (n,), optional
-        Frames that have a reference.
-    covariance : ndarray, shape (n, 6, 6), optional
-        Of the poses of mode `image`, which gets a band of its 95 % intervals.
+    count : int
+        Panels, from length on.
+    frames : ndarray of int, optional
+        Frames to draw; by default all.
+    minus_reference : bool
+        Draw differences from the reference.
 
     References
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
     """
-    figure = _new_figure(10.0, 4.2)
-    panels = figure.subplots(1, 2)
-    curves = {mode: _length_and_tilt(each, centre_mm) for mode, each in poses.items()}
-    if reference is not None:
-        shown = _reference_curves(reference, covered, next(iter(curves.values())), centre_mm)
-        _draw(panels, shown, color="black", linewidth=2.2, alpha=0.55, label=reference_name)
-    if covariance is not None and "image" in curves:
-        _shade(panels, curves["image"], covariance)
-    for mode, curve in curves.items():
-        colour, dashes = MODE_COLOURS.get(mode, "#56B4E9"), _MODE_STYLES.get(mode, "-")
-        label = MODE_LABELS.get(mode, mode)
-        _draw(panels, curve, color=colour, linestyle=dashes, linewidth=1.3, label=label)
-    _label(panels[0], "frame", "elevational offset at the centre / mm")
-    _label(panels[1], "frame", "accumulated tilt / degrees")
-    panels[0].legend(frameon=False, fontsize="small")
+    at = np.arange(curves.frames) if frames is None else frames
+
+    def over_frames(values: FloatArray) -> FloatArray:
+        return np.column_stack([at, values[at]])
+
+    panels = []
+    for q in range(count):
+        zero = np.zeros(curves.frames)
+        if minus_reference and curves.reference is not None:
+            zero = curves.reference[q]
+        series = []
+        if curves.reference is not None:
+            level = over_frames(curves.reference[q] - zero)
+            series.append(Series(curves.reference_name, _REFERENCE_COLOUR, level, "reference"))
+        if curves.half_width is not None:
+            middle, half = curves.modes["image"][q] - zero, curves.half_width[q]
+            name = f"95 % of {label_of('image')}"
+            band = over_frames(middle + half)
+            series.append(Series(name, colour_of("image"), band, "band", (middle - half)[at]))
+        for i, (mode, values) in enumerate(curves.modes.items()):
+            colour = colour_of(mode, list(curves.modes))
+            series.append(Series(label_of(mode), colour, over_frames(values[q] - zero), dash=i))
+        panels.append(Panel(series, ("frame", CURVE_LABELS[q])))
+    return panels
+
+
+def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
+    """Draw accumulated length and tilt over the frames, for every mode and the reference."""
+    figure = figure_panels(curve_panels(curves, 2), 2, (10.0, 4.2))
     figure.suptitle(title)
     return figure
 
 
-def _shade(panels: npt.NDArray[Any], curves: Any, covariance: FloatArray) -> None:
-    deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    for panel, curve, sigma in zip(
-        panels, curves, (deviation[:, 2], np.rad2deg(deviation[:, 3])), strict=True
-    ):
-        frames = np.arange(len(curve))
-        low, high = curve - 1.96 * sigma, curve + 1.96 * sigma
-        panel.fill_between(
-            frames, low, high, color=MODE_COLOURS["image"], alpha=0.15, linewidth=0, label="95 % of image"
-        )
+def figure_panels(panels: Sequence[Panel], columns: int, size_in: tuple[float, float]) -> Figure:
+    """Draw panels in rows of `columns`; panels below each other share the horizontal axis."""
+    figure = new_figure(*size_in)
+    rows = -(-len(panels) // columns)
+    named = bool(panels[0].levels)
+    places = figure.subplots(rows, columns, squeeze=False, sharex="col" if rows > 1 else False, sharey=named)
+    for i, (panel, axes) in enumerate(zip(panels, places.ravel(), strict=True)):
+        draw_panel(axes, panel, i + columns >= len(panels))
+    if named:
+        places[0, 0].set_yticks(range(len(panels[0].levels)), panels[0].levels)
+        places[0, 0].invert_yaxis()
+    else:
+        places[0, 0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def draw_panel(axes: Axes, panel: Panel, named_below: bool = True) -> None:
+    """Draw one panel."""
+    if panel.levels:
+        axes.axvline(0.0, color="0.6", linewidth=0.8)
+    for each in panel.series:
+        look: dict[str, Any] = {"color": each.colour, "label": each.label, **_STYLES[each.style]}
+        if each.low is not None:
+            axes.fill_between(each.points[:, 0], each.low, each.points[:, 1], **look)
+        else:
+            axes.plot(*each.points.T, **{"linestyle": _DASHES[each.dash % len(_DASHES)], **look})
+    if panel.limits:
+        axes.set_ylim(*panel.limits)
+    label_axes(axes, panel.axes[0] if named_below else "", panel.axes[1])
+    axes.grid(visible=True, alpha=0.3)
 
 
 def figure_reslice(
@@ -131,21 +232,34 @@ def figure_reslice(
         )
     widths = [abs(extents_mm[mode][1] - extents_mm[mode][0]) for mode in images_db]
     height = max(abs(extents_mm[mode][3] - extents_mm[mode][2]) for mode in images_db)
-    figure = _new_figure(*_reslice_size(widths, height))
+    figure = new_figure(*_reslice_size(widths, height))
     panels = figure.subplots(
         1, len(images_db), squeeze=False, sharey=True, width_ratios=[max(w, 0.2 * height) for w in widths]
     )[0]
     brightest = _brightest(images_db)
-    greys = colormaps["gray"].with_extremes(bad="#33415c")
     for panel, (mode, image) in zip(panels, images_db.items(), strict=True):
-        panel.imshow(image, cmap=greys, vmin=brightest - dynamic_range_db, vmax=brightest, aspect="equal",
-                     extent=extents_mm[mode], interpolation="nearest")  # fmt: skip
-        title = wrapped(MODE_LABELS.get(mode, mode), figure.get_figwidth() / len(images_db))
-        panel.set_title(title, fontsize="medium", color=MODE_COLOURS.get(mode, "black"))
+        show_grey(panel, image, extents_mm[mode], (brightest - dynamic_range_db, brightest))
+        panel.set_title(
+            wrapped(label_of(mode), figure.get_figwidth() / len(images_db)),
+            fontsize="medium",
+            color=colour_of(mode, list(images_db)),
+        )
         panel.set_xlabel(axis_labels[0])
     panels[0].set_ylabel(axis_labels[1])
     figure.suptitle(title)
     return figure
+
+
+def show_grey(
+    axes: Axes,
+    image: npt.NDArray[np.floating],
+    extent_mm: tuple[float, float, float, float],
+    levels: tuple[float, float],
+) -> None:
+    """Draw an image in grey from the first of the levels (black) to the second; blue-grey where it is NaN."""
+    greys = colormaps["gray"].with_extremes(bad=_UNSEEN)
+    axes.imshow(image, cmap=greys, vmin=levels[0], vmax=levels[1], aspect="equal", extent=extent_mm,
+                interpolation="nearest")  # fmt: skip
 
 
 def wrapped(title: str, width_in: float) -> str:
@@ -167,50 +281,19 @@ def save_figure(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _new_figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+def new_figure(
+    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
+) -> Figure:
+    """Make a figure that needs no window system."""
+    figure = Figure(figsize=(width_in, height_in), layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
 
-def _draw(panels: npt.NDArray[np.object_], curves: FloatArray, **style: Any) -> None:
-    for panel, curve in zip(panels, curves, strict=True):
-        panel.plot(curve, **style)
-
-
-def _length_and_tilt(poses: RigidTransform, centre_mm: npt.ArrayLike) -> FloatArray:
-    """Accumulated length, mm, and tilt, degrees, shape (2, n)."""
-    motion = accumulated(poses, centre_mm)
-    return np.stack([motion.length_mm, np.rad2deg(motion.tilt_rad)])
-
-
-def _reference_curves(
-    reference: RigidTransform,
-    covered: npt.ArrayLike | None,
-    estimate: FloatArray,
-    centre_mm: npt.ArrayLike,
-) -> FloatArray:
-    """Length and tilt of the reference, NaN where it has none.
-
-    A sum from the first reading would carry that reading's jitter along the whole trace, so the trace starts
-    at the estimate's level over the first few readings.
-    """
-    used = np.ones(estimate.shape[1], dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
-    if used.shape != estimate.shape[1:] or len(reference) not in (used.size, used.sum()):
-        raise MismatchError(
-            f"reference: expected {used.sum()} poses for {estimate.shape[1]} frames, got {len(reference)}"
-        )
-    curves = _length_and_tilt(reference[used] if len(reference) == used.size else reference, centre_mm)
-    start = (curves - estimate[:, used])[:, :JITTER_FRAMES]
-    shown = np.full(estimate.shape, np.nan)
-    shown[:, used] = curves - np.median(start, axis=1, keepdims=True)
-    return shown
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
+def label_axes(axes: Axes, x: str, y: str) -> None:
+    """Name the axes and leave out the frame at the top and the right."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.grid(visible=True, alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
 
 

@@ -1,22 +1,31 @@
-"""Grey images of a reconstructed sweep, made as they are asked for."""
+"""Images of a sweep to look at: log-compressed, or a narrow strip of every frame to cut along the sweep."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from speckle3d.config import config_from_toml
-from speckle3d.core.arrays import Float32Array
+from speckle3d.config import Config, config_from_toml
+from speckle3d.core.arrays import Float16Array, Float32Array
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.imaging.images import Images
+from speckle3d.imaging.reslice import ReslicePlane, along_sweep_plane, reslice_frames
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
 
+STRIP_MM = 2.4
+PIXEL_MM = 0.1
+"""Pixel of a cut along the sweep, and spacing of the depths that `Strip` keeps."""
+
+_LARGEST_MM = (400.0, 200.0)
 _GLANCES = 24
 """Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""
 
@@ -83,7 +92,38 @@ def grey_images(
     progress: Callable[[int, int], None] | None = None,
     reconstruction: Reconstruction | None = None,
 ) -> GreyImages:
-    """Make a sweep's images for compounding and reslicing, as its reconstruction was configured."""
+    """Make a sweep's grey images for compounding and reslicing, one at a time as they are asked for.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    dynamic_range_db : float
+        Range of the log-compressed grey levels 0 to 255.
+    progress : callable, optional
+        Called with the number of each image and of all.
+    reconstruction : Reconstruction, optional
+        To make the images as its configuration says.
+
+    Returns
+    -------
+    GreyImages
+        Indexed by frame: float32, shape (vector, sample), 0 to 255.
+
+    Raises
+    ------
+    InvalidInputError
+        If `dynamic_range_db` is not above zero.
+
+    Examples
+    --------
+    >>> import speckle3d as s3
+    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> images = s3.grey_images(sweep, dynamic_range_db=50.0)
+    >>> images.shape == (len(sweep), images.grid.vectors, images.grid.samples)
+    True
+    >>> bool(0 <= images[0].min() and images[0].max() <= 255)
+    True
+    """
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
         settings = config_from_toml(reconstruction.config_toml).intensity
@@ -100,10 +140,80 @@ def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Rec
     """
     reconstruction = read_reconstruction(path, with_pairs=False)
     stored = Path(reconstruction.provenance.input_path)
-    # As given, or from where the reconstruction lies.
+    # The stored path is tried as it is, then from the reconstruction's folder.
     source = sweep_file or (stored if stored.is_file() else path.parent / stored)
     if not source.is_file():
         raise InvalidInputError(f"{path}: expected its sweep at {source}, got none; say where it is: --sweep")
     if sha256_of(source) != reconstruction.provenance.input_sha256:
         raise MismatchError(f"{source}: expected the sweep that {path} was made from, got another (SHA-256)")
     return reconstruction, load_sweep(source)
+
+
+class Strip:
+    """A few vectors about the middle of every frame, pooled in depth: enough for a reslice, and small.
+
+    Attributes
+    ----------
+    grid : ImageGrid
+        Of the strip's images.
+    left_mm : float
+        Where its first vector lies in the whole image.
+    """
+
+    def __init__(self, sweep: Sweep, config: Config) -> None:
+        self._first, grid = middle_vectors(IntensityExtractor.for_sweep(sweep, config.intensity).grid)
+        self._pool = max(1, round(PIXEL_MM / grid.sample_spacing_mm))
+        self.grid = ImageGrid(
+            grid.vectors,
+            grid.samples // self._pool,
+            grid.vector_pitch_mm,
+            grid.sample_spacing_mm * self._pool,
+            grid.first_sample_depth_mm + (self._pool - 1) / 2 * grid.sample_spacing_mm,
+        )
+        self.left_mm = self._first * grid.vector_pitch_mm
+        self._images: dict[int, Float16Array] = {}
+
+    def keep(self, index: int, intensity: Float32Array) -> None:
+        """Keep the strip of a frame."""
+        part = intensity[self._first : self._first + self.grid.vectors, : self.grid.samples * self._pool]
+        pooled = part.reshape(self.grid.vectors, self.grid.samples, self._pool).mean(axis=2)
+        decibel = 10 * np.log10(np.maximum(pooled, 1e-12))
+        self._images[index] = decibel.astype(np.float16)
+
+    def kept(self, first: int, stop: int) -> Float16Array:
+        """Strips of some frames as they are kept, shape (frame, vector, sample), dB."""
+        return np.stack([self._images[index] for index in range(first, stop)])
+
+    def take(self, first: int, images: Float16Array) -> None:
+        """Keep strips of the frames from `first` on that were made elsewhere."""
+        self._images.update(enumerate(images, start=first))
+
+    def __getitem__(self, index: int) -> Float32Array:
+        return self._images[index].astype(np.float32)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (frame, vector, sample)."""
+        return len(self._images), self.grid.vectors, self.grid.samples
+
+
+def middle_vectors(grid: ImageGrid) -> tuple[int, ImageGrid]:
+    """First of the vectors `STRIP_MM` wide about the middle of the image, and their grid."""
+    width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
+    return (grid.vectors - width) // 2, replace(grid, vectors=width)
+
+
+def middle_plane(world_from_image: RigidTransform, grid: ImageGrid) -> ReslicePlane:
+    """Plane along the sweep through the middle vector, no larger than 400 x 200 mm."""
+    plane = along_sweep_plane(world_from_image, grid, grid.width_mm / 2, PIXEL_MM)
+    width, height = _LARGEST_MM
+    return replace(plane, width_mm=min(plane.width_mm, width), height_mm=min(plane.height_mm, height))
+
+
+def cut_frames(
+    images: Images, grid: ImageGrid, world_from_image: RigidTransform, plane: ReslicePlane
+) -> Float32Array:
+    """Reslice with a reach of two of the sweep's longest steps, so that no gaps show between frames."""
+    steps = np.abs(np.diff((world_from_image[0].inv() * world_from_image).translation[:, 2]))
+    reach_mm = max(0.3, 2.0 * float(np.percentile(steps, 99)))
+    return reslice_frames(images, grid, world_from_image, plane, reach_mm)

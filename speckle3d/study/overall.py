@@ -1,4 +1,4 @@
-"""What a study says over all its sweeps: mean errors by mode with intervals, and modes told apart or not.
+"""Results over all sweeps of a study: mean errors by mode with intervals, and which modes are told apart.
 
 A sweep is the unit. Of the errors of its parts the mean magnitude counts; drift and displacement are one
 number per sweep anyhow. A mode's mean is over the sweeps that have it; modes are ranked by their means over
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.tables import text_table
 from speckle3d.scoring.statistics import holm, mean_interval, paired_comparison
 
 LEVEL = 0.05
@@ -27,13 +28,13 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something to compare modes by: its key in a study's rows, words for it, and how it is written."""
+    """A number that modes are compared by: its key in a study's rows, words for it, and its format."""
 
     key: str
     words: str
     form: str = "{:.2f}"
     signed_parts: bool = False
-    """Whether it is an error of every part, with a sign."""
+    """Whether it is a signed error of every part of a sweep, not one number per sweep."""
 
     def shown(self, value: float | None, signed: bool = False) -> str:
         """Write a value; a dash for none."""
@@ -96,7 +97,7 @@ def over_sweeps(
 
 
 def beats(paired: Sequence[Row], quantity: str, mode: str, other: str) -> bool:
-    """Whether a study tells that a mode has less error than another in a quantity."""
+    """Whether the sweeps show that a mode has less error than another in a quantity."""
     return any(
         row["quantity"] == quantity
         and {row["mode"], row["against"]} == {mode, other}
@@ -143,12 +144,12 @@ def overall_text(
     shared: Sequence[Row] = (),
     references: Mapping[str, str] | None = None,
 ) -> str:
-    """Compact table of means and intervals, then the modes that are told apart; empty without any sweep.
+    """Table of means and intervals, then the modes that are told apart; empty without any sweep.
 
     Parameters
     ----------
     shared : sequence of mapping
-        As `shared_means` gives them, shown where the modes are not of the same sweeps.
+        From `shared_means`, shown where the modes are not of the same sweeps.
     references : mapping of str to str, optional
         What each sweep was compared with.
     """
@@ -178,15 +179,7 @@ def _means_lines(title: str, records: Sequence[Row], most: int) -> list[str]:
         cells = {row["mode"]: _cell(quantity, row, most) for row in mine}
         if cells:
             lines.append([quantity.words, *(cells.get(mode, "-") for mode in modes)])
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    lines.insert(1, ["-" * width for width in widths])
-    return [
-        "  ".join(
-            cell.rjust(width) if i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    ]
+    return text_table(lines).splitlines()
 
 
 def reference_words(references: Mapping[str, str]) -> str:

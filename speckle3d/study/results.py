@@ -1,21 +1,91 @@
-"""What a study writes of all its sweeps together: ``study.json`` and the tables."""
+"""Results of a comparison on file: of one sweep (``summary.json``) and of a whole study (``study.json``).
+
+Beside each lie ``table.txt`` for people and ``table.csv``.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from speckle3d.io.hdf5 import atomic_path
-from speckle3d.report.data import FORMAT, VERSION
+import numpy as np
+from pydantic_core import to_json
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.tables import text_table
+from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.overall import over_sweeps, overall_text, shared_means
-from speckle3d.study.summary import Summary, csv_text, plain, remark_on, table_text
-from speckle3d.study.sweepjob import SweepOutcome
+
+FORMAT = "speckle3d.study"
+VERSION = 1
+
+_COLUMNS = (
+    ("sweep", "sweep", "{}"),
+    ("part", "part", "{}"),
+    ("mode", "mode", "{}"),
+    ("reference", "reference", "{}"),
+    ("reference_mm", "reference mm", "{:.2f}"),
+    ("estimate_mm", "estimate mm", "{:.2f}"),
+    ("length_error_mm", "error mm", "{:+.2f}"),
+    ("length_error_percent", "error %", "{:+.1f}"),
+    ("tilt_error_deg", "tilt deg", "{:+.2f}"),
+    ("yaw_error_deg", "yaw deg", "{:+.2f}"),
+    ("roll_error_deg", "roll deg", "{:+.2f}"),
+    ("remark", "remark", "{}"),
+)
+_TO_THE_LEFT = (0, 1, 2, 3, 11)
+_UNLIKE = (0.5, 2.0)
+"""Ratios of the tracker's travel to that of the images beyond which its unit is doubted: a wrong unit is a
+factor of ten."""
+
+_TRAVEL_MM = 1.0
+"""Travel below which jitter may be larger than what was travelled."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Errors of one sweep.
+
+    Attributes
+    ----------
+    reference : str
+        What the modes were compared with: "truth", "tracker" or "none".
+    coverage : float
+        Share of the frames that have a reference.
+    rows : sequence of ModeError
+    details : dict
+        Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
+    """
+
+    sweep: str
+    reference: str
+    frames: int
+    coverage: float
+    rows: Sequence[ModeError]
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """What became of one sweep; `status` is "done" or "failed", and `reason` says why it failed."""
+
+    name: str
+    path: Path
+    status: str
+    reason: str = ""
+    sha256: str = ""
+    key: str = ""
+    folder: str = ""
+    seconds: float = 0.0
+    frames: int = 0
+    skipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -25,7 +95,7 @@ class Study:
     Attributes
     ----------
     copies : mapping of str to str
-        Sweeps of the same bytes as one before them, which statistics over sweeps leave out, and that one.
+        Sweeps whose bytes are those of an earlier one, and that one; statistics over sweeps leave them out.
     """
 
     directory: Path
@@ -34,6 +104,22 @@ class Study:
     drift: Sequence[Mapping[str, Any]]
     table: str
     copies: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_summary(directory: Path, summaries: Sequence[Summary]) -> list[Path]:
+    """Write ``summary.json``, ``table.txt`` and ``table.csv``; each appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the directory cannot be written.
+    """
+    texts = {
+        "summary.json": json_text({"sweeps": summaries}),
+        "table.txt": table_text(summaries),
+        "table.csv": csv_text(summaries),
+    }
+    return _write_texts(directory, texts)
 
 
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
@@ -50,27 +136,18 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
         if outcome.status == "done":
             folder = directory / outcome.folder
             summaries.append(_read_summary(folder, outcome.name))
-            rows = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
-            drift += [{"sweep": outcome.name} | row for row in rows]
-    rows = [
-        {"sweep": each.sweep, "reference": each.reference, **asdict(row), "remark": remark_on(each, row)}
-        for each in summaries
-        for row in each.rows
-    ]
+            found = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
+            drift += [{"sweep": outcome.name} | row for row in found]
+    rows = _rows(summaries)
     copies = copies_among(outcomes)
-    single = (
-        [row for row in rows if row["sweep"] not in copies],
-        [row for row in drift if row["sweep"] not in copies],
-    )
+    single = [[row for row in some if row["sweep"] not in copies] for some in (rows, drift)]
     intervals, paired = over_sweeps(*single)
     shared = shared_means(*single)
-    table = table_text(summaries) + "".join(
-        f"{each.name}  failed: {each.reason}\n" for each in outcomes if each.status == "failed"
-    )
     references = {each.sweep: each.reference for each in summaries if each.sweep not in copies}
-    table += "".join(f"{line}\n" for line in copy_lines(copies))
-    if overall := overall_text(intervals, paired, shared, references):
-        table += f"\n{overall}"
+    overall = overall_text(intervals, paired, shared, references)
+    failed = [f"{each.name}  failed: {each.reason}" for each in outcomes if each.status == "failed"]
+    table = table_text(summaries) + "".join(f"{line}\n" for line in [*failed, *copy_lines(copies)])
+    table += f"\n{overall}" if overall else ""
     contents = {
         "format": FORMAT,
         "version": VERSION,
@@ -83,19 +160,89 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
         "shared": shared,
         "paired": paired,
     }
-    texts = {
-        "study.json": json.dumps(plain(contents), indent=2, allow_nan=False) + "\n",
+    files = {
+        "study.json": json_text(contents),
         "table.txt": table,
-        "table.csv": _csv(summaries, outcomes, copies),
+        "table.csv": csv_text(summaries, outcomes, copies),
     }
-    for name, text in texts.items():
-        with atomic_path(directory / name) as part:
-            part.write_text(text, encoding="utf-8")
+    _write_texts(directory, files)
     return Study(directory, outcomes, summaries, drift, table, copies)
 
 
+def remark_on(summary: Summary, row: ModeError) -> str:
+    """What a reader of a row must know beside its numbers; empty for nothing."""
+    words = []
+    images = next((r for r in summary.rows if r.mode == "image" and r.part == row.part), None)
+    fitted = any(each.mode == "pose" for each in summary.rows)
+    if row.mode == "pose" and summary.reference == "tracker":
+        words.append("fitted to this tracker")
+    if row.mode == "pose" and images is not None:
+        words.append(_doubt_of_unit(row.estimate_mm, images.estimate_mm))
+    elif row.mode == "image" and summary.reference == "tracker" and not fitted:
+        words.append(_doubt_of_unit(row.reference_mm, row.estimate_mm))
+    return "; ".join(each for each in words if each)
+
+
+def table_text(summaries: Sequence[Summary]) -> str:
+    """Aligned table for reading; angles and lengths are estimate minus reference."""
+    lines = [[heading for _, heading, _ in _COLUMNS]]
+    lines += [[_cell(row[key], form) for key, _, form in _COLUMNS] for row in _rows(summaries)]
+    if not any(line[-1] for line in lines[1:]):
+        lines = [line[:-1] for line in lines]
+    return text_table(lines, _TO_THE_LEFT)
+
+
+def csv_text(
+    summaries: Sequence[Summary],
+    outcomes: Sequence[SweepOutcome] | None = None,
+    copies: Mapping[str, str] | None = None,
+) -> str:
+    """One line per sweep, part and mode, with full precision, under the names of `ModeError`.
+
+    Parameters
+    ----------
+    outcomes : sequence of SweepOutcome, optional
+        Of a study: each line then also names its file, and each sweep that failed has a line with its reason.
+    copies : mapping of str to str, optional
+        As in `Study`.
+    """
+    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark"]
+    rows = _rows(summaries)
+    if outcomes is not None:
+        columns += ["path", "copy_of", "reason"]
+        paths = {each.name: str(each.path) for each in outcomes}
+        rows = [
+            row | {"path": paths[row["sweep"]], "copy_of": (copies or {}).get(row["sweep"], "")}
+            for row in rows
+        ]
+        rows += [
+            {"sweep": each.name, "path": str(each.path), "reason": each.reason}
+            for each in outcomes
+            if each.status == "failed"
+        ]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def json_text(value: Any) -> str:
+    """Dataclasses, arrays and numbers as strict JSON: a value that is not finite becomes null.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is anything else in it.
+    """
+    try:
+        return to_json(value, indent=2, inf_nan_mode="null", fallback=_listed).decode() + "\n"
+    except ValueError as error:
+        raise InvalidInputError(f"summary: expected what JSON can hold: {error}") from error
+
+
 def copies_among(outcomes: Sequence[SweepOutcome]) -> dict[str, str]:
-    """Sweeps that are copies of one before them, byte by byte, and which: they tell nothing of their own."""
+    """Sweeps whose bytes are those of an earlier one, and that one's name."""
     first: dict[str, str] = {}
     copies: dict[str, str] = {}
     for each in outcomes:
@@ -107,6 +254,23 @@ def copies_among(outcomes: Sequence[SweepOutcome]) -> dict[str, str]:
 def copy_lines(copies: Mapping[str, str]) -> list[str]:
     """Say which sweeps were left out of what is counted over sweeps."""
     return [f"{name} is a copy of {first}: counted once" for name, first in copies.items()]
+
+
+def _rows(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
+    """One record per sweep, part and mode."""
+    return [
+        {"sweep": each.sweep, "reference": each.reference, **asdict(row), "remark": remark_on(each, row)}
+        for each in summaries
+        for row in each.rows
+    ]
+
+
+def _doubt_of_unit(tracker_mm: float, images_mm: float) -> str:
+    if not (abs(images_mm) >= _TRAVEL_MM and math.isfinite(tracker_mm)):
+        return ""
+    share = abs(tracker_mm / images_mm)
+    low, high = _UNLIKE
+    return "" if low <= share <= high else f"tracker travels {share:.2g} of what the images do: its unit?"
 
 
 def _entry(outcome: SweepOutcome, copies: Mapping[str, str]) -> dict[str, Any]:
@@ -127,16 +291,20 @@ def _read_summary(folder: Path, name: str) -> Summary:
     )
 
 
-def _csv(summaries: Sequence[Summary], outcomes: Sequence[SweepOutcome], copies: Mapping[str, str]) -> str:
-    """All rows with their files, and one for each sweep that failed, with its reason."""
-    lines = list(csv.reader(io.StringIO(csv_text(summaries))))
-    width = len(lines[0])
-    paths = {each.name: str(each.path) for each in outcomes}
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*lines[0], "path", "copy_of", "reason"])
-    writer.writerows([*line, paths[line[0]], copies.get(line[0], ""), ""] for line in lines[1:])
-    for each in outcomes:
-        if each.status == "failed":
-            writer.writerow([each.name, *[""] * (width - 1), paths[each.name], "", each.reason])
-    return text.getvalue()
+def _cell(value: Any, form: str) -> str:
+    return "-" if isinstance(value, float) and math.isnan(value) else form.format(value)
+
+
+def _listed(value: Any) -> Any:
+    """Arrays and NumPy scalars as lists and numbers of Python's own, for `to_json`."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise ValueError(f"got {type(value)}")
+
+
+def _write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+    make_folder(directory)
+    for name, text in texts.items():
+        with atomic_path(directory / name) as part:
+            part.write_text(text, encoding="utf-8")
+    return [directory / name for name in texts]

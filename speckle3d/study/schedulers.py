@@ -1,9 +1,9 @@
 """Where a study's jobs run: in this process one after another, or on the workers of a Dask cluster.
 
-A job is a function of one argument that returns a result and does not raise; both ways call the same function
-with the same argument, so the results are the same. A job that its worker does not survive, tried again on
-others, becomes a result by `lost`, so that it cannot stop a study. A job may come after others: it starts
-when they have ended, and is lost if one of them was.
+A job is a function of one argument that returns a result and does not raise; both ways call the same
+function with the same argument, so the results are the same. A job whose worker dies is tried again on
+others; one that takes several workers with it becomes a result by `lost` and does not stop the study. A job
+may come after others: it starts when they have ended, and is lost if one of them was.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Scheduler(Protocol):
 
 @dataclass(frozen=True)
 class InProcess:
-    """One job after another, here."""
+    """Runs one job after another in this process."""
 
     def run(
         self,
@@ -79,10 +79,11 @@ class InProcess:
 
 @dataclass(frozen=True)
 class OnCluster:
-    """On the workers that a Dask client reaches.
+    """Runs jobs on the workers of a Dask client.
 
-    Each job is one task, given to a worker when it is free. The task of a worker that dies is given to
-    another; a task that has taken several workers with it is given up. Jobs that others wait for go first.
+    Each job is one task, given to a worker when it is free; a job that comes after others depends on their
+    tasks. The task of a worker that dies is given to another; a task that has taken several workers with it
+    is given up. Jobs that come after others go first, then those that others wait for.
     """
 
     client: Any
@@ -95,49 +96,57 @@ class OnCluster:
         after: After | None = None,
     ) -> Iterator[tuple[int, Result]]:
         """Yield the number of each job and its result as they come."""
-        order = _Order({number: (after or {}).get(number, ()) for number in range(len(jobs))})
-        while order.waiting:
-            suspects = []
-            for number, reason, result in self._arriving(function, jobs, order):
-                if reason == _KILLED:
-                    suspects.append(number)
-                else:
-                    yield from _ended(number, reason, result, jobs, lost, order)
-            # The cluster blames a death on all that waited at the worker; alone, each shows if it was it.
-            for suspect in suspects:
-                for number, reason, result in self._arriving(function, jobs, _Order({suspect: ()})):
-                    yield from _ended(number, reason, result, jobs, lost, order)
+        before = {number: (after or {}).get(number, ()) for number in range(len(jobs))}
+        suspects = []
+        for number, reason, result in self._arriving(function, jobs, before):
+            if reason == _KILLED:
+                suspects.append(number)
+            else:
+                yield number, result if reason is None else lost(jobs[number], reason)
+        # The cluster blames a death on every task that waited at the worker and on those that depend on them:
+        # each shows alone whether it was the cause.
+        given_up: dict[int, str] = {}
+        for number in sorted(suspects):
+            reason = next((given_up[each] for each in before[number] if each in given_up), None)
+            result = None
+            if reason is None:
+                ((_, reason, result),) = self._arriving(function, jobs, {number: ()})
+            if reason is not None:
+                given_up[number] = reason
+            yield number, result if reason is None else lost(jobs[number], reason)
 
     def _arriving(
-        self, function: Callable[[Job], Result], jobs: Sequence[Job], order: _Order
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], before: After
     ) -> Iterator[tuple[int, str | None, Any]]:
-        """Submit jobs as their turn comes; yield why each failed, or None, and its result, as they end."""
-        held: dict[Any, tuple[int, Any]] = {}
-        arriving = _dask().as_completed()
+        """Submit jobs; yield the number, why it failed or None, and the result of each as it ends."""
+        futures: dict[int, Any] = {}
+        needed = {each for others in before.values() for each in others}
+        for number, others in before.items():
+            # Not pure: a job's key must not be taken for that of an earlier study that is still held.
+            futures[number] = self.client.submit(
+                _on_one_thread,
+                function,
+                jobs[number],
+                [futures[each] for each in others],
+                pure=False,
+                priority=2 if others else int(number in needed),
+            )
+        numbers = {future.key: number for number, future in futures.items()}
+        arriving = _dask().as_completed(list(futures.values()))
         try:
-            while True:
-                for number in order.start():
-                    # Not pure: a job's key must not be taken for that of an earlier study that is still held.
-                    future = self.client.submit(
-                        _on_one_thread, function, jobs[number], pure=False, priority=order.priority[number]
-                    )
-                    held[future.key] = number, future
-                    arriving.add(future)
-                if not held:
-                    return
+            while futures:
                 if not self._one_has_ended(arriving):
-                    for number, _ in held.values():
+                    for number in futures:
                         yield number, _DESERTED, None
                     return
                 future = next(arriving)
-                # A result that is still asked for would be made again if its worker died.
-                number, _ = held.pop(future.key)
                 reason = _failure(future)
                 result = future.result() if reason is None else None
-                future.release()
-                yield number, reason, result
+                # A result that is still asked for would be made again if its worker died.
+                futures.pop(numbers[future.key]).release()
+                yield numbers[future.key], reason, result
         finally:
-            self.client.cancel([future for _, future in held.values()])
+            self.client.cancel(list(futures.values()))
 
     def _one_has_ended(self, arriving: Any) -> bool:
         """Wait for a job to end; False if there has been no worker for long."""
@@ -156,59 +165,6 @@ class OnCluster:
     def workers(self) -> int:
         """Threads of all workers, as they are now."""
         return max(1, int(sum(self.client.nthreads().values())))
-
-
-class _Order:
-    """Which jobs may start.
-
-    Attributes
-    ----------
-    waiting : dict
-        The jobs that have not started, each with those that it waits for.
-    priority : dict
-        Of every job: what finishes something begun goes first, then what others wait for.
-    """
-
-    def __init__(self, after: After) -> None:
-        self.waiting = {number: set(others) for number, others in after.items()}
-        needed = set().union(*after.values())
-        self.priority = {n: 2 if others else int(n in needed) for n, others in after.items()}
-
-    def start(self) -> list[int]:
-        """Jobs that wait for nothing any more; they wait no longer."""
-        ready = [number for number, others in self.waiting.items() if not others]
-        for number in ready:
-            del self.waiting[number]
-        return ready
-
-    def end(self, number: int) -> None:
-        """Let go of those that waited for a job."""
-        for others in self.waiting.values():
-            others.discard(number)
-
-    def give_up(self, number: int) -> list[int]:
-        """Take out those that waited for a job, and those that waited for them."""
-        gone = [n for n, others in self.waiting.items() if number in others]
-        for each in gone:
-            del self.waiting[each]
-        return gone + [n for each in gone for n in self.give_up(each)]
-
-
-def _ended(
-    number: int,
-    reason: str | None,
-    result: Any,
-    jobs: Sequence[Job],
-    lost: Callable[[Job, str], Result],
-    order: _Order,
-) -> Iterator[tuple[int, Result]]:
-    """Results that the end of a job brings: its own, or if it was lost, those of all that come after it."""
-    if reason is None:
-        order.end(number)
-        yield number, result
-        return
-    for each in (number, *order.give_up(number)):
-        yield each, lost(jobs[each], reason)
 
 
 @contextmanager
@@ -239,7 +195,7 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Any]:
-    """Client of so many worker processes of one thread each on this machine, ended with the block."""
+    """Client of a cluster of single-threaded worker processes on this machine; both end with the block."""
     with _without_interrupts():
         cluster = _start_local(workers)
     with cluster, _dask().Client(cluster) as client:
@@ -248,12 +204,12 @@ def local_cluster(workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Start processes that Ctrl-C does not end; one that comes in these seconds is lost.
+    """Start processes that ignore Ctrl-C; a Ctrl-C during these seconds is lost.
 
-    A terminal sends it to every process. The study's own then ends its workers, which need not say, each with
-    a traceback, that they were stopped. What a process ignores, those that it starts ignore, too.
+    A terminal sends it to every process. The study's own process then ends its workers, which need not print
+    a traceback each. Signals that a process ignores are ignored by the processes that it starts.
     """
-    if threading.current_thread() is not threading.main_thread():  # which alone may say so
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         yield
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -264,14 +220,14 @@ def _without_interrupts() -> Iterator[None]:
 
 
 def _start_local(workers: int) -> Any:
-    # A worker has one thread: more in the kernels would only get in the way.
+    # A worker has one thread: more threads in the kernels would only compete with the other workers.
     env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     return _dask().LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
-        # Even so it opens a port, by default the same for every cluster of the machine; 0 is a free one.
+        # Without a dashboard it still opens its port, by default the same for every cluster; 0 is a free one.
         scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
         memory_limit=0,
         silence_logs=50,
@@ -310,8 +266,8 @@ def _connected(address: str) -> Iterator[Any]:
         yield client
 
 
-def _on_one_thread(function: Callable[[Job], Result], job: Job) -> Result:
-    """What a worker runs: it was given one thread, and its neighbours need theirs."""
+def _on_one_thread(function: Callable[[Job], Result], job: Job, _before: Sequence[object]) -> Result:
+    """Run a job on a worker, without a second thread; its arguments include the results it comes after."""
     with on_one_thread():
         return function(job)
 
@@ -329,7 +285,7 @@ def _failure(future: Any) -> str | None:
 
 
 def _dask() -> Any:
-    """Dask's distributed part, an extra."""
+    """Import Dask's distributed part, which is an extra."""
     try:
         return importlib.import_module("distributed")
     except ImportError as error:

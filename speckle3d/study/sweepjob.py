@@ -1,7 +1,8 @@
-"""One sweep of a study as a job: it travels to a worker, works in a folder of its own, never raises.
+"""Jobs of a study: one for each sweep, in a folder of its own, and one for each block of a long sweep.
 
-The blocks of a long sweep are jobs of their own (`speckle3d.matching.blocks`). What they leave, the sweep's
-own job takes; a block that is not there it does itself.
+A job is sent to a worker and never raises: whatever goes wrong becomes the reason in its outcome. The job of
+a long sweep takes what the jobs of its blocks left on disk (`speckle3d.study.blockfiles`), and matches those
+blocks itself that are missing.
 """
 
 from __future__ import annotations
@@ -27,22 +28,23 @@ from speckle3d.io.load import companion_files, load_landmarks, load_sweep, sniff
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.blocks import Block, blocks_of
 from speckle3d.pipeline import match_ahead
-from speckle3d.scoring.scores import drift_rows
+from speckle3d.scoring.displacements import drift_rows
+from speckle3d.scoring.references import find_reference
 from speckle3d.study.blockfiles import BlockFiles
-from speckle3d.study.job import available_modes, find_reference, require_possible, run_job
-from speckle3d.study.strip import Strip
-from speckle3d.study.summary import plain
+from speckle3d.study.images import Strip
+from speckle3d.study.job import available_modes, require_possible, run_job
+from speckle3d.study.results import SweepOutcome, json_text
 
 DONE = "job.json"
-"""Written last into a sweep's folder."""
+"""File that is written last into a sweep's folder: with it the folder is whole."""
 
 _TEMPORARY = re.compile(r"\.part-[0-9a-f]{8}-")
-"""What a temporary name has before the name that it is to become."""
+"""Prefix of temporary names."""
 
 
 @dataclass(frozen=True)
 class SweepJob:
-    """One sweep to reconstruct, with everything that determines the result; it travels to workers.
+    """One sweep to reconstruct, with everything that determines the result.
 
     Attributes
     ----------
@@ -51,7 +53,8 @@ class SweepJob:
     key : str
         SHA-256 of the input's bytes, configuration, version, modes, reference, curves and calibrations.
     stamp : tuple of int
-        Size and time of change of the input from before it was hashed: as long as they last, so do its bytes.
+        Size and time of change of the input from before it was hashed; while they are the same, so are its
+        bytes.
     """
 
     name: str
@@ -77,24 +80,8 @@ class BlockJob:
 
 
 @dataclass(frozen=True)
-class SweepOutcome:
-    """What became of one sweep; `status` is "done" or "failed", and `reason` says why if it failed."""
-
-    name: str
-    path: Path
-    status: str
-    reason: str = ""
-    sha256: str = ""
-    key: str = ""
-    folder: str = ""
-    seconds: float = 0.0
-    frames: int = 0
-    skipped: bool = False
-
-
-@dataclass(frozen=True)
 class BlockOutcome:
-    """What became of one block; `reason` says why if it failed, and is empty if it did not."""
+    """What became of one block; `reason` says why it failed, and is empty if it did not."""
 
     name: str
     frames: int
@@ -159,7 +146,7 @@ def run_block(job: BlockJob) -> BlockOutcome:
 
 
 def lost_block(job: BlockJob, reason: str) -> BlockOutcome:
-    """Outcome of a block that has none of its own."""
+    """Outcome of a block that failed or was lost with its workers."""
     return BlockOutcome(job.sweep.name, job.block.stop - job.block.first, reason)
 
 
@@ -175,7 +162,7 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
     if held is not None:
         files.clear()
         return held
-    # A folder of its own: another worker may be at the same sweep, if this one was thought dead.
+    # Another worker may be at the same sweep if this one was taken for dead: each has its own folder.
     part = job.folder.with_name(f".part-{secrets.token_hex(4)}-{job.folder.name}")
     began = time.perf_counter()
     try:
@@ -185,7 +172,7 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
         _move(part, job)
         files.clear()
     except Exception as error:  # noqa: BLE001
-        # One broken sweep, or one bug that it brings to light, must not cost the others.
+        # One broken sweep, or one bug that it reveals, must not stop the others.
         return lost(job, _reason(error))
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -212,18 +199,18 @@ def _reconstruct(job: SweepJob, part: Path, files: BlockFiles) -> None:
     rows = []
     if reference is not None:
         poses = read_reconstruction(part / "reconstruction.h5", with_pairs=False).poses
-        rows = drift_rows(mounted, poses, reference, load_landmarks(job.path))
-    (part / "drift.json").write_text(json.dumps(plain(rows), allow_nan=False), encoding="utf-8")
+        rows = drift_rows(mounted.grid, poses, reference, load_landmarks(job.path))
+    (part / "drift.json").write_text(json_text(rows), encoding="utf-8")
 
 
 def _modes(job: SweepJob, sweep: Sweep, settings: Config) -> list[str]:
-    """Modes beside `image`, which is there in any case."""
+    """Modes beside `image`, which every job has."""
     modes = available_modes(sweep, settings) if job.modes is None else job.modes
     return [mode for mode in modes if mode != "image"]
 
 
 def _require_unchanged(job: SweepJob) -> None:
-    """Refuse an input of other bytes, without reading them all where nothing speaks for it."""
+    """Refuse an input of other bytes; they are only read if the file's size or time has changed."""
     if _stamp(job.path) != job.stamp:
         _require_same(job)
 
@@ -269,7 +256,7 @@ def _done(job: SweepJob, seconds: float, skipped: bool = False) -> SweepOutcome:
 
 
 def lost(job: SweepJob, reason: str) -> SweepOutcome:
-    """Outcome of a job that has none of its own; the reason names what was wanted, not temporary files."""
+    """Outcome of a job that failed or was lost with its workers; the reason leaves out temporary names."""
     told = _TEMPORARY.sub("", reason)
     return SweepOutcome(job.name, job.path, "failed", told, job.sha256, job.key, frames=job.frames)
 

@@ -35,7 +35,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.direction import settle_direction
 from speckle3d.pipeline import calibrate_curves, correct, track
-from speckle3d.scoring.lengths import accumulated, align_sign, compare_modes
+from speckle3d.scoring.lengths import accumulated, compare_modes
 from speckle3d.simulation.presets import SimulationSettings
 
 FIRST_SEED = 1001
@@ -142,6 +142,18 @@ class Result:
     gap_mm: float
     standard_poses: np.ndarray
     standard_patches: np.ndarray
+
+
+def align_sign(poses: RigidTransform, truth: RigidTransform, centre_mm: np.ndarray) -> RigidTransform:
+    """Mirror a sensorless reconstruction that moves the other way than the truth.
+
+    Images alone cannot tell a sweep from its mirror image in the first frame's plane, (z, tilt, yaw) ->
+    (-z, -tilt, -yaw): scored as they come, half the sweeps would score that convention and not the method.
+    """
+    found, true = (accumulated(each, centre_mm).length_mm for each in (poses, truth))
+    if (found - found.mean()) @ (true - true.mean()) >= 0.0:
+        return poses
+    return poses[0] * mirrored(poses[0].inv() * poses)
 
 
 def measure(case: Case, method: str, seed: int, curves: DecorrelationCurves, folder: Path) -> Result:

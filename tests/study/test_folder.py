@@ -1,7 +1,12 @@
 import itertools
+import subprocess
+import sys
 from pathlib import Path
 
-from speckle3d.study.naming import named
+import pytest
+
+from speckle3d.core.errors import FileError
+from speckle3d.study.folder import named, only_run
 
 
 def names_of(folder, *files):
@@ -33,3 +38,31 @@ def test_one_file_given_twice_is_one_and_a_link_has_its_own_name(tmp_path):
     paths = [tmp_path / name for name in ("s.h5", "again.h5", "dangling.h5")]
     assert named([*paths, paths[0]]) == [("s", paths[0]), ("dangling", paths[2])]
     assert named([Path("s.h5")])[0][0] == "s"
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from speckle3d.study.folder import only_run
+with only_run(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_folder_is_held_until_its_process_is_gone(tmp_path):
+    command = [sys.executable, "-c", HOLDER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(FileError, match=f"process {holder.pid}"), only_run(tmp_path):
+            pass
+        holder.kill()
+    with only_run(tmp_path):
+        pass
+
+
+def test_a_run_may_hold_its_folder_already(tmp_path):
+    with only_run(tmp_path), only_run(tmp_path):
+        pass
+    with only_run(tmp_path):
+        pass

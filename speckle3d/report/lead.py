@@ -1,24 +1,15 @@
-"""What the report says of all sweeps together: its first sentences, and tables of intervals and of pairs."""
+"""The report's first sentences: which mode has the smallest errors, and whether the sweeps can tell."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
 
-from speckle3d.report.figures import label_of
-from speckle3d.report.html import plain_table
-from speckle3d.study.overall import (
-    QUANTITIES,
-    Quantity,
-    beats,
-    fitted_to_reference,
-    mean_over_sweeps,
-    reference_words,
-)
+from speckle3d.study.figures import label_of
+from speckle3d.study.overall import beats, fitted_to_reference, mean_over_sweeps, reference_words
 
 Row = Mapping[str, Any]
 
@@ -34,7 +25,7 @@ _ERRORS = {
 
 @dataclass(frozen=True)
 class Scored:
-    """What the first sentences rest on.
+    """Mean errors by mode, from which the first sentences are made.
 
     Attributes
     ----------
@@ -147,34 +138,6 @@ def _reference_lines(means: Sequence[Row], references: Mapping[str, str]) -> lis
     return lines
 
 
-def intervals_table(intervals: Sequence[Row]) -> str:
-    """Mean and interval of every quantity, a column for each mode."""
-    if not intervals:
-        return ""
-    modes = list(dict.fromkeys(str(row["mode"]) for row in intervals))
-    most = max(row["sweeps"] for row in intervals)
-    lines = []
-    for quantity in QUANTITIES:
-        rows = {row["mode"]: row for row in intervals if row["quantity"] == quantity.key}
-        if rows:
-            lines.append(
-                [_words(quantity), *(_with_interval(quantity, rows.get(mode), most) for mode in modes)]
-            )
-    return plain_table([f"mean of {counted(most, 'sweep')}", *map(label_of, modes)], lines)
-
-
-def paired_table(paired: Sequence[Row]) -> str:
-    """Difference of every two modes in every quantity, bold where they are told apart."""
-    pairs = list(dict.fromkeys((str(row["mode"]), str(row["against"])) for row in paired))
-    lines = []
-    for quantity in QUANTITIES:
-        rows = {(r["mode"], r["against"]): r for r in paired if r["quantity"] == quantity.key}
-        if rows:
-            lines.append([_words(quantity), *(_difference(quantity, rows.get(pair)) for pair in pairs)])
-    heads = ["difference", *(f"{label_of(one)} − {label_of(other)}" for one, other in pairs)]
-    return plain_table(heads, lines)
-
-
 def best_of(means: Sequence[Row], key: str) -> str | None:
     """Mode with the smallest mean; None without any."""
     valued = [row for row in means if row[key] is not None]
@@ -219,29 +182,3 @@ def _doubt(means: Sequence[Row], paired: Sequence[Row], quantity: str, best: str
         others_named = "the other modes" if len(others) > 1 else label_of(others[0])
         return f" It is not told apart from {others_named} by these sweeps: the difference may be chance."
     return f" It is not told apart from {' and '.join(map(label_of, alike))}: that difference may be chance."
-
-
-def _words(quantity: Quantity) -> str:
-    return escape(
-        quantity.words.replace(" deg", " / °").replace(" mm", " / mm").replace("error %", "error / %")
-    )
-
-
-def _with_interval(quantity: Quantity, row: Row | None, most: int) -> str:
-    if row is None:
-        return "–"
-    text = quantity.shown(row["mean"])
-    if row["low"] is not None:
-        text += f" ({quantity.shown(row['low'])} to {quantity.shown(row['high'])})"
-    return text if row["sweeps"] == most else f"{text}<br>{counted(row['sweeps'], 'sweep')} only"
-
-
-def _difference(quantity: Quantity, row: Row | None) -> str:
-    if row is None:
-        return "–"
-    text = quantity.shown(row["difference"], signed=True)
-    if row["low"] is not None:
-        low, high = (quantity.shown(row[end], signed=True) for end in ("low", "high"))
-        text += f"<br>({low} to {high})"
-    text = text.replace("-", "−")
-    return f"<b>{text}</b>" if row["better"] else text

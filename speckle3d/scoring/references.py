@@ -1,0 +1,162 @@
+"""What a sweep's reconstruction is compared with: the simulation's truth, or the position sensor.
+
+`sweep_curves` accumulates the motion of both, frame by frame, as figures show them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.sweep import Sweep
+from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
+
+REFERENCES = ("tracker", "truth")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Poses that modes are compared with.
+
+    Attributes
+    ----------
+    name : {"tracker", "truth"}
+    world_from_image : RigidTransform, length k
+        At the covered frames.
+    covered : ndarray of bool, shape (n,)
+        Which of the sweep's n frames have a reference; k of them.
+    """
+
+    name: str
+    world_from_image: RigidTransform
+    covered: BoolArray
+
+
+@dataclass(frozen=True)
+class SweepCurves:
+    """Accumulated length (mm), tilt, yaw and roll (degrees) over the frames.
+
+    Attributes
+    ----------
+    modes : dict of str to ndarray, shape (4, n)
+    reference : ndarray, shape (4, n), or None
+        NaN at frames without one.
+    reference_name : str
+    half_width : ndarray, shape (4, n), or None
+        Of the 95 % interval of mode `image`.
+    """
+
+    modes: Mapping[str, FloatArray]
+    reference: FloatArray | None = None
+    reference_name: str = "none"
+    half_width: FloatArray | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return int(next(iter(self.modes.values())).shape[1])
+
+
+def require_reference(wanted: str | None) -> None:
+    """Raise `InvalidInputError` unless `wanted` is None or one of `REFERENCES`."""
+    if wanted is not None and wanted not in REFERENCES:
+        raise InvalidInputError(f"expected a reference among {', '.join(REFERENCES)}; got {wanted!r}")
+
+
+def find_reference(sweep: Sweep, wanted: str | None = None) -> Reference | None:
+    """Poses to compare a sweep's modes with: by default the truth if stored, else the tracker, else None.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    wanted : {"tracker", "truth"}, optional
+
+    Raises
+    ------
+    InvalidInputError
+        If `wanted` is neither.
+    InsufficientDataError
+        If the sweep does not have what is wanted.
+    """
+    require_reference(wanted)
+    if sweep.truth is not None and wanted != "tracker":
+        return Reference("truth", sweep.truth, np.ones(len(sweep), dtype=bool))
+    if wanted == "truth":
+        raise InsufficientDataError(f"{sweep.name}: expected true poses in /truth, got none")
+    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
+        covered = sweep.tracker.covers(sweep.frame_time_s)
+        if covered.sum() >= 2:
+            poses = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
+            return Reference("tracker", poses, covered)
+    if wanted == "tracker":
+        raise InsufficientDataError(f"{sweep.name}: expected a calibrated tracker over the frames, got none")
+    return None
+
+
+def sweep_curves(
+    poses: Mapping[str, RigidTransform],
+    centre_mm: npt.ArrayLike,
+    reference: Reference | None = None,
+    covariance: FloatArray | None = None,
+) -> SweepCurves:
+    """Accumulate the motion of every mode and of the reference.
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform, length n
+        ``world_from_image`` by mode.
+    centre_mm : array_like, shape (3,)
+        Image centre in the image frame.
+    reference : Reference, optional
+    covariance : ndarray, shape (n, 6, 6), optional
+        Of the poses of mode `image`: (x, y, z) in mm and (tilt, yaw, roll) in radians.
+
+    Raises
+    ------
+    MismatchError
+        If the reference is not of the same frames.
+    """
+    modes = {mode: _accumulated(each, centre_mm) for mode, each in poses.items()}
+    half_width = None
+    if covariance is not None and "image" in modes:
+        half_width = 1.96 * _in_degrees(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:])
+    if reference is None:
+        return SweepCurves(modes, half_width=half_width)
+    shown = _reference_curves(reference, next(iter(modes.values())), centre_mm)
+    return SweepCurves(modes, shown, reference.name, half_width)
+
+
+def _accumulated(poses: RigidTransform, centre_mm: npt.ArrayLike) -> FloatArray:
+    motion = accumulated(poses, centre_mm)
+    return _in_degrees(np.stack([motion.length_mm, motion.tilt_rad, motion.yaw_rad, motion.roll_rad]))
+
+
+def _in_degrees(values: FloatArray) -> FloatArray:
+    """Turn all rows but the first, which is a length, from radians to degrees."""
+    return np.concatenate([values[:1], np.rad2deg(values[1:])])
+
+
+def _reference_curves(reference: Reference, estimate: FloatArray, centre_mm: npt.ArrayLike) -> FloatArray:
+    """Curves of the reference, NaN at frames without one.
+
+    Summed from the first reading on, a tracker's trace would carry that reading's jitter throughout, so it
+    starts at the estimate's level over the first few readings.
+    """
+    used, poses = reference.covered, reference.world_from_image
+    if used.shape != estimate.shape[1:] or len(poses) != used.sum():
+        raise MismatchError(
+            f"reference: expected {used.sum()} poses for {estimate.shape[1]} frames, got {len(poses)}"
+        )
+    curves = _accumulated(poses, centre_mm)
+    if reference.name != "truth":
+        start = (curves - estimate[:, used])[:, :JITTER_FRAMES]
+        curves -= np.median(start, axis=1, keepdims=True)
+    shown = np.full(estimate.shape, np.nan)
+    shown[:, used] = curves
+    return shown
