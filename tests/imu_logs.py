@@ -2,6 +2,7 @@
 
 import numpy as np
 from imu_messages import (
+    Item,
     calibration_message,
     configuration_message,
     counts_of,
@@ -13,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.mtdata2 import Item
 from xsens.messages.rawcounts import RawCalibration
 
 G = 9.80665

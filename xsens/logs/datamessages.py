@@ -168,14 +168,6 @@ _NOTATIONS = {
 }
 """Parameter of `orientations_of` by the name of the item."""
 
-_MEASURED = (
-    "acceleration_m_s2",
-    "rate_of_turn_rad_s",
-    "magnetic_field_au",
-    "delta_v_m_s",
-    "delta_q_wxyz",
-    *_NOTATIONS,
-)
 _STAMPS = ("packet_counter", "sample_time_fine")
 _TICK_S = 1e-4
 
@@ -193,7 +185,7 @@ def mtdata2_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, h
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    table, damaged = columns(frames[which], frozenset((*_MEASURED, *_STAMPS)))
+    table, damaged = columns(frames[which])
     if damaged:
         parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
     rows = _sample_rows(table, which.size)
@@ -211,7 +203,7 @@ def _sample_rows(table: Table, size: int) -> BoolArray:
     """Mark messages that hold a measurement and every kind of time stamp that any message holds."""
     rows = np.zeros(size, dtype=bool)
     for identifier, column in table.items():
-        if name_of(identifier) in _MEASURED:
+        if name_of(identifier) not in _STAMPS:
             rows[column.rows] = True
     for stamp in _STAMPS:
         told = _filled(table, stamp, size)

@@ -19,7 +19,7 @@ from imu_logs import (
     raw_values,
     samples,
 )
-from imu_messages import calibration_message, configuration_message, items_payload, mtdata_payloads
+from imu_messages import Item, calibration_message, configuration_message, items_payload, mtdata_payloads
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
@@ -31,7 +31,6 @@ from xsens.logs.textlogs import write_csv
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration, utc_message
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
-from xsens.messages.mtdata2 import Item
 
 UNIT = calibration()
 COUNTED = OutputSettings.COUNTER
