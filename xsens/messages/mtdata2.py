@@ -22,10 +22,10 @@ from xsens.messages.mtdata import NumberFormat, numbers_from_bytes
 
 
 class Kind(NamedTuple):
-    """Meaning of an identifier: `count` real numbers, or a whole number of the NumPy type `whole`."""
+    """Meaning of an identifier: `numbers` real numbers, or a whole number of the NumPy type `whole`."""
 
     name: str
-    count: int
+    numbers: int
     whole: str = ""
 
 
@@ -144,7 +144,7 @@ def _numbers(identifier: int, data: ByteArray) -> FloatArray | None:
     if kind is None:
         return None
     one = np.dtype(kind.whole).itemsize if kind.whole else form.size
-    if data.shape[1] != kind.count * one:
+    if data.shape[1] != kind.numbers * one:
         return None
     if kind.whole:
         return np.ascontiguousarray(data).view(kind.whole).astype(np.float64)

@@ -182,7 +182,9 @@ def mixed(count, seed=0):
         for identifier, kind in KINDS.items():
             if rng.random() < 0.3 and not kind.whole:
                 bits = int(rng.integers(4) | rng.integers(3) << 2)
-                items.append(Item(identifier | bits, tuple(np.round(rng.normal(size=kind.count) * 64) / 64)))
+                items.append(
+                    Item(identifier | bits, tuple(np.round(rng.normal(size=kind.numbers) * 64) / 64))
+                )
         for odd in (0x7777, 0x201C, 0x4040, 0x4020, 0x1060):
             if rng.random() < 0.1:
                 items.insert(int(rng.integers(len(items))), Item(odd, bytes(int(rng.integers(13, 200)))))
