@@ -11,7 +11,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.simulation.bath import water_bath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
-from speckle3d.simulation.medium import MEDIA, Medium, TiledMedium
+from speckle3d.simulation.medium import Medium, TiledMedium, fully_developed, phantom, tissue
 from speckle3d.simulation.movement import (
     HandMotion,
     Trajectory,
@@ -22,12 +22,13 @@ from speckle3d.simulation.movement import (
     turned_about,
     world_from_medium,
 )
-from speckle3d.simulation.scan import Receiver, SimulatedFrames
+from speckle3d.simulation.scan import SimulatedFrames
 from speckle3d.simulation.sensors import (
     OrientationModel,
     TrackerModel,
     simulate_orientation,
     simulate_tracker,
+    with_noise,
 )
 from speckle3d.simulation.settings import Preset, SimulatedSweep, SimulationSettings
 
@@ -68,7 +69,7 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)
     if settings.preset == "plane":
         return (_plane(settings, medium_seed, heading_seed, sweep_seeds[0]),)
-    medium = MEDIA[_MEDIUM[settings.preset]](_entropy(medium_seed), settings.length_mm)
+    medium = _MEDIUM[settings.preset](_entropy(medium_seed), settings.length_mm)
     probe = Probe()
     beam = tabulate_beam(probe, attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
     heading = np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)
@@ -82,13 +83,13 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     )
 
 
-_MEDIUM: dict[str, str] = {
-    "phantom": "phantom",
-    "tissue": "tissue",
-    "reversal": "tissue",
-    "rotation": "phantom",
-    "crossed": "tissue",
-    "stepped": "fully_developed",
+_MEDIUM = {
+    "phantom": phantom,
+    "tissue": tissue,
+    "reversal": tissue,
+    "rotation": phantom,
+    "crossed": tissue,
+    "stepped": fully_developed,
 }
 
 
@@ -157,7 +158,7 @@ def _plane(
     scan = scan_floor(settings, width, world, np.random.default_rng(motion_seed))
     tracker = TrackerModel(mounting_rad=_MOUNTING_RAD, mounting_mm=_MOUNTING_MM)
     noise = settings.sensor_noise
-    sensors = tracker.with_noise(noise), OrientationModel().with_noise(noise)
+    sensors = with_noise(tracker, noise), with_noise(OrientationModel(), noise)
     bath = water_bath(_entropy(medium_seed), settings.reflector)
     name = f"plane-{settings.reflector}-{settings.seed}"
     return _scanned(settings, beam, bath, scan, times, duration, sensors, others, False, name)
@@ -189,7 +190,7 @@ def _scanned(
     orientation = simulate_orientation(trajectory, span, sensors[1], np.random.default_rng(seeds[1]))
     poses = trajectory.medium_from_image(times)
     sweep = Sweep(
-        SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(seeds[2])),
+        SimulatedFrames(beam, medium, poses, image, settings.snr_db, _entropy(seeds[2])),
         image,
         beam.probe.signal,
         times,
@@ -215,7 +216,7 @@ def _stepped(
     poses = stepped_poses(settings.steps, settings.step_mm, settings.blocks, gap)
     times = np.arange(len(poses)) / settings.frame_rate_hz
     sweep = Sweep(
-        SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(seed)),
+        SimulatedFrames(beam, medium, poses, image, settings.snr_db, _entropy(seed)),
         image,
         beam.probe.signal,
         times,
