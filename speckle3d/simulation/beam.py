@@ -188,7 +188,7 @@ def tabulate_beam(
     neper = attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * nodes
     field *= np.exp(-2.0 * depth[:, None] * neper)[:, None, None, :]
     field /= np.abs(field[np.argmin(np.abs(depth - probe.transmit_focus_mm)), 0, 0]).max()
-    curvature = _fit_curvature(field, depth, lateral, elevation, _wavenumbers(probe, nodes))
+    curvature = _fit_curvature(field, lateral, elevation, _wavenumbers(probe, nodes))
     echo = depth[:, None, None] + curvature[:, 0, None, None] * lateral[:, None] ** 2
     echo = echo + curvature[:, 1, None, None] * elevation**2
     reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (grid.floor_db / 20.0))
@@ -244,11 +244,7 @@ def _focused(
 
 
 def _fit_curvature(
-    field: ComplexArray,
-    depth: FloatArray,
-    lateral: FloatArray,
-    elevation: FloatArray,
-    wavenumbers: FloatArray,
+    field: ComplexArray, lateral: FloatArray, elevation: FloatArray, wavenumbers: FloatArray
 ) -> FloatArray:
     """Curvature of the two-way wavefront near the axis, lateral and elevational, shape (depth, 2)."""
     k = 2.0 * wavenumbers[wavenumbers.size // 2]

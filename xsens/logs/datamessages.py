@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -230,7 +230,8 @@ def _filled(table: Table, name: str, size: int) -> FloatArray | None:
 
 
 def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
-    counter, ticks = (_whole(_filled(table, name, rows.size), rows) for name in _STAMPS)
+    told = (_filled(table, name, rows.size) for name in _STAMPS)
+    counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
     # A new start before a message that is no sample is one before the next sample.
     at = np.flatnonzero(rows)
     starts, computer_s = np.zeros(at.size, dtype=bool), np.full(at.size, np.nan)
@@ -243,14 +244,9 @@ def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
     return Stamps(counter, ticks, tick_s=_TICK_S, others=others, starts=starts, computer_s=computer_s)
 
 
-def _whole(values: FloatArray | None, rows: BoolArray) -> IntArray | None:
-    return None if values is None else values[rows, 0].astype(np.int64)
-
-
 def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
-    def vectors(name: str) -> FloatArray | None:
-        found: FloatArray | None = only(_filled(table, name, rows.size), rows)
-        return found
+    def vectors(name: str) -> Any:
+        return only(_filled(table, name, rows.size), rows)
 
     acceleration, rate = vectors("acceleration_m_s2"), vectors("rate_of_turn_rad_s")
     orientations, notes = _orientations(table, rows, acceleration, hints)
