@@ -13,7 +13,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
 from xsens.logs.parts import Hints, Orientations, Parts, from_quaternions, on_clock, only, orientations_of
-from xsens.logs.samples import ImuLog
+from xsens.logs.samples import VECTORS, ImuLog
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings, Values
@@ -132,31 +132,20 @@ def _in_units(values: Values, calibration: RawCalibration | None, parts: Parts) 
     if calibration is None:
         raise InvalidInputError("expected a calibration block before raw counts, got none")
     names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
-    acceleration, rate, field = calibration.to_units(np.stack([values[name] for name in names], axis=1))
-    return replace(
-        parts.noting(NOT_COMPENSATED),
-        accelerometer_m_s2=acceleration,
-        gyroscope_rad_s=rate,
-        magnetometer_au=field,
-    )
+    vectors = calibration.to_units(np.stack([values[name] for name in names], axis=1))
+    return replace(parts.noting(NOT_COMPENSATED), vectors=tuple(vectors))
 
 
 def _as_sent(values: Values, parts: Parts, layout: DataLayout, hints: Hints) -> Parts:
-    acceleration = values.get("accelerometer_m_s2")
+    vectors = tuple(map(values.get, VECTORS))
     orientations, notes = orientations_of(
         hints.world or layout.frame,
-        acceleration,
+        vectors[0],
         values.get("quaternion_wxyz"),
         values.get("matrix"),
         values.get("euler_deg"),
     )
-    return replace(
-        parts.noting(*notes),
-        accelerometer_m_s2=acceleration,
-        gyroscope_rad_s=values.get("gyroscope_rad_s"),
-        magnetometer_au=values.get("magnetometer_au"),
-        orientations=orientations,
-    )
+    return replace(parts.noting(*notes), vectors=vectors, orientations=orientations)
 
 
 # -- MTData2
@@ -256,13 +245,8 @@ def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Part
         turned = from_quaternions(turns, "NWU")
         rate = np.where(turned.there[:, None], turned.world_from_sensor.as_rotvec(), np.nan)
         notes = (*notes, "rate of turn is the sensor's orientation increments over its sampling period")
-    return replace(
-        parts.noting(*notes),
-        accelerometer_m_s2=acceleration,
-        gyroscope_rad_s=rate,
-        magnetometer_au=vectors("magnetic_field_au"),
-        orientations=orientations,
-    )
+    measured = (acceleration, rate, vectors("magnetic_field_au"))
+    return replace(parts.noting(*notes), vectors=measured, orientations=orientations)
 
 
 def _per_second(log: ImuLog, table: Table) -> ImuLog:

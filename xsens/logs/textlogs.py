@@ -20,7 +20,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from xsens.logs.clocks import Stamps, timeline_of_times
 from xsens.logs.parts import Hints, Parts, are_rotations, assembled, from_angles, on_clock, orientations_of
-from xsens.logs.samples import Gap, ImuLog
+from xsens.logs.samples import VECTORS, Gap, ImuLog
 from xsens.logs.texttables import TextTable, number, read_table
 
 Names = tuple[str, ...]
@@ -171,13 +171,7 @@ def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -
         notes = (*notes, "acceleration without gravity is no accelerometer's reading and was left out")
     if found[1] is not None:
         found[1] = found[1] * dialect.gyroscope_to_rad
-    return replace(_with_vectors(parts, *found), orientations=orientations).noting(*notes)
-
-
-def _with_vectors(
-    parts: Parts, acceleration: FloatArray | None, rate: FloatArray | None, field: FloatArray | None
-) -> Parts:
-    return replace(parts, accelerometer_m_s2=acceleration, gyroscope_rad_s=rate, magnetometer_au=field)
+    return replace(parts.noting(*notes), vectors=tuple(found), orientations=orientations)
 
 
 def _gaps_told(header: tuple[str, ...], samples: int) -> tuple[Gap, ...] | None:
@@ -218,7 +212,7 @@ def _mt9(values: FloatArray, parts: Parts, world: str) -> Parts:
         orientations, _ = orientations_of(world, None, matrices=values)
         note = "matrices are taken row by row: nothing in this file can tell"
         return replace(parts, orientations=orientations).noting(note)
-    return _with_vectors(parts, values[:, :3], values[:, 3:6], values[:, 6:9])
+    return replace(parts, vectors=(values[:, :3], values[:, 3:6], values[:, 6:9]))
 
 
 # -- columns that are not understood
@@ -300,9 +294,8 @@ def _csv_columns(log: ImuLog) -> Iterator[tuple[str, FloatArray | IntArray]]:
     yield "time_s", log.time_s
     if log.counter is not None:
         yield "counter", log.counter
-    vectors = (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)
-    for names, values in zip(PLAIN_VECTORS, vectors, strict=True):
-        if values is not None:
+    for names, vectors in zip(PLAIN_VECTORS, VECTORS, strict=True):
+        if (values := getattr(log, vectors)) is not None:
             yield from zip(names, values.T, strict=True)
     if log.world_from_sensor is not None:
         quaternions = log.world_from_sensor.as_quat(scalar_first=True)
