@@ -19,7 +19,7 @@ from imu_messages import Item, items_payload
 from speckle3d.core.errors import FileError, Speckle3DError
 from xsens.logs.read import MOST_BYTES, parse_stream, read_log
 from xsens.logs.samples import ImuLog
-from xsens.logs.textlogs import parse_text, write_csv
+from xsens.logs.textlogs import parse_text
 from xsens.messages.control import Configuration, MessageId
 from xsens.messages.framing import Framer, Message, encode, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
@@ -312,10 +312,3 @@ def test_time_and_memory_grow_with_the_size_alone(name, tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 70 * len(data)
     finally:
         tracemalloc.stop()
-
-
-def test_what_is_read_can_be_written(tmp_path):
-    for data in STREAMS.values():
-        log = survives(data)
-        write_csv(tmp_path / "log.csv", log)
-        assert len(read_log(tmp_path / "log.csv")) == len(log) == 8

@@ -32,21 +32,6 @@ def test_fixed_point_numbers_of_a_real_packet():
     np.testing.assert_allclose(two, [[57.67944828, -0.03808910]], 0, 5e-9)
 
 
-def in_range(form):
-    limit = {NumberFormat.FP12_20: 2047.0, NumberFormat.FP16_32: 32767.0}.get(form)
-    return st.floats(-limit, limit) if limit else st.floats(width=32 if form is NumberFormat.FLOAT32 else 64)
-
-
-@FEW
-@given(st.data(), st.sampled_from(FORMATS))
-def test_numbers_come_back_to_half_the_last_bit(data, form):
-    values = np.array([data.draw(st.lists(in_range(form), min_size=3, max_size=3))])
-    packed = bytes_from_numbers(values, form)
-    assert packed.shape == (1, 3 * form.size)
-    step = {NumberFormat.FP12_20: 2.0**-21, NumberFormat.FP16_32: 2.0**-33}.get(form, 0.0)
-    np.testing.assert_allclose(numbers_from_bytes(packed, form), values, rtol=0, atol=step)
-
-
 @FEW
 @given(st.binary(min_size=24, max_size=24), st.sampled_from(FORMATS))
 def test_bytes_of_numbers_come_back(data, form):
