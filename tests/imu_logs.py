@@ -103,10 +103,7 @@ def legacy_values(s, layout, first=0):
         "velocity_m_s": np.zeros((m, 3)),
         "status": np.full((m, 1), 3),
         "counter": (first + np.arange(m)[:, None]) % 65536,
-        "utc_nanosecond": np.full((m, 1), 123456789),
-        "utc_year": np.full((m, 1), 2020),
-        "utc_month_to_second": np.tile([1, 2, 3, 4, 5], (m, 1)),
-        "utc_valid": np.full((m, 1), 7),
+        "utc": np.tile(np.arange(12), (m, 1)),
     }
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.scatter import (
     BeamLimits,
@@ -94,9 +94,11 @@ class SimulatedFrames:
         probe, image, beam = self.beam.probe, self.image, self.beam
         out = np.zeros((image.vectors, self._spectra.length, beam.grid.components), np.complex64)
         vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
+        near = (vector_mm - vector_mm[0]) / _CELL_MM
+        far = near + 2.0 * beam.lateral_extent_mm / _CELL_MM
         scatter_echoes(
             self._near(self.medium_from_image[index]),
-            Vectors(vector_mm, *_cells_of(vector_mm, beam.lateral_extent_mm)),
+            Vectors(vector_mm, (near + 1e-6).astype(np.int64), (far + 1e-6).astype(np.int64) + 1),
             FieldTable(beam.residual, beam.reach, beam.curvature_per_mm, self._table_steps),
             image.first_sample_depth_mm,
             image.sample_spacing_mm,
@@ -188,10 +190,3 @@ class _Spectra:
         spectrum[:, self._band] += np.einsum("vfk,fk->vf", baseband, self._pulse)
         wave: Float32Array = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
         return wave
-
-
-def _cells_of(vector_mm: FloatArray, extent_mm: float) -> tuple[IntArray, IntArray]:
-    """First lateral cell that each vector looks at, and the one after its last."""
-    near = (vector_mm - vector_mm[0]) / _CELL_MM
-    far = near + 2.0 * extent_mm / _CELL_MM
-    return (near + 1e-6).astype(np.int64), (far + 1e-6).astype(np.int64) + 1

@@ -10,10 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.errorstate import ErrorStateFilter
 from xsens.fusion.increments import Samples
-from xsens.fusion.readings import UNKNOWN_HEADING_RAD, require_log, usable_samples
+from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.fusion.smoothing import Smoothed, Step, forward, smooth
 from xsens.logs.samples import ImuLog
@@ -102,7 +103,8 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     >>> bool(found.rotations.world_from_sensor.magnitude().max() < 1e-6)
     True
     """
-    require_log(log)
+    if not isinstance(log, ImuLog):
+        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     settings = settings or FusionSettings()
     used, samples, notes = usable_samples(log)
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():

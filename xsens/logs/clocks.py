@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -128,9 +129,10 @@ def _first_of_repeats(stamps: Stamps) -> BoolArray:
 
 
 def _only(stamps: Stamps, kept: BoolArray) -> Stamps:
-    names = ("counter", "ticks", "others", "starts", "computer_s")
-    arrays = {name: getattr(stamps, name) for name in names}
-    return replace(stamps, **{name: a[kept] for name, a in arrays.items() if a is not None})
+    arrays: dict[str, Any] = {
+        name: value for name, value in vars(stamps).items() if isinstance(value, np.ndarray)
+    }
+    return replace(stamps, **{name: values[kept] for name, values in arrays.items()})
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ PathLike = str | os.PathLike[str]
 MOST_BYTES = 1 << 27
 """Of a log: five hours of raw counts at 256 Hz. Reading takes ten times as much memory, damage 35 times."""
 
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _SNIFFED = 1 << 16
 _DAMAGED = 0.01
 _TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
@@ -104,7 +105,8 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
         If the file cannot be read, is no file, or is larger than `most_bytes`.
     """
     try:
-        with open(path, "rb", opener=_without_waiting) as file:
+        # A pipe is opened without waiting for its writer.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
             found = os.fstat(file.fileno())
             if not stat.S_ISREG(found.st_mode):
                 raise FileError(f"{path}: expected a file, got something else")
@@ -116,10 +118,6 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FileError(f"{path}: cannot be read: {reason}") from error
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _is_text(data: bytes) -> bool:

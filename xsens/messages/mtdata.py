@@ -100,12 +100,7 @@ _RAW = (
     Field("raw_temperature", 1, _U2),
 )
 _COUNTER = Field("counter", 1, _U2)
-_UTC = (
-    Field("utc_nanosecond", 1, ">u4"),
-    Field("utc_year", 1, _U2),
-    Field("utc_month_to_second", 5, _U1),
-    Field("utc_valid", 1, _U1),
-)
+_UTC = Field("utc", 12, _U1)
 _ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9))
 
 
@@ -160,7 +155,7 @@ class DataLayout:
         if self.mode == OutputMode.MT9:
             return (_COUNTER, *_RAW)
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
-        utc = _UTC if self.settings & OutputSettings.UTC else ()
+        utc = (_UTC,) if self.settings & OutputSettings.UTC else ()
         body = _RAW if self.mode == OutputMode.RAW else tuple(self._measured())
         return (*counter, *body, *utc) if self.counter_first else (*body, *counter, *utc)
 

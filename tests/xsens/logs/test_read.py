@@ -134,12 +134,6 @@ def test_matrices_are_turned_if_gravity_says_so(s):
     assert any("taken by columns" in note for note in log.notes)
 
 
-def test_skipped_samples_make_the_rate_lower(s):
-    layout = DataLayout(EVERYTHING, COUNTED)
-    log = parse_stream(configured(layout, period=1152, skip=3) + b"".join(legacy_messages(s, layout)))
-    assert log.rate_hz == pytest.approx(25.0)
-
-
 def test_legacy_data_without_configuration_need_a_layout(s):
     layout = DataLayout(EVERYTHING, COUNTED)
     data = b"".join(legacy_messages(s, layout))
