@@ -2,6 +2,7 @@
 
 import numpy as np
 from imu_messages import (
+    Item,
     calibration_message,
     configuration_message,
     counts_of,
@@ -13,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.mtdata2 import Item
 from xsens.messages.rawcounts import RawCalibration
 
 G = 9.80665
@@ -103,10 +103,7 @@ def legacy_values(s, layout, first=0):
         "velocity_m_s": np.zeros((m, 3)),
         "status": np.full((m, 1), 3),
         "counter": (first + np.arange(m)[:, None]) % 65536,
-        "utc_nanosecond": np.full((m, 1), 123456789),
-        "utc_year": np.full((m, 1), 2020),
-        "utc_month_to_second": np.tile([1, 2, 3, 4, 5], (m, 1)),
-        "utc_valid": np.full((m, 1), 7),
+        "utc": np.tile(np.arange(12), (m, 1)),
     }
 
 

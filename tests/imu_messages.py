@@ -1,13 +1,14 @@
 """Messages as a sensor would write them: the inverse of the package's decoders, for tests alone."""
 
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Message
 from xsens.messages.mtdata import NumberFormat
-from xsens.messages.mtdata2 import kind_of, number_format
+from xsens.messages.mtdata2 import kind_of
 
 
 def bytes_from_numbers(values, form):
@@ -37,21 +38,26 @@ def mtdata_payloads(layout, values):
     return np.concatenate(parts, axis=1)
 
 
+@dataclass(frozen=True)
+class Item:
+    """One item of an MTData2 message: a tuple of numbers if the package reads it, else bytes."""
+
+    identifier: int
+    values: tuple[float, ...] | bytes
+
+
 def items_payload(items):
     """Payload of an MTData2 message that holds `items`."""
     return b"".join(map(_item, items))
 
 
 def _item(item):
-    data = item.values if isinstance(item.values, bytes) else _packed(item)
+    data = item.values
+    if not isinstance(data, bytes):
+        whole = kind_of(item.identifier).whole
+        form = NumberFormat(item.identifier & 3)
+        data = np.array(data).astype(whole).tobytes() if whole else bytes_from_numbers([data], form).tobytes()
     return struct.pack(">HB", item.identifier, len(data)) + data
-
-
-def _packed(item):
-    kind = kind_of(item.identifier)
-    if kind.whole:
-        return struct.pack(kind.whole, *item.values)
-    return bytes_from_numbers([item.values], number_format(item.identifier)).tobytes()
 
 
 def configuration_message(c):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -52,9 +52,9 @@ class PosedImages:
 
     def __post_init__(self) -> None:
         require_poses(self.world_from_image)
-        shape = getattr(self.images, "shape", None)
-        known = shape[0] if shape else len(self) if callable(self.images) else _length(self.images)
-        if known is not None and known != len(self):
+        shape = getattr(self.images, "shape", None) or [len(self)]
+        known = len(self.images) if isinstance(self.images, Sized) else shape[0]
+        if known != len(self):
             raise MismatchError(
                 f"world_from_image: expected {known} poses for {known} images, got {len(self)}"
             )
@@ -117,7 +117,3 @@ def require_poses(world_from_image: RigidTransform) -> None:
     if world_from_image.single or len(world_from_image) == 0:
         got = "a single one outside a row" if world_from_image.single else "none"
         raise InvalidInputError(f"world_from_image: expected a row of poses, one per image, got {got}")
-
-
-def _length(images: object) -> int | None:
-    return len(images) if hasattr(images, "__len__") else None

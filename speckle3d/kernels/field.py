@@ -14,7 +14,6 @@ def line_field(
     lateral_mm: FloatArray,
     elevation_mm: FloatArray,
     strip_mm: FloatArray,
-    strip_weight: FloatArray,
     lens_mm: FloatArray,
     wavenumbers_rad_mm: FloatArray,
     out: ComplexArray,
@@ -38,7 +37,7 @@ def line_field(
                     r = np.sqrt(xy2 + (elevation_mm[iz] - strip_mm[s]) ** 2)
                     path = r + lens_mm[s]
                     # Obliquity y/r and spreading 1/r of a source in a pressure-release plane.
-                    weight = strip_weight[s] * y / (r * r)
+                    weight = y / (r * r)
                     phasor = weight * (np.cos(first * path) - 1j * np.sin(first * path))
                     turn = np.cos(step * path) - 1j * np.sin(step * path)
                     for k in range(nodes):

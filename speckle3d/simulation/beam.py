@@ -188,7 +188,7 @@ def tabulate_beam(
     neper = attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * nodes
     field *= np.exp(-2.0 * depth[:, None] * neper)[:, None, None, :]
     field /= np.abs(field[np.argmin(np.abs(depth - probe.transmit_focus_mm)), 0, 0]).max()
-    curvature = _fit_curvature(field, depth, lateral, elevation, _wavenumbers(probe, nodes))
+    curvature = _fit_curvature(field, lateral, elevation, _wavenumbers(probe, nodes))
     echo = depth[:, None, None] + curvature[:, 0, None, None] * lateral[:, None] ** 2
     echo = echo + curvature[:, 1, None, None] * elevation**2
     reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (grid.floor_db / 20.0))
@@ -216,44 +216,26 @@ def _sum_sources(
     sub = (np.arange(grid.per_pitch) - (grid.per_pitch - 1) / 2.0) * step
     source = (element[:, None] + sub).ravel()
     distance = (np.arange(round((source[-1] + lateral[-1]) / step) + 1) + 0.5) * step
-    line = _line_sources(probe, grid, depth, distance, elevation, wavenumbers)
-    transmit, receive = _apertures(probe, np.repeat(element, grid.per_pitch), depth, wavenumbers)
+    # All elements share the field of one elevational line source, shifted along the array.
+    strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
+    strip = strip - probe.elevation_aperture_mm / 2.0
+    lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
+    line = np.empty((depth.size, distance.size, elevation.size, wavenumbers.size), dtype=complex)
+    line_field(depth, distance, elevation, strip, lens, wavenumbers, line)
+    across = np.repeat(element, grid.per_pitch)
+    half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
+    focus = np.full(depth.size, probe.transmit_focus_mm)
+    transmit = _focused(probe, across, half, focus, wavenumbers)
+    receive = _focused(probe, across, probe.receive_half_width_mm(depth), depth, wavenumbers)
     out = np.empty((depth.size, lateral.size, elevation.size, wavenumbers.size), dtype=complex)
     two_way_field(line, source, step, transmit, receive, out)
     return out
 
 
-def _line_sources(
-    probe: Probe,
-    grid: BeamGrid,
-    depth: FloatArray,
-    distance: FloatArray,
-    elevation: FloatArray,
-    wavenumbers: FloatArray,
-) -> ComplexArray:
-    """Field of elevational line sources; all elements share one table, shifted along the array."""
-    strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
-    strip = strip - probe.elevation_aperture_mm / 2.0
-    lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
-    line = np.empty((depth.size, distance.size, elevation.size, wavenumbers.size), dtype=complex)
-    line_field(depth, distance, elevation, strip, np.ones_like(strip), lens, wavenumbers, line)
-    return line
-
-
-def _apertures(
-    probe: Probe, element: FloatArray, depth: FloatArray, wavenumbers: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Weights and focusing phases of the sources, shape (depth, source, node), transmit and receive."""
-    half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
-    focus = np.full(depth.size, probe.transmit_focus_mm)
-    transmit = _focused(probe, element, half, focus, wavenumbers)
-    receive = _focused(probe, element, probe.receive_half_width_mm(depth), depth, wavenumbers)
-    return transmit, receive
-
-
 def _focused(
     probe: Probe, element: FloatArray, half_width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
 ) -> ComplexArray:
+    """Weights and focusing phases of the sources, shape (depth, source, node)."""
     across = element / half_width[:, None]
     raised = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
     weight = np.where(np.abs(across) <= 1.0, raised, 0.0)
@@ -262,11 +244,7 @@ def _focused(
 
 
 def _fit_curvature(
-    field: ComplexArray,
-    depth: FloatArray,
-    lateral: FloatArray,
-    elevation: FloatArray,
-    wavenumbers: FloatArray,
+    field: ComplexArray, lateral: FloatArray, elevation: FloatArray, wavenumbers: FloatArray
 ) -> FloatArray:
     """Curvature of the two-way wavefront near the axis, lateral and elevational, shape (depth, 2)."""
     k = 2.0 * wavenumbers[wavenumbers.size // 2]

@@ -24,6 +24,9 @@ _KEPT_TILES = 160
 """A frame of 127 vectors sees about 40 tiles; the rest serve neighbouring frames and turned ones."""
 
 
+_PER_MM3 = 100.0
+"""Density of the diffuse background of the media that presets name."""
+
 _CELL_MM = 0.5
 """Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
 
@@ -54,21 +57,6 @@ def bounds_in_medium(
 def tile_seed(i: int, j: int) -> tuple[int, int]:
     """Tile indices as non-negative numbers, which seeds require, distinct on either side of the origin."""
     return i % 2**32, j % 2**32
-
-
-@dataclass(frozen=True)
-class PointMedium:
-    """Scatterers listed one by one: positions, shape (n, 3), mm, and strengths, shape (n,)."""
-
-    position_mm: FloatArray
-    strength: Float32Array
-    attenuation_db_cm_mhz: float = 0.0
-
-    def seen(
-        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> list[Scatterers]:
-        """Return all scatterers, whatever the box."""
-        return [(self.position_mm, self.strength)]
 
 
 @dataclass(frozen=True)
@@ -311,21 +299,20 @@ class TiledMedium:
         return position[mine], strength[mine]
 
 
-def fully_developed(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
+def fully_developed(entropy: int, length_mm: float) -> TiledMedium:
     """Make a uniform speckle phantom."""
-    return TiledMedium(entropy, per_mm3, 0.3)
+    return TiledMedium(entropy, _PER_MM3, 0.3)
 
 
-def phantom(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
+def phantom(entropy: int, length_mm: float) -> TiledMedium:
     """Make a speckle phantom with spherical inclusions, brighter and darker by 6 to 12 dB."""
     rng = np.random.default_rng([entropy, 1])
     factors = (2.0, 0.5, 0.25, 3.0, 0.5)
-    return TiledMedium(
-        entropy, per_mm3, 0.3, spheres=[_sphere(rng, length_mm, (1.5, 4.0), f) for f in factors]
-    )
+    spheres = [_sphere(rng, length_mm, (1.5, 4.0), factor) for factor in factors]
+    return TiledMedium(entropy, _PER_MM3, 0.3, spheres=spheres)
 
 
-def tissue(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMedium:
+def tissue(entropy: int, length_mm: float) -> TiledMedium:
     """Make layered tissue: skin, fat, muscles between fascias, cysts, and a poorly filled depth.
 
     Fibres run mostly along the sweep and are longer than the beam is thick, more of them in some muscles
@@ -343,9 +330,8 @@ def tissue(entropy: int, length_mm: float, per_mm3: float = 100.0) -> TiledMediu
     ]
     texture = Waves.random(rng, 0.25, (2.0, 2.0, 2.0), 12)
     cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]
-    return TiledMedium(
-        entropy, per_mm3, 0.4, layers, texture, _tissue_clusters(rng, tops.tolist()), spheres=cysts
-    )
+    clusters = _tissue_clusters(rng, tops.tolist())
+    return TiledMedium(entropy, _PER_MM3, 0.4, layers, texture, clusters, cysts)
 
 
 def _sphere(
@@ -368,11 +354,3 @@ def _tissue_clusters(rng: np.random.Generator, tops: Sequence[float]) -> list[Cl
     septa = Clusters(0.12, 24, 0.06, (tops[1], tops[7]), 5.0, 0.02, (1.0, 0.05, 0.1), 0.1)
     round_ones = Clusters(0.25, 12, 0.09, (tops[1], 42.0), spread_mm=0.12, coherent=False)
     return [*fibres, septa, round_ones]
-
-
-MEDIA: dict[str, Callable[[int, float], TiledMedium]] = {
-    "fully_developed": fully_developed,
-    "phantom": phantom,
-    "tissue": tissue,
-}
-"""Media by the name that presets use; each takes a seed and the length of the sweep."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
 from speckle3d.simulation.bath import water_bath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
-from speckle3d.simulation.medium import MEDIA, Medium, TiledMedium
+from speckle3d.simulation.medium import Medium, fully_developed, phantom, tissue
 from speckle3d.simulation.movement import (
     HandMotion,
     Trajectory,
@@ -22,12 +22,13 @@ from speckle3d.simulation.movement import (
     turned_about,
     world_from_medium,
 )
-from speckle3d.simulation.scan import Receiver, SimulatedFrames
+from speckle3d.simulation.scan import SimulatedFrames
 from speckle3d.simulation.sensors import (
     OrientationModel,
     TrackerModel,
     simulate_orientation,
     simulate_tracker,
+    with_noise,
 )
 from speckle3d.simulation.settings import Preset, SimulatedSweep, SimulationSettings
 
@@ -66,34 +67,59 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     """
     seeds = np.random.SeedSequence(settings.seed)
     medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)
+    heading_rng = np.random.default_rng(heading_seed)
     if settings.preset == "plane":
-        return (_plane(settings, medium_seed, heading_seed, sweep_seeds[0]),)
-    medium = MEDIA[_MEDIUM[settings.preset]](_entropy(medium_seed), settings.length_mm)
-    probe = Probe()
-    beam = tabulate_beam(probe, attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
-    heading = np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)
-    world = world_from_medium(float(heading))
+        bath = water_bath(_entropy(medium_seed), settings.reflector)
+        world = _world_from_bath(settings, heading_rng)
+        return (_plane(_Scene(settings, tabulate_beam(Probe()), bath, world), sweep_seeds[0]),)
+    medium = _MEDIUM[settings.preset](_entropy(medium_seed), settings.length_mm)
+    beam = tabulate_beam(Probe(), attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
+    world = world_from_medium(float(heading_rng.uniform(-np.pi, np.pi)))
+    scene = _Scene(settings, beam, medium, world)
     if settings.preset == "stepped":
-        return (_stepped(settings, beam, medium, world, sweep_seeds[0]),)
+        return (_stepped(scene, sweep_seeds[0]),)
     count = 2 if settings.preset == "crossed" else 1
-    return tuple(
-        _hand_held(settings, beam, medium, world, seed, number)
-        for number, seed in enumerate(sweep_seeds[:count])
-    )
+    return tuple(_hand_held(scene, seed, number) for number, seed in enumerate(sweep_seeds[:count]))
 
 
-_MEDIUM: dict[str, str] = {
-    "phantom": "phantom",
-    "tissue": "tissue",
-    "reversal": "tissue",
-    "rotation": "phantom",
-    "crossed": "tissue",
-    "stepped": "fully_developed",
+_MEDIUM = {
+    "phantom": phantom,
+    "tissue": tissue,
+    "reversal": tissue,
+    "rotation": phantom,
+    "crossed": tissue,
+    "stepped": fully_developed,
 }
 
 
-def _image(settings: SimulationSettings, probe: Probe) -> ImageGrid:
-    return ImageGrid(settings.vectors, settings.samples, probe.pitch_mm, probe.signal.sample_spacing_mm)
+@dataclass(frozen=True)
+class _Scene:
+    """The settings and what they make: the beam, the medium, and its place in the world."""
+
+    settings: SimulationSettings
+    beam: BeamTable
+    medium: Medium
+    world_from_medium: RigidTransform
+
+    @property
+    def image(self) -> ImageGrid:
+        s, probe = self.settings, self.beam.probe
+        return ImageGrid(s.vectors, s.samples, probe.pitch_mm, probe.signal.sample_spacing_mm)
+
+    def sweep(
+        self,
+        poses: RigidTransform,
+        time_s: FloatArray,
+        noise: np.random.SeedSequence,
+        name: str,
+        orientation: OrientationSensor | None = None,
+        tracker: Tracker | None = None,
+    ) -> Sweep:
+        """Sweep whose images have `poses` in the medium, with the seed of its electronic noise."""
+        image, snr_db = self.image, self.settings.snr_db
+        frames = SimulatedFrames(self.beam, self.medium, poses, image, snr_db, _entropy(noise))
+        truth = self.world_from_medium * poses
+        return Sweep(frames, image, self.beam.probe.signal, time_s, orientation, tracker, truth, name=name)
 
 
 def _motion(settings: SimulationSettings) -> HandMotion:
@@ -111,62 +137,40 @@ def _comes_back(settings: SimulationSettings) -> bool:
     return settings.preset == "reversal" or (settings.preset == "rotation" and settings.reverse)
 
 
-def _hand_held(
-    settings: SimulationSettings,
-    beam: BeamTable,
-    medium: TiledMedium,
-    world: RigidTransform,
-    seed: np.random.SeedSequence,
-    number: int,
-) -> SimulatedSweep:
+def _hand_held(scene: _Scene, seed: np.random.SeedSequence, number: int) -> SimulatedSweep:
+    settings, face_mm = scene.settings, scene.image.width_mm
     motion_seed, clock_seed, *others = seed.spawn(5)
     frames = settings.frames or round(8 * settings.length_mm * (2 if _comes_back(settings) else 1))
-    image = _image(settings, beam.probe)
     times = frame_times(frames, settings.frame_rate_hz, np.random.default_rng(clock_seed))
     duration = frames / settings.frame_rate_hz
-    centre = np.array([image.width_mm / 2.0, 0.0, settings.length_mm / 2.0])
+    centre = np.array([face_mm / 2.0, 0.0, settings.length_mm / 2.0])
     start = turned_about(centre, float(np.deg2rad(settings.crossing_deg)) * number)
-    trajectory = hand_sweep(
-        settings.length_mm,
-        duration,
-        image.width_mm,
-        _motion(settings),
-        start,
-        world,
-        np.random.default_rng(motion_seed),
-    )
+    rng = np.random.default_rng(motion_seed)
+    motion, world = _motion(settings), scene.world_from_medium
+    trajectory = hand_sweep(settings.length_mm, duration, face_mm, motion, start, world, rng)
     sensors = TrackerModel(), OrientationModel()
     mounted = settings.preset != "crossed" or not settings.uncalibrated
     name = f"{settings.preset}-{settings.seed}" + ("-crossing" if number else "")
-    return _scanned(settings, beam, medium, trajectory, times, duration, sensors, others, mounted, name)
+    return _scanned(scene, trajectory, times, duration, sensors, others, mounted, name)
 
 
-def _plane(
-    settings: SimulationSettings,
-    medium_seed: np.random.SeedSequence,
-    heading_seed: np.random.SeedSequence,
-    sweep_seed: np.random.SeedSequence,
-) -> SimulatedSweep:
+def _plane(scene: _Scene, seed: np.random.SeedSequence) -> SimulatedSweep:
     """Scan of a water bath's floor, its sensors uncalibrated."""
-    motion_seed, clock_seed, *others = sweep_seed.spawn(5)
-    beam, duration = tabulate_beam(Probe()), settings.duration_s
+    settings, duration = scene.settings, scene.settings.duration_s
+    motion_seed, clock_seed, *others = seed.spawn(5)
     frames = settings.frames or _PLANE_FRAMES
     times = frame_times(frames, frames / duration, np.random.default_rng(clock_seed))
-    world = _world_from_bath(settings, np.random.default_rng(heading_seed))
-    width = _image(settings, beam.probe).width_mm
-    scan = scan_floor(settings, width, world, np.random.default_rng(motion_seed))
+    rng = np.random.default_rng(motion_seed)
+    scan = scan_floor(settings, scene.image.width_mm, scene.world_from_medium, rng)
     tracker = TrackerModel(mounting_rad=_MOUNTING_RAD, mounting_mm=_MOUNTING_MM)
     noise = settings.sensor_noise
-    sensors = tracker.with_noise(noise), OrientationModel().with_noise(noise)
-    bath = water_bath(_entropy(medium_seed), settings.reflector)
+    sensors = with_noise(tracker, noise), with_noise(OrientationModel(), noise)
     name = f"plane-{settings.reflector}-{settings.seed}"
-    return _scanned(settings, beam, bath, scan, times, duration, sensors, others, False, name)
+    return _scanned(scene, scan, times, duration, sensors, others, False, name)
 
 
 def _scanned(
-    settings: SimulationSettings,
-    beam: BeamTable,
-    medium: Medium,
+    scene: _Scene,
     trajectory: Trajectory,
     times: FloatArray,
     duration_s: float,
@@ -184,45 +188,23 @@ def _scanned(
     mounted : bool
         Whether the sweep says how its sensors sit on the probe, or leaves that to a calibration.
     """
-    image, span = _image(settings, beam.probe), (-0.3, duration_s + 0.3)
+    span = (-0.3, duration_s + 0.3)
     tracker = simulate_tracker(trajectory, span, sensors[0], np.random.default_rng(seeds[0]))
     orientation = simulate_orientation(trajectory, span, sensors[1], np.random.default_rng(seeds[1]))
     poses = trajectory.medium_from_image(times)
-    sweep = Sweep(
-        SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(seeds[2])),
-        image,
-        beam.probe.signal,
-        times,
-        orientation if mounted else replace(orientation, sensor_from_image=None),
-        tracker if mounted else replace(tracker, sensor_from_image=None),
-        trajectory.world_from_medium * poses,
-        name=name,
-    )
     if mounted:
-        return SimulatedSweep(sweep, settings)
-    return SimulatedSweep(sweep, settings, tracker.sensor_from_image, orientation.sensor_from_image)
+        sweep = scene.sweep(poses, times, seeds[2], name, orientation, tracker)
+        return SimulatedSweep(sweep, scene.settings)
+    bare = replace(orientation, sensor_from_image=None), replace(tracker, sensor_from_image=None)
+    sweep = scene.sweep(poses, times, seeds[2], name, *bare)
+    return SimulatedSweep(sweep, scene.settings, tracker.sensor_from_image, orientation.sensor_from_image)
 
 
-def _stepped(
-    settings: SimulationSettings,
-    beam: BeamTable,
-    medium: TiledMedium,
-    world: RigidTransform,
-    seed: np.random.SeedSequence,
-) -> SimulatedSweep:
-    image = _image(settings, beam.probe)
-    gap = 2.0 * float(beam.elevation_extent_mm.max())
+def _stepped(scene: _Scene, seed: np.random.SeedSequence) -> SimulatedSweep:
+    settings, gap = scene.settings, 2.0 * float(scene.beam.elevation_extent_mm.max())
     poses = stepped_poses(settings.steps, settings.step_mm, settings.blocks, gap)
     times = np.arange(len(poses)) / settings.frame_rate_hz
-    sweep = Sweep(
-        SimulatedFrames(beam, medium, poses, image, Receiver(settings.snr_db), _entropy(seed)),
-        image,
-        beam.probe.signal,
-        times,
-        truth=world * poses,
-        name=f"stepped-{settings.seed}",
-    )
-    return SimulatedSweep(sweep, settings)
+    return SimulatedSweep(scene.sweep(poses, times, seed, f"stepped-{settings.seed}"), settings)
 
 
 def _entropy(seed: np.random.SeedSequence) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.scatter import (
     BeamLimits,
@@ -31,30 +31,17 @@ FULL_SCALE = 8191
 SPECKLE_RMS_COUNTS = 350.0
 """Fully developed speckle of unit strength after time-gain compensation: 27 dB below full scale."""
 
+_NOISE_BAND_HZ = (2e6, 13e6)
+"""The amplifier's pass band."""
+
+_MOST_GAIN_DB = 40.0
+"""Most that time-gain compensation, which is fixed for a uniform medium, amplifies over the focus."""
+
 _CELL_MM = 0.3
 """Lateral cells that scatterers are sorted into: a vector skips those out of its reach."""
 
 _GUARD_SAMPLES = 160
 """Longer than the pulse (its raised-cosine spectrum is 10 MHz wide): keeps the FFT's ends apart."""
-
-
-@dataclass(frozen=True)
-class Receiver:
-    """From echoes to counts: fixed time-gain compensation for a uniform medium, and electronic noise.
-
-    Parameters
-    ----------
-    snr_db : float
-        Unit-strength speckle over electronic noise at the transmit focus.
-    noise_band_hz : tuple of float
-        The amplifier's pass band.
-    max_gain_db : float
-        Most that time-gain compensation amplifies over its value at the focus.
-    """
-
-    snr_db: float = 40.0
-    noise_band_hz: tuple[float, float] = (2e6, 13e6)
-    max_gain_db: float = 40.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +54,8 @@ class SimulatedFrames:
     medium : Medium
     medium_from_image : RigidTransform, length n
     image : ImageGrid
-    receiver : Receiver
+    snr_db : float
+        Unit-strength speckle over electronic noise at the transmit focus.
     noise_entropy : int
         With a frame's index, the seed of its electronic noise.
     """
@@ -76,7 +64,7 @@ class SimulatedFrames:
     medium: Medium
     medium_from_image: RigidTransform
     image: ImageGrid
-    receiver: Receiver = field(default_factory=Receiver)
+    snr_db: float = 40.0
     noise_entropy: int = 0
 
     @property
@@ -106,9 +94,11 @@ class SimulatedFrames:
         probe, image, beam = self.beam.probe, self.image, self.beam
         out = np.zeros((image.vectors, self._spectra.length, beam.grid.components), np.complex64)
         vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
+        near = (vector_mm - vector_mm[0]) / _CELL_MM
+        far = near + 2.0 * beam.lateral_extent_mm / _CELL_MM
         scatter_echoes(
             self._near(self.medium_from_image[index]),
-            Vectors(vector_mm, *_cells_of(vector_mm, beam.lateral_extent_mm)),
+            Vectors(vector_mm, (near + 1e-6).astype(np.int64), (far + 1e-6).astype(np.int64) + 1),
             FieldTable(beam.residual, beam.reach, beam.curvature_per_mm, self._table_steps),
             image.first_sample_depth_mm,
             image.sample_spacing_mm,
@@ -139,17 +129,17 @@ class SimulatedFrames:
     @cached_property
     def _gain(self) -> FloatArray:
         rms, focus = self._rms
-        quietest = focus * 10.0 ** (-self.receiver.max_gain_db / 20.0)
+        quietest = focus * 10.0 ** (-_MOST_GAIN_DB / 20.0)
         return np.asarray(SPECKLE_RMS_COUNTS / np.maximum(rms, quietest)).astype(np.float32)
 
     def _noise(self, index: int) -> Complex64Array:
         """Spectrum of one frame's electronic noise, shape (vector, bin)."""
         rng = np.random.default_rng([self.noise_entropy, index])
-        low, high = self.receiver.noise_band_hz
+        low, high = _NOISE_BAND_HZ
         frequency = self._spectra.frequency_hz
         band = np.flatnonzero((frequency >= low) & (frequency <= high))
         _, focus = self._rms
-        rms = focus * 10.0 ** (-self.receiver.snr_db / 20.0)
+        rms = focus * 10.0 ** (-self.snr_db / 20.0)
         # irfft of bins of variance 2 s^2 over n samples has variance 4 s^2 bins / n^2.
         scale = rms * self._spectra.length / np.sqrt(4.0 * band.size)
         noise = np.zeros((self.image.vectors, frequency.size), np.complex64)
@@ -200,10 +190,3 @@ class _Spectra:
         spectrum[:, self._band] += np.einsum("vfk,fk->vf", baseband, self._pulse)
         wave: Float32Array = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
         return wave
-
-
-def _cells_of(vector_mm: FloatArray, extent_mm: float) -> tuple[IntArray, IntArray]:
-    """First lateral cell that each vector looks at, and the one after its last."""
-    near = (vector_mm - vector_mm[0]) / _CELL_MM
-    far = near + 2.0 * extent_mm / _CELL_MM
-    return (near + 1e-6).astype(np.int64), (far + 1e-6).astype(np.int64) + 1

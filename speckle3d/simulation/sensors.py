@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -35,14 +36,6 @@ class TrackerModel:
     def sensor_from_image(self) -> RigidTransform:
         """Where the image is on the sensor."""
         return RigidTransform.from_components(self.mounting_mm, Rotation.from_euler("ZYX", self.mounting_rad))
-
-    def with_noise(self, factor: float) -> TrackerModel:
-        """Return the same sensor with its jitter multiplied."""
-        return replace(
-            self,
-            position_mm=factor * self.position_mm,
-            orientation_rad=factor * self.orientation_rad,
-        )
 
 
 @dataclass(frozen=True)
@@ -85,12 +78,10 @@ class OrientationModel:
         """How the image is turned on the sensor."""
         return Rotation.from_euler("ZYX", self.mounting_rad)
 
-    def with_noise(self, factor: float) -> OrientationModel:
-        """Return the same sensor with all of its errors multiplied, those of its clock excepted."""
-        return replace(self, **{name: factor * getattr(self, name) for name in _ERRORS})
-
 
 _ERRORS = (
+    "position_mm",
+    "orientation_rad",
     "inclination_rad",
     "heading_rad",
     "white_rad",
@@ -100,6 +91,14 @@ _ERRORS = (
     "accelerometer_bias_m_s2",
     "magnetometer_au",
 )
+
+Model = TypeVar("Model", TrackerModel, OrientationModel)
+
+
+def with_noise(model: Model, factor: float) -> Model:
+    """Return the same sensor with all of its errors multiplied, those of its clock excepted."""
+    errors = {name: value for name, value in vars(model).items() if name in _ERRORS}
+    return replace(model, **{name: factor * value for name, value in errors.items()})
 
 
 def simulate_tracker(
@@ -125,27 +124,19 @@ def simulate_orientation(
     """Orientation and raw inertial readings over `span_s` of image time."""
     clock = _clock(span_s, model.rate_hz, model.clock_jitter_s, rng)
     world_from_sensor = _sensor_rotation(trajectory, model, clock)
-    wander = _wander(clock, model.wander_s, rng) * [
-        model.inclination_rad,
-        model.inclination_rad,
-        model.heading_rad,
-    ]
+    slow_rad = [model.inclination_rad, model.inclination_rad, model.heading_rad]
+    wander = _wander(clock, model.wander_s, rng) * slow_rad
     white = Rotation.from_rotvec(model.white_rad * rng.standard_normal((clock.size, 3)))
     reported = Rotation.from_rotvec(wander) * world_from_sensor * white
+    force, rate = _specific_force(trajectory, model, clock), _angular_rate(trajectory, model, clock)
+    field = world_from_sensor.inv().apply([np.cos(model.dip_rad), 0.0, -np.sin(model.dip_rad)])
     return OrientationSensor(
         TimedRotations(clock - model.time_offset_s, reported),
         model.sensor_from_image,
         model.time_offset_s,
-        _noisy(
-            _specific_force(trajectory, model, clock),
-            model.accelerometer_bias_m_s2,
-            model.accelerometer_m_s2,
-            rng,
-        ),
-        _noisy(
-            _angular_rate(trajectory, model, clock), model.gyroscope_bias_rad_s, model.gyroscope_rad_s, rng
-        ),
-        _noisy(world_from_sensor.inv().apply(_earth_field(model)), 0.0, model.magnetometer_au, rng),
+        _noisy(force, model.accelerometer_bias_m_s2, model.accelerometer_m_s2, rng),
+        _noisy(rate, model.gyroscope_bias_rad_s, model.gyroscope_rad_s, rng),
+        _noisy(field, 0.0, model.magnetometer_au, rng),
     )
 
 
@@ -178,10 +169,6 @@ def _specific_force(trajectory: Trajectory, model: OrientationModel, time_s: Flo
     acceleration = 1e-3 * (before - 2.0 * now + after) / _DERIVATIVE_S**2
     world = acceleration + np.array([0.0, 0.0, GRAVITY_M_S2])
     return np.asarray(_sensor_rotation(trajectory, model, time_s).inv().apply(world))
-
-
-def _earth_field(model: OrientationModel) -> FloatArray:
-    return np.array([np.cos(model.dip_rad), 0.0, -np.sin(model.dip_rad)])
 
 
 def _noisy(true: FloatArray, bias: float, white: float, rng: np.random.Generator) -> FloatArray:

@@ -3,17 +3,18 @@
 import numpy as np
 import oracles
 import pytest
+from points import PointMedium
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import Probe, tabulate_beam
-from speckle3d.simulation.medium import PointMedium, TiledMedium
-from speckle3d.simulation.scan import Receiver, SimulatedFrames
+from speckle3d.simulation.medium import TiledMedium
+from speckle3d.simulation.scan import SimulatedFrames
 
 PROBE = Probe()
 NODES_HZ = np.arange(2.75e6, 12.3e6, 0.5e6)
-SILENT = Receiver(snr_db=200.0)
+SILENT = 200.0
 
 
 def direct_response(points_mm, frequency_hz=NODES_HZ):

@@ -10,7 +10,7 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import Probe, tabulate_beam
 from speckle3d.simulation.medium import TiledMedium, tissue
 from speckle3d.simulation.movement import stepped_poses
-from speckle3d.simulation.scan import Receiver, SimulatedFrames
+from speckle3d.simulation.scan import SimulatedFrames
 
 STEP_MM, STEPS, BLOCKS, VECTORS = 0.1, 5, 5, 48
 DEPTHS_MM = (10.0, 20.0, 30.0)
@@ -20,7 +20,7 @@ def intensity_correlation(medium, beam, depth_mm, blocks=BLOCKS):
     """Mean correlation of intensity over pairs at 0, 1, .. steps, and its standard error over blocks."""
     image = ImageGrid(VECTORS, 2700, 0.3, Probe().signal.sample_spacing_mm)
     poses = stepped_poses(STEPS, STEP_MM, blocks, 6.0)
-    frames = SimulatedFrames(beam, medium, poses, image, Receiver(snr_db=60.0))
+    frames = SimulatedFrames(beam, medium, poses, image, snr_db=60.0)
     rho = np.zeros((len(depth_mm), blocks, STEPS))
     for block in range(blocks):
         rf = np.stack([frames[block * STEPS + i] for i in range(STEPS)]).astype(float)
@@ -93,6 +93,6 @@ def test_the_same_place_again_is_the_same_speckle():
     medium, beam = TiledMedium(5, 100.0, 0.0), tabulate_beam()
     image = ImageGrid(4, 1000, 0.3, Probe().signal.sample_spacing_mm)
     there_and_back = RigidTransform.from_translation([[0, 0, 0.0], [0, 0, 9.0], [0, 0, 0.0]])
-    frames = SimulatedFrames(beam, medium, there_and_back, image, Receiver(snr_db=200.0))
+    frames = SimulatedFrames(beam, medium, there_and_back, image, snr_db=200.0)
     assert np.array_equal(frames[0], frames[2])
     assert not np.array_equal(frames[0], frames[1])

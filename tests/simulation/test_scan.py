@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from points import PointMedium
 from scipy.signal import hilbert
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import tabulate_beam
-from speckle3d.simulation.medium import PointMedium, TiledMedium, fully_developed, tissue
-from speckle3d.simulation.scan import FULL_SCALE, Receiver, SimulatedFrames
+from speckle3d.simulation.medium import TiledMedium, fully_developed, tissue
+from speckle3d.simulation.scan import FULL_SCALE, SimulatedFrames
 
 STILL = RigidTransform.from_matrix(np.eye(4)[None])
 
@@ -25,7 +26,7 @@ def image(vectors, beam, samples=3818):
 
 
 def test_uniform_speckle_is_fully_developed_at_every_depth(beam):
-    frames = SimulatedFrames(beam, fully_developed(7, 20.0), STILL, image(48, beam), Receiver(snr_db=60.0))
+    frames = SimulatedFrames(beam, fully_developed(7, 20.0), STILL, image(48, beam), snr_db=60.0)
     rf = frames[0].astype(float)
     intensity = np.abs(hilbert(rf, axis=-1)) ** 2
     for depth_mm in (5, 10, 20, 30, 40):
@@ -56,7 +57,7 @@ def test_another_seed_is_another_noise(beam):
 
 def test_electronic_noise_is_as_far_below_speckle_as_asked_at_the_focus_and_grows_with_gain(beam):
     medium = PointMedium(np.array([[0.0, 20.0, 0.0]]), np.zeros(1, np.float32))
-    noise = SimulatedFrames(beam, medium, STILL, image(32, beam), Receiver(snr_db=30.0))[0].astype(float)
+    noise = SimulatedFrames(beam, medium, STILL, image(32, beam), snr_db=30.0)[0].astype(float)
     at = {d: round(d / beam.probe.signal.sample_spacing_mm) for d in (20, 38)}
     level = {d: noise[:, row - 100 : row + 100].std() for d, row in at.items()}
     # 6400 samples, a third of them independent: 1.5 % standard error, and the gain's slope.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -101,9 +100,9 @@ def compare_orientations(
             f"and {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s"
         )
     time_s = one.time_s[common]
-    w, x, y, z = _difference(one.world_from_sensor[common], other.at(time_s)).T
-    heading = 2.0 * np.arctan2(z, w)
-    heading = np.angle(np.exp(1j * heading))
+    apart = one.world_from_sensor[common] * other.at(time_s).inv()
+    w, x, y, z = apart.as_quat(scalar_first=True).T
+    heading = np.angle(np.exp(2j * np.arctan2(z, w)))
     inclination = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
     total = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
     offset = float(np.angle(np.exp(1j * heading).mean()))
@@ -118,10 +117,6 @@ def _stream(given: object) -> TimedRotations:
             "a log's own orientation is log.rotations()"
         )
     return stream
-
-
-def _difference(one: Rotation, other: Rotation) -> FloatArray:
-    return np.asarray((one * other.inv()).as_quat(scalar_first=True))
 
 
 def _rms(values: FloatArray) -> float:

@@ -223,7 +223,8 @@ class FieldMonitor:
             self._candidate.add(world_from_sensor, field_au, off, duration_s)
             if fits and self._known is not None:
                 self._known.add(world_from_sensor, field_au, off, duration_s)
-                self._refine()
+                room, iron, _ = self._known.solve()
+                self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)
             learnt = self._learn()
             restart = None if self.confirmed else learnt
             self.confirmed = self.confirmed or self._turned_s > _PROVED_AFTER_S
@@ -262,13 +263,6 @@ class FieldMonitor:
         self._candidate.clear()
         self._fitting_s = self._turned_s = 0.0
         return room
-
-    def _refine(self) -> None:
-        """Refine the estimate of iron while the sensor turns."""
-        if self._known is None:
-            return
-        room, iron, _ = self._known.solve()
-        self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)
 
 
 class RestDetector:

@@ -113,7 +113,8 @@ class ErrorStateFilter:
 
     def advance(self, increment: Increment) -> None:
         """Predict over one increment and correct by its observations."""
-        self._decide_rest(increment)
+        bias_sd = math.sqrt(max(float(np.diag(self.kalman.P)[BIAS].max()), 0.0))
+        self.resting = self._rest.rests(increment, self.bias, bias_sd)
         before = self._level
         self._predict(increment)
         self.predicted = self._level, self.velocity
@@ -125,10 +126,6 @@ class ErrorStateFilter:
             self._correct_bias(increment)
         if increment.field_au is not None and self._magnetic:
             self._correct_heading(before @ increment.field_au, increment)
-
-    def _decide_rest(self, increment: Increment) -> None:
-        sd = math.sqrt(max(float(np.diag(self.kalman.P)[BIAS].max()), 0.0))
-        self.resting = self._rest.rests(increment, self.bias, sd)
 
     def _begin(self, increment: Increment) -> None:
         """Set up from the mean force since the start, and north from the mean field."""

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from xsens.fusion.errorstate import ErrorStateFilter
-from xsens.fusion.increments import Samples, blocks_of, turn_matrix
+from xsens.fusion.increments import Samples, increments_of, turn_matrix
 from xsens.fusion.readings import FASTEST_RAD_S, real_field, require_metres
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 
@@ -68,7 +68,7 @@ class OnlineFilter:
     def __init__(self, settings: FusionSettings | None = None) -> None:
         self._settings = settings or FusionSettings()
         self._kalman: ErrorStateFilter | None = None
-        self._pending: list[Samples] = []
+        self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
         self._pending_s = self._skipped_s = self._pause_s = 0.0
         self._force = np.full(3, np.nan)
         self._first: list[FloatArray] = []
@@ -114,8 +114,8 @@ class OnlineFilter:
             return None
         matrix, bias = kalman.matrix, kalman.heading_bias
         if not kalman.resting:
-            for each in self._pending:
-                matrix = matrix @ turn_matrix((each.rate_rad_s[0] - bias) * each.step_s[0])
+            for step_s, rate, _, _ in self._pending:
+                matrix = matrix @ turn_matrix((rate - bias) * step_s)
         return OnlineState(
             Rotation.from_matrix(matrix),
             kalman.sd_rad,
@@ -153,7 +153,7 @@ class OnlineFilter:
             self._pause_s = step_s
         # The turn in a pause is not known, nor is the first sample's own step.
         step_s = step_s if step_s <= BRIDGED_S else self._settings.block_s
-        self._pending.append(Samples(np.array([step_s]), rate[None], self._force[None], field[None]))
+        self._pending.append((step_s, rate, self._force, field))
         self._pending_s += step_s
         # Half a sample too short is as near to the block's length as half a sample too long.
         if self._pending_s + 0.5 * step_s >= self._settings.block_s:
@@ -164,7 +164,8 @@ class OnlineFilter:
         if not self._pending:
             return
         bias = np.zeros(3) if self._kalman is None else self._kalman.bias
-        (increment,) = blocks_of(_joined(self._pending), len(self._pending), bias)
+        columns = [np.array(column) for column in zip(*self._pending, strict=True)]
+        (increment,) = increments_of(Samples(*columns), len(self._pending), bias)
         self._pending, self._pending_s = [], 0.0
         if self._kalman is None:
             self._kalman = ErrorStateFilter(self._settings, increment)
@@ -199,8 +200,3 @@ def _checked(
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
     vectors[2], _ = real_field(vectors[2])
     return step, vectors[0], vectors[1], vectors[2]
-
-
-def _joined(samples: list[Samples]) -> Samples:
-    names = ("step_s", "rate_rad_s", "force_m_s2", "field_au")
-    return Samples(*(np.concatenate([getattr(each, name) for each in samples]) for name in names))

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.errorstate import ErrorStateFilter
-from xsens.fusion.increments import Samples, quaternion_product, quaternions_of
-from xsens.fusion.readings import UNKNOWN_HEADING_RAD, require_log, usable_samples
+from xsens.fusion.increments import Samples
+from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
-from xsens.fusion.smoothing import Pass, Smoothed, forward, smooth
+from xsens.fusion.smoothing import Smoothed, Step, forward, smooth
 from xsens.logs.samples import ImuLog
 
 _SHORTEST_S = 3.0
@@ -56,11 +58,10 @@ class Orientation:
         return len(self.rotations)
 
 
-@dataclass(frozen=True)
-class _Result:
-    """Orientation of one stretch, a row per sample; quaternions scalar first."""
+class _Result(NamedTuple):
+    """Orientation of one stretch, a row per sample; quaternions scalar last."""
 
-    wxyz: FloatArray
+    xyzw: FloatArray
     sd_rad: FloatArray
     bias_rad_s: FloatArray
     disturbed: BoolArray
@@ -102,7 +103,8 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     >>> bool(found.rotations.world_from_sensor.magnitude().max() < 1e-6)
     True
     """
-    require_log(log)
+    if not isinstance(log, ImuLog):
+        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     settings = settings or FusionSettings()
     used, samples, notes = usable_samples(log)
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
@@ -112,13 +114,11 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, smooth)
-    joined = _Result(
-        *(np.concatenate(parts) for parts in zip(*(vars(each).values() for each in results), strict=True))
-    )
+    joined = _Result(*map(np.concatenate, zip(*results, strict=True)))
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
-    rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.wxyz, scalar_first=True))
+    rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.xyzw))
     return Orientation(
         rotations,
         joined.sd_rad,
@@ -151,70 +151,48 @@ def _stretches(
         if smoothing and stretch.step_s.sum() > _SHORTEST_S:
             results.append(_from_smoother(*smooth(stretch, settings)))
             continue
-        done, kalman = forward(stretch, settings, kalman, pause_s)
-        results.append(_from_filter(done))
+        steps, kalman = forward(stretch, settings, kalman, pause_s)
+        results.append(_from_filter(steps))
     return results
 
 
-def _from_filter(done: Pass) -> _Result:
-    steps = done.steps
-    starts = Rotation.from_matrix([step.start for step in steps]).as_quat(scalar_first=True)
+def _from_filter(steps: list[Step]) -> _Result:
+    starts = Rotation.from_matrix([step.start for step in steps])
     resting = np.array([step.resting for step in steps])
-    biases = np.array([step.start_bias_rad_s for step in steps])
-    wxyz = _within_steps(done, starts, biases, resting)
+    within = _within_steps(steps, starts, np.array([step.start_bias_rad_s for step in steps]), resting)
+    each = _step_of_sample(steps)
     sd = np.sqrt([np.diag(step.covariance)[:3] for step in steps])
     disturbed = np.array([step.disturbed for step in steps])
     after = np.array([step.bias_rad_s for step in steps])
-    return _per_sample(done, wxyz, sd, after, disturbed, resting)
+    return _Result(within.as_quat(), sd[each], after[each], disturbed[each], resting[each])
 
 
-def _from_smoother(done: Pass, found: Smoothed) -> _Result:
+def _from_smoother(steps: list[Step], found: Smoothed) -> _Result:
     """Result by the gyroscope within each step; its error at the step's end is spread over the step."""
     nodes = Rotation.from_matrix(found.matrices)
-    wxyz = _within_steps(done, nodes[:-1].as_quat(scalar_first=True), found.bias_rad_s[:-1], found.resting)
-    ends = Rotation.from_quat([q[-1] for q in wxyz], scalar_first=True)
-    missed = (nodes[1:] * ends.inv()).as_rotvec()
-    spread = []
-    for k, q in enumerate(wxyz):
-        share = done.time_s[k] / done.time_s[k][-1]
-        correction = Rotation.from_rotvec(share[:, None] * missed[k])
-        spread.append((correction * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True))
-    return _per_sample(done, spread, found.sd_rad[1:], found.bias_rad_s[1:], found.disturbed, found.resting)
+    within = _within_steps(steps, nodes[:-1], found.bias_rad_s[:-1], found.resting)
+    each = _step_of_sample(steps)
+    last = np.flatnonzero(np.diff(each, append=len(steps)))
+    missed = (nodes[1:] * within[last].inv()).as_rotvec()
+    share = np.concatenate([step.increment.time_s / step.increment.time_s[-1] for step in steps])
+    spread = Rotation.from_rotvec(share[:, None] * missed[each]) * within
+    sd, bias = found.sd_rad[1:], found.bias_rad_s[1:]
+    return _Result(spread.as_quat(), sd[each], bias[each], found.disturbed[each], found.resting[each])
+
+
+def _step_of_sample(steps: list[Step]) -> IntArray:
+    return np.repeat(np.arange(len(steps)), [step.increment.time_s.size for step in steps])
 
 
 def _within_steps(
-    done: Pass, starts: FloatArray, biases_rad_s: FloatArray, resting: BoolArray
-) -> list[FloatArray]:
-    """Orientation of every sample as quaternions, shape (samples, 4) per step, from the steps' starts.
-
-    Parameters
-    ----------
-    done : Pass
-    starts : ndarray, shape (steps, 4)
-        World from sensor, scalar first.
-    biases_rad_s : ndarray, shape (steps, 3)
-    resting : ndarray of bool, shape (steps,)
-        Steps in which the orientation is held.
-    """
-    out = []
-    for k, step in enumerate(done.steps):
-        if resting[k]:
-            out.append(np.tile(starts[k], (len(done.turns[k]), 1)))
-            continue
-        off = step.increment.bias_rad_s - biases_rad_s[k]
-        turns = quaternion_product(done.turns[k], quaternions_of(off * done.time_s[k][:, None]))
-        out.append(quaternion_product(starts[k], turns))
-    return out
-
-
-def _per_sample(
-    done: Pass,
-    wxyz: list[FloatArray],
-    sd_rad: FloatArray,
-    bias_rad_s: FloatArray,
-    disturbed: BoolArray,
-    resting: BoolArray,
-) -> _Result:
-    counts = [len(times) for times in done.time_s]
-    each = np.repeat(np.arange(len(counts)), counts)
-    return _Result(np.concatenate(wxyz), sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
+    steps: list[Step], starts: Rotation, biases_rad_s: FloatArray, resting: BoolArray
+) -> Rotation:
+    """World from sensor at every sample, by the gyroscope from the steps' starts; held in `resting` steps."""
+    increments = [step.increment for step in steps]
+    each = _step_of_sample(steps)
+    off = np.array([increment.bias_rad_s for increment in increments]) - biases_rad_s
+    time_s = np.concatenate([increment.time_s for increment in increments])
+    turns = Rotation.from_quat(np.concatenate([increment.turns_xyzw for increment in increments]))
+    turns *= Rotation.from_rotvec(off[each] * time_s[:, None])
+    held = np.where(resting[each, None], [0.0, 0.0, 0.0, 1.0], turns.as_quat())
+    return starts[each] * Rotation.from_quat(held)

@@ -36,12 +36,6 @@ _NEAR_REST_M_S2 = 1.0
 _FEWEST = 20
 
 
-def require_log(log: object) -> None:
-    """Raise `InvalidInputError` if given a file path, say, instead of an `ImuLog`."""
-    if not isinstance(log, ImuLog):
-        raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
-
-
 def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     """Prepare a log's readings for the filter.
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from xsens.fusion.detectors import FieldMonitor, FieldReading
 from xsens.fusion.errorstate import ANGLE, BIAS, HEADING, SPEED, ErrorStateFilter
-from xsens.fusion.increments import Increment, Samples, blocks_of, turn_matrix
+from xsens.fusion.increments import Increment, Samples, increments_of, turn_matrix
 from xsens.fusion.settings import FusionSettings
 
 _CHUNK = 64
@@ -71,27 +71,9 @@ class Step:
     started: bool
 
 
-@dataclass(frozen=True)
-class Pass:
-    """All steps of a stretch, and the turns within the steps.
-
-    Attributes
-    ----------
-    steps : list of Step
-    turns : list of ndarray, shape (samples of the step, 4)
-        ``start_from_sample``, scalar first, with the bias of the step's increment.
-    time_s : list of ndarray, shape (samples of the step,)
-        Time since the step's start.
-    """
-
-    steps: list[Step]
-    turns: list[FloatArray]
-    time_s: list[FloatArray]
-
-
 def forward(
     samples: Samples, settings: FusionSettings, kept: ErrorStateFilter | None = None, pause_s: float = 0.0
-) -> tuple[Pass, ErrorStateFilter]:
+) -> tuple[list[Step], ErrorStateFilter]:
     """Run the filter over a stretch.
 
     Parameters
@@ -104,20 +86,18 @@ def forward(
     pause_s : float
         Time since the end of that stretch.
     """
-    done = Pass([], [], [])
+    steps: list[Step] = []
     kalman = kept
     for part, per_block in _parts(samples, settings):
-        blocks = blocks_of(part, per_block, np.zeros(3) if kalman is None else kalman.bias)
-        for k, increment in enumerate(blocks):
+        bias = np.zeros(3) if kalman is None else kalman.bias
+        for increment in increments_of(part, per_block, bias):
             if kalman is None:
                 kalman = ErrorStateFilter(settings, increment)
-            elif not done.steps:
+            elif not steps:
                 kalman.resume(increment, pause_s)
-            done.steps.append(_step(kalman, increment))
-            done.turns.append(blocks.turns_wxyz[k])
-            done.time_s.append(np.cumsum(blocks.step_s[k]))
+            steps.append(_step(kalman, increment))
     assert kalman is not None
-    return done, kalman
+    return steps, kalman
 
 
 def _parts(samples: Samples, settings: FusionSettings) -> Iterator[tuple[Samples, int]]:
@@ -176,13 +156,11 @@ class Smoothed:
     resting: BoolArray
 
 
-def smooth(samples: Samples, settings: FusionSettings) -> tuple[Pass, Smoothed]:
+def smooth(samples: Samples, settings: FusionSettings) -> tuple[list[Step], Smoothed]:
     """Smooth one stretch, which must be longer than the filter's start, one second."""
-    done, _ = forward(samples, replace(settings, use_magnetometer=False))
-    level = _backward(done.steps)
-    if not settings.use_magnetometer:
-        return done, level
-    return done, _pointed_north(done.steps, level, settings)
+    steps, _ = forward(samples, replace(settings, use_magnetometer=False))
+    level = _backward(steps)
+    return steps, _pointed_north(steps, level, settings) if settings.use_magnetometer else level
 
 
 # -- inclination and turning
@@ -300,7 +278,8 @@ def _smoothed_heading(
     """
     kalman = KalmanFilter(dim_x=5, dim_z=1)
     kalman.x[0, 0] = _first_angle(steps, readings)
-    kalman.P = np.diag([math.pi**2, *_bias_variances(steps), settings.field_sd_rad**2])
+    bias_variance = np.diag(steps[-1].covariance)[BIAS]  # at the end of the stretch
+    kalman.P = np.diag([math.pi**2, *bias_variance, settings.field_sd_rad**2])
     shows = np.array([[1.0, 0.0, 0.0, 0.0, 1.0]])
     nodes, transitions, noises = [(kalman.x, kalman.P)], [np.eye(5)], [np.zeros((5, 5))]
     for k, (step, reading) in enumerate(zip(steps, readings, strict=True)):
@@ -331,11 +310,6 @@ def _first_angle(steps: list[Step], readings: list[FieldReading | None]) -> floa
             total += np.exp(1j * _north(reading))
             spent += step.increment.duration_s
     return float(np.angle(total))
-
-
-def _bias_variances(steps: list[Step]) -> FloatArray:
-    """Variance of the bias, shape (3,), at the end of the stretch."""
-    return np.diag(steps[-1].covariance)[BIAS]
 
 
 def _heading_model(step: Step, matrix: FloatArray, settings: FusionSettings) -> tuple[FloatArray, FloatArray]:

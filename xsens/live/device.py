@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Literal, get_args
 
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -135,14 +134,6 @@ class Device:
         self._framer = Framer()
         self.tap: Callable[[bytes], None] | None = None
 
-    def __enter__(self) -> Device:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     @property
     def baud(self) -> int:
         """Speed of the line."""
@@ -225,10 +216,6 @@ class Device:
     def go_to_config(self, tries: int = _TRIES) -> None:
         """Bring the sensor to take settings; it stops sending data."""
         self.request(Message(MessageId.GO_TO_CONFIG), tries)
-
-    def go_to_measurement(self) -> None:
-        """Bring the sensor to send data."""
-        self.request(Message(MessageId.GO_TO_MEASUREMENT))
 
 
 def connect(port_name: str, baud: int | None = None) -> Device:

@@ -10,7 +10,6 @@ from threading import Lock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from xsens.fusion.online import OnlineFilter
 from xsens.fusion.settings import FusionSettings
@@ -243,20 +242,15 @@ class _Field:
         up = log.accelerometer_m_s2 if rotations is None else rotations.inv().apply([0.0, 0.0, 1.0])
         if log.magnetometer_au is None or up is None:
             return
-        norm, dip = _norm_and_dip(log.magnetometer_au, up)
-        if not norm.size:
+        norm, length = np.linalg.norm(log.magnetometer_au, axis=1), np.linalg.norm(up, axis=1)
+        there = (norm > 0) & (length > 0)  # NaN is not
+        if not there.any():
             return
+        sine = np.einsum("ij,ij->i", log.magnetometer_au[there], up[there]) / (norm * length)[there]
+        norm, dip = norm[there], -np.arcsin(np.clip(sine, -1.0, 1.0))
         if self._learnt_s < REFERENCE_S:
             self._learnt_s += norm.size / log.rate_hz if len(log) > 1 else 0.0
             self._sum += [norm.sum(), dip.sum(), norm.size]
         usual_norm, usual_dip = self._sum[:2] / self._sum[2]
         self.ratio = float(norm.mean() / usual_norm)
         self.dip_change_rad = float(dip.mean() - usual_dip)
-
-
-def _norm_and_dip(field: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Norm, and angle below the horizontal in radians, of the samples that have both vectors."""
-    norm, length = np.linalg.norm(field, axis=1), np.linalg.norm(up, axis=1)
-    there = (norm > 0) & (length > 0)  # NaN is not
-    sine = np.einsum("ij,ij->i", field[there], up[there]) / (norm * length)[there]
-    return norm[there], -np.arcsin(np.clip(sine, -1.0, 1.0))

@@ -14,13 +14,12 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor
 from xsens.messages.control import MessageId, utc_message
-from xsens.messages.framing import encode
+from xsens.messages.framing import Message, encode
 
 SILENCE_S = 2.0
 """A sensor silent for so long is taken for disconnected and asked to answer; its slowest rate is 1 Hz."""
@@ -128,9 +127,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -175,7 +172,7 @@ class Recorder:
             self._file.append(encode(message))
         self._monitor.started(self.info)
         device.tap = self._take
-        device.go_to_measurement()
+        device.request(Message(MessageId.GO_TO_MEASUREMENT))
         self._listen(device)
         with suppress(DeviceError):  # what it sends until it stops is recorded as well
             device.go_to_config()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -128,9 +129,10 @@ def _first_of_repeats(stamps: Stamps) -> BoolArray:
 
 
 def _only(stamps: Stamps, kept: BoolArray) -> Stamps:
-    names = ("counter", "ticks", "others", "starts", "computer_s")
-    arrays = {name: getattr(stamps, name) for name in names}
-    return replace(stamps, **{name: a[kept] for name, a in arrays.items() if a is not None})
+    arrays: dict[str, Any] = {
+        name: value for name, value in vars(stamps).items() if isinstance(value, np.ndarray)
+    }
+    return replace(stamps, **{name: values[kept] for name, values in arrays.items()})
 
 
 @dataclass(frozen=True)
@@ -152,13 +154,18 @@ class _Steps:
 
 def _steps(stamps: Stamps) -> _Steps:
     span = stamps.counter_span
-    counts, ticks = _rise(stamps.counter, span), _rise(stamps.ticks, _TICK_SPAN)
+    counts = None if stamps.counter is None else np.diff(stamps.counter) % span
+    ticks = None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN
     anew = _starts_anew(stamps, counts, ticks)
     samples = _samples(counts, stamps.others, anew)
     period_s = stamps.period_s
     if ticks is not None and not (period_s > 0.0 or anew.all()):
         period_s = float(np.median(ticks[~anew])) * stamps.tick_s
-    seconds = _seconds(ticks, stamps.tick_s, samples, period_s)
+    if ticks is not None:
+        seconds = np.asarray(ticks * stamps.tick_s)
+    else:
+        assert samples is not None  # one of the two is there
+        seconds = np.asarray(samples * period_s)
     samples = _unlike_stride(samples, counts, seconds[~anew], period_s, anew)
     missing, irregular = _missing(seconds, samples, period_s, span, anew)
     if counts is not None and samples is not None:
@@ -167,21 +174,6 @@ def _steps(stamps: Stamps) -> _Steps:
     unknown = anew & np.isnan(pauses)
     seconds = np.where(anew, np.where(unknown, UNKNOWN_PAUSE_S, pauses), seconds)
     return _Steps(seconds, np.where(anew, 0, missing), anew, unknown, period_s, counts, irregular)
-
-
-def _seconds(
-    ticks: IntArray | None, tick_s: float, samples: FloatArray | None, period_s: float
-) -> FloatArray:
-    """Seconds of each step by the clock, else by the counter."""
-    if ticks is not None:
-        return np.asarray(ticks * tick_s)
-    assert samples is not None  # one of the two is there
-    return np.asarray(samples * period_s)
-
-
-def _rise(values: IntArray | None, span: int) -> IntArray | None:
-    """Steps of a number that wraps round at `span`."""
-    return None if values is None else np.diff(values) % span
 
 
 def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None) -> BoolArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
 from xsens.logs.parts import Hints, Orientations, Parts, from_quaternions, on_clock, only, orientations_of
-from xsens.logs.samples import ImuLog
+from xsens.logs.samples import VECTORS, ImuLog
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings, Values
@@ -132,31 +132,20 @@ def _in_units(values: Values, calibration: RawCalibration | None, parts: Parts) 
     if calibration is None:
         raise InvalidInputError("expected a calibration block before raw counts, got none")
     names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
-    acceleration, rate, field = calibration.to_units(np.stack([values[name] for name in names], axis=1))
-    return replace(
-        parts.noting(NOT_COMPENSATED),
-        accelerometer_m_s2=acceleration,
-        gyroscope_rad_s=rate,
-        magnetometer_au=field,
-    )
+    vectors = calibration.to_units(np.stack([values[name] for name in names], axis=1))
+    return replace(parts.noting(NOT_COMPENSATED), vectors=tuple(vectors))
 
 
 def _as_sent(values: Values, parts: Parts, layout: DataLayout, hints: Hints) -> Parts:
-    acceleration = values.get("accelerometer_m_s2")
+    vectors = tuple(map(values.get, VECTORS))
     orientations, notes = orientations_of(
         hints.world or layout.frame,
-        acceleration,
+        vectors[0],
         values.get("quaternion_wxyz"),
         values.get("matrix"),
         values.get("euler_deg"),
     )
-    return replace(
-        parts.noting(*notes),
-        accelerometer_m_s2=acceleration,
-        gyroscope_rad_s=values.get("gyroscope_rad_s"),
-        magnetometer_au=values.get("magnetometer_au"),
-        orientations=orientations,
-    )
+    return replace(parts.noting(*notes), vectors=vectors, orientations=orientations)
 
 
 # -- MTData2
@@ -168,14 +157,6 @@ _NOTATIONS = {
 }
 """Parameter of `orientations_of` by the name of the item."""
 
-_MEASURED = (
-    "acceleration_m_s2",
-    "rate_of_turn_rad_s",
-    "magnetic_field_au",
-    "delta_v_m_s",
-    "delta_q_wxyz",
-    *_NOTATIONS,
-)
 _STAMPS = ("packet_counter", "sample_time_fine")
 _TICK_S = 1e-4
 
@@ -193,7 +174,7 @@ def mtdata2_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, h
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    table, damaged = columns(frames[which], frozenset((*_MEASURED, *_STAMPS)))
+    table, damaged = columns(frames[which])
     if damaged:
         parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
     rows = _sample_rows(table, which.size)
@@ -211,7 +192,7 @@ def _sample_rows(table: Table, size: int) -> BoolArray:
     """Mark messages that hold a measurement and every kind of time stamp that any message holds."""
     rows = np.zeros(size, dtype=bool)
     for identifier, column in table.items():
-        if name_of(identifier) in _MEASURED:
+        if name_of(identifier) not in _STAMPS:
             rows[column.rows] = True
     for stamp in _STAMPS:
         told = _filled(table, stamp, size)
@@ -238,7 +219,8 @@ def _filled(table: Table, name: str, size: int) -> FloatArray | None:
 
 
 def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
-    counter, ticks = (_whole(_filled(table, name, rows.size), rows) for name in _STAMPS)
+    told = (_filled(table, name, rows.size) for name in _STAMPS)
+    counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
     # A new start before a message that is no sample is one before the next sample.
     at = np.flatnonzero(rows)
     starts, computer_s = np.zeros(at.size, dtype=bool), np.full(at.size, np.nan)
@@ -251,14 +233,9 @@ def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
     return Stamps(counter, ticks, tick_s=_TICK_S, others=others, starts=starts, computer_s=computer_s)
 
 
-def _whole(values: FloatArray | None, rows: BoolArray) -> IntArray | None:
-    return None if values is None else values[rows, 0].astype(np.int64)
-
-
 def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
-    def vectors(name: str) -> FloatArray | None:
-        found: FloatArray | None = only(_filled(table, name, rows.size), rows)
-        return found
+    def vectors(name: str) -> Any:
+        return only(_filled(table, name, rows.size), rows)
 
     acceleration, rate = vectors("acceleration_m_s2"), vectors("rate_of_turn_rad_s")
     orientations, notes = _orientations(table, rows, acceleration, hints)
@@ -268,13 +245,8 @@ def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Part
         turned = from_quaternions(turns, "NWU")
         rate = np.where(turned.there[:, None], turned.world_from_sensor.as_rotvec(), np.nan)
         notes = (*notes, "rate of turn is the sensor's orientation increments over its sampling period")
-    return replace(
-        parts.noting(*notes),
-        accelerometer_m_s2=acceleration,
-        gyroscope_rad_s=rate,
-        magnetometer_au=vectors("magnetic_field_au"),
-        orientations=orientations,
-    )
+    measured = (acceleration, rate, vectors("magnetic_field_au"))
+    return replace(parts.noting(*notes), vectors=measured, orientations=orientations)
 
 
 def _per_second(log: ImuLog, table: Table) -> ImuLog:

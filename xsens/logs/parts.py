@@ -93,13 +93,14 @@ class Orientations:
 
 @dataclass(frozen=True)
 class Parts:
-    """Samples before their clock is known: as in `ImuLog`, one row for each message or line."""
+    """Samples before their clock is known: as in `ImuLog`, one row for each message or line.
+
+    `vectors` are the readings of accelerometer, gyroscope and magnetometer.
+    """
 
     source: str
     notes: tuple[str, ...] = ()
-    accelerometer_m_s2: FloatArray | None = None
-    gyroscope_rad_s: FloatArray | None = None
-    magnetometer_au: FloatArray | None = None
+    vectors: tuple[FloatArray | None, ...] = (None, None, None)
     orientations: Orientations | None = None
 
     def noting(self, *notes: str) -> Parts:
@@ -140,11 +141,12 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
     missing = 0 if turned is None else int((~turned.there).sum())
     lacking = (f"{missing} samples lack the sensor's own orientation",) if missing else ()
     oriented = turned is not None and bool(turned.there.any())
+    acceleration, rate, field = (_sane(vectors, line.kept) for vectors in parts.vectors)
     return ImuLog(
         line.time_s,
-        _sane(parts.accelerometer_m_s2, line.kept),
-        _sane(parts.gyroscope_rad_s, line.kept),
-        _sane(parts.magnetometer_au, line.kept),
+        acceleration,
+        rate,
+        field,
         only(turned.world_from_sensor, line.kept) if turned is not None and oriented else None,
         line.counter,
         line.gaps,
@@ -157,8 +159,7 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
 def _out_of_range(parts: Parts, kept: BoolArray) -> tuple[str, ...]:
     """Notes of readings that `_sane` leaves out although they are numbers."""
     notes = []
-    for name in ("accelerometer", "gyroscope", "magnetometer"):
-        vectors = next(value for key, value in vars(parts).items() if key.startswith(name))
+    for name, vectors in zip(("accelerometer", "gyroscope", "magnetometer"), parts.vectors, strict=True):
         if vectors is not None and (count := int((np.abs(vectors[kept]) >= _ABSURD).any(axis=1).sum())):
             notes.append(f"{count} {name} readings out of range were left out")
     return tuple(notes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -22,10 +23,14 @@ PathLike = str | os.PathLike[str]
 MOST_BYTES = 1 << 27
 """Of a log: five hours of raw counts at 256 Hz. Reading takes ten times as much memory, damage 35 times."""
 
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _SNIFFED = 1 << 16
 _DAMAGED = 0.01
 _TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
 """Bytes that text does not hold unless it is damaged."""
+
+_WIDE = (b"\xff\xfe", b"\xfe\xff")
+"""First bytes of text whose characters take two bytes."""
 
 _BEGINNINGS = (
     (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
@@ -86,7 +91,8 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     if (other := _other_kind(data)) is not None:
         raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
     if _is_text(data):
-        return parse_text(_text(data), hints, str(path))
+        text = data.decode("utf-16" if data.startswith(_WIDE) else "utf-8-sig", errors="replace")
+        return parse_text(text, hints, str(path))
     return parse_stream(data, hints, str(path))
 
 
@@ -99,7 +105,8 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
         If the file cannot be read, is no file, or is larger than `most_bytes`.
     """
     try:
-        with open(path, "rb", opener=_without_waiting) as file:
+        # A pipe is opened without waiting for its writer.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
             found = os.fstat(file.fileno())
             if not stat.S_ISREG(found.st_mode):
                 raise FileError(f"{path}: expected a file, got something else")
@@ -113,31 +120,17 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
         raise FileError(f"{path}: cannot be read: {reason}") from error
 
 
-def _without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
-
-
 def _is_text(data: bytes) -> bool:
     """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
     head = np.frombuffer(data[:_SNIFFED], dtype=np.uint8)
     controls = int((_TEXT_CONTROLS[head]).sum())
-    return (_is_wide(data) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
-
-
-def _is_wide(data: bytes) -> bool:
-    return data.startswith((b"\xff\xfe", b"\xfe\xff"))
-
-
-def _text(data: bytes) -> str:
-    return data.decode("utf-16" if _is_wide(data) else "utf-8-sig", errors="replace")
+    return (data.startswith(_WIDE) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
 
 
 def _other_kind(data: bytes) -> str | None:
     """Kind of a file that is clearly no log, in words; None if it may be one."""
-    for beginning, kind in _BEGINNINGS:
-        if data.startswith(beginning):
-            return kind
-    return "nothing but zeros" if not data.strip(b"\0") else None
+    zeros = "nothing but zeros" if not data.strip(b"\0") else None
+    return next((kind for beginning, kind in _BEGINNINGS if data.startswith(beginning)), zeros)
 
 
 # -- the sensor's own bytes
@@ -163,7 +156,7 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
     frames = find_frames(data)
     with naming(source):
         which = _of_one_kind(frames)
-        parts = Parts(source, (*_skipped(frames), *_left_out(frames, which)))
+        parts = Parts(source, tuple(_passed_over(frames, which)))
         read = legacy_log if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_log
         return read(frames, which, _stretches(frames, which), parts, hints or Hints())
 
@@ -180,17 +173,13 @@ def _of_one_kind(frames: Frames) -> IntArray:
     return np.asarray(data[kinds == names[counts.argmax()]])
 
 
-def _skipped(frames: Frames) -> tuple[str, ...]:
-    runs = frames.skipped()
-    if not runs:
-        return ()
-    size = sum(length for _, length in runs)
-    return (f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message",)
-
-
-def _left_out(frames: Frames, which: IntArray) -> tuple[str, ...]:
-    others = int(np.isin(frames.mid, _DATA).sum()) - which.size
-    return (f"{others} data messages of another kind or unit were left out",) if others else ()
+def _passed_over(frames: Frames, which: IntArray) -> Iterator[str]:
+    """Notes on bytes and messages that hold no samples of the log."""
+    if runs := frames.skipped():
+        size = sum(length for _, length in runs)
+        yield f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message"
+    if others := int(np.isin(frames.mid, _DATA).sum()) - which.size:
+        yield f"{others} data messages of another kind or unit were left out"
 
 
 def _stretches(frames: Frames, which: IntArray) -> Stamps:

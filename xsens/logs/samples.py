@@ -18,7 +18,7 @@ from speckle3d.core.geometry import require_increasing
 from speckle3d.core.streams import DEFAULT_MAX_GAP_S
 from speckle3d.core.streams import TimedRotations as TimedRotations
 
-_VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 
 _PAUSE = 2.5
 """A clock step of more periods is a pause, not jitter."""
@@ -102,7 +102,7 @@ class ImuLog:
         if self.oriented.size == 0:
             object.__setattr__(self, "oriented", np.full(len(self), self.world_from_sensor is not None))
         self._require_shape("oriented", (len(self),))
-        for name in _VECTORS:
+        for name in VECTORS:
             self._require_shape(name, (len(self), 3))
         self._require_shape("counter", (len(self),))
         if self.world_from_sensor is not None and len(self.world_from_sensor) != len(self):

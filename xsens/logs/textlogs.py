@@ -20,7 +20,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from xsens.logs.clocks import Stamps, timeline_of_times
 from xsens.logs.parts import Hints, Parts, are_rotations, assembled, from_angles, on_clock, orientations_of
-from xsens.logs.samples import Gap, ImuLog
+from xsens.logs.samples import VECTORS, Gap, ImuLog
 from xsens.logs.texttables import TextTable, number, read_table
 
 Names = tuple[str, ...]
@@ -53,8 +53,6 @@ _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.]+)\s*hz", re.
 _GAP = re.compile(r"# gap: after sample (\d+), (\d+) lost, (\S+) s$")
 _ENOUGH = 1000
 """Lines that show whether nine numbers are a matrix."""
-
-_MT9_COLUMNS = {4: "angles", 10: "matrix or vectors", 11: "vectors"}
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     if untimed:
         parts = parts.noting(f"{untimed} lines without a time were left out")
     parts = _measured(table, parts, dialect, hints)
-    counter = _whole(_first(table, _COUNTERS))
+    counter = next((c for name in _COUNTERS if (c := _whole(table.column(name))) is not None), None)
     time_s = table.column(_TIME)
     if time_s is not None:
         log = assembled(timeline_of_times(time_s, counter), parts)
@@ -125,10 +123,6 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     ticks = _whole(table.column(_TICKS))
     stamps = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
     return on_clock(stamps, len(table.values), parts, hints)
-
-
-def _first(table: TextTable, names: Names) -> FloatArray | None:
-    return next((column for name in names if (column := table.column(name)) is not None), None)
 
 
 def _timed(table: TextTable) -> tuple[TextTable, int]:
@@ -177,13 +171,7 @@ def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -
         notes = (*notes, "acceleration without gravity is no accelerometer's reading and was left out")
     if found[1] is not None:
         found[1] = found[1] * dialect.gyroscope_to_rad
-    return replace(_with_vectors(parts, *found), orientations=orientations).noting(*notes)
-
-
-def _with_vectors(
-    parts: Parts, acceleration: FloatArray | None, rate: FloatArray | None, field: FloatArray | None
-) -> Parts:
-    return replace(parts, accelerometer_m_s2=acceleration, gyroscope_rad_s=rate, magnetometer_au=field)
+    return replace(parts.noting(*notes), vectors=tuple(found), orientations=orientations)
 
 
 def _gaps_told(header: tuple[str, ...], samples: int) -> tuple[Gap, ...] | None:
@@ -199,7 +187,7 @@ def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     """Log of an export of the MT9 software; its kind is told by the number of columns."""
     count = table.values.shape[1]
     _require_unnamed(table, count)
-    if count not in _MT9_COLUMNS:
+    if count not in (4, 10, 11):  # angles, matrix or vectors, vectors and temperature
         raise InvalidInputError(f"expected 4, 10 or 11 columns where none has a name, got {count}")
     timed = np.isfinite(table.values[:, 0])
     if not timed.any():
@@ -224,7 +212,7 @@ def _mt9(values: FloatArray, parts: Parts, world: str) -> Parts:
         orientations, _ = orientations_of(world, None, matrices=values)
         note = "matrices are taken row by row: nothing in this file can tell"
         return replace(parts, orientations=orientations).noting(note)
-    return _with_vectors(parts, values[:, :3], values[:, 3:6], values[:, 6:9])
+    return replace(parts, vectors=(values[:, :3], values[:, 3:6], values[:, 6:9]))
 
 
 # -- columns that are not understood
@@ -296,33 +284,23 @@ def write_csv(path: str | os.PathLike[str], log: ImuLog) -> None:
     ...     xsens.read_log(path).rate_hz
     100.0
     """
-    names, columns = _csv_table(log)
-    lines = (*_comments(log), ",".join(names), *_csv_lines(columns), "")
+    names, columns = zip(*_csv_columns(log), strict=True)
+    cells = [["" if number != number else repr(number) for number in values.tolist()] for values in columns]
+    lines = (*_comments(log), ",".join(names), *map(",".join, zip(*cells, strict=True)), "")
     _write_whole(Path(path), "\n".join(lines))
 
 
-def _csv_table(log: ImuLog) -> tuple[list[str], list[list[str]]]:
-    named: list[tuple[str, FloatArray | IntArray]] = [("time_s", log.time_s)]
+def _csv_columns(log: ImuLog) -> Iterator[tuple[str, FloatArray | IntArray]]:
+    yield "time_s", log.time_s
     if log.counter is not None:
-        named.append(("counter", log.counter))
-    for names, vectors in zip(
-        PLAIN_VECTORS, (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au), strict=True
-    ):
-        if vectors is not None:
-            named += [(name, vectors[:, i]) for i, name in enumerate(names)]
+        yield "counter", log.counter
+    for names, vectors in zip(PLAIN_VECTORS, VECTORS, strict=True):
+        if (values := getattr(log, vectors)) is not None:
+            yield from zip(names, values.T, strict=True)
     if log.world_from_sensor is not None:
         quaternions = log.world_from_sensor.as_quat(scalar_first=True)
         quaternions[~log.oriented] = np.nan
-        named += [(f"quaternion_{axis}", quaternions[:, i]) for i, axis in enumerate("wxyz")]
-    return [name for name, _ in named], [_csv_cells(values) for _, values in named]
-
-
-def _csv_cells(values: FloatArray | IntArray) -> list[str]:
-    return ["" if number != number else repr(number) for number in values.tolist()]
-
-
-def _csv_lines(columns: list[list[str]]) -> Iterator[str]:
-    return map(",".join, zip(*columns, strict=True))
+        yield from zip(_QUATERNIONS[0], quaternions.T, strict=True)
 
 
 def _comments(log: ImuLog) -> Iterator[str]:

@@ -10,6 +10,7 @@ import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
+from typing import NamedTuple
 
 from speckle3d.core.errors import InvalidInputError
 from xsens.messages.framing import Message
@@ -26,43 +27,29 @@ class MessageId(IntEnum):
 
     REQ_DID = 0x00
     DEVICE_ID = 0x01
-    INIT_MT = 0x02
     INIT_MT_RESULTS = 0x03
     PERIOD = 0x04
     REQ_CONFIGURATION = 0x0C
     CONFIGURATION = 0x0D
-    RESTORE_FACTORY_DEFAULTS = 0x0E
     GO_TO_MEASUREMENT = 0x10
     GO_TO_MEASUREMENT_ACK = 0x11
-    REQ_FW_REV = 0x12
-    FIRMWARE_REV = 0x13
-    BAUD_RATE = 0x18
-    REQ_PRODUCT_CODE = 0x1C
-    PRODUCT_CODE = 0x1D
     GO_TO_CONFIG = 0x30
     GO_TO_CONFIG_ACK = 0x31
     MT_DATA = 0x32
     REQ_DATA = 0x34
-    REQ_DATA_ACK = 0x35
     MT_DATA2 = 0x36
     WAKE_UP = 0x3E
     WAKE_UP_ACK = 0x3F
-    RESET = 0x40
-    RESET_ACK = 0x41
     ERROR = 0x42
     UTC_TIME = 0x61
-    FILTER_PROFILE = 0x64
     REQ_EMTS = 0x90
     EMTS = 0x91
     RESET_ORIENTATION = 0xA4
     OUTPUT_CONFIGURATION = 0xC0
     OUTPUT_CONFIGURATION_ACK = 0xC1
     OUTPUT_MODE = 0xD0
-    OUTPUT_MODE_ACK = 0xD1
     OUTPUT_SETTINGS = 0xD2
-    OUTPUT_SETTINGS_ACK = 0xD3
     SKIP_FACTOR = 0xD4
-    SKIP_FACTOR_ACK = 0xD5
 
 
 _ERRORS = {
@@ -78,13 +65,13 @@ _ERRORS = {
 
 def error_of(message: Message) -> str:
     """Text of an error message of the sensor."""
-    code = _exactly(message, 1)[0]
+    code = _payload(message, 1)[0]
     return f"error {code}: {_ERRORS.get(code, 'not documented')}"
 
 
 def device_id(message: Message) -> int:
     """Serial number of the unit, from a message that begins with it (DeviceID, configuration)."""
-    return int.from_bytes(_at_least(message, 4)[:4], "big")
+    return int.from_bytes(_payload(message, 4, at_least=True)[:4], "big")
 
 
 @dataclass(frozen=True)
@@ -142,14 +129,13 @@ class Configuration:
     @classmethod
     def from_message(cls, message: Message) -> Configuration:
         """Decode; raises `InvalidInputError` if the length does not suit the number of units."""
-        number, period, skip, count = _HEAD.unpack_from(_at_least(message, _HEAD.size))
-        payload = _exactly(message, _HEAD.size + count * _UNIT.size)
+        number, period, skip, count = _HEAD.unpack_from(_payload(message, _HEAD.size, at_least=True))
+        payload = _payload(message, _HEAD.size + count * _UNIT.size)
         units = tuple(UnitConfiguration(*fields) for fields in _UNIT.iter_unpack(payload[_HEAD.size :]))
         return cls(number, period, skip, units)
 
 
-@dataclass(frozen=True)
-class OutputItem:
+class OutputItem(NamedTuple):
     """One line of an MTData2 sensor's output configuration.
 
     Attributes
@@ -170,12 +156,12 @@ def output_configuration(message: Message) -> tuple[OutputItem, ...]:
         raise InvalidInputError(
             f"output configuration: expected whole items of 4 bytes, got {len(message.payload)} bytes"
         )
-    return tuple(OutputItem(*item) for item in struct.iter_unpack(">HH", message.payload))
+    return tuple(map(OutputItem._make, struct.iter_unpack(">HH", message.payload)))
 
 
 def set_output_configuration(items: tuple[OutputItem, ...]) -> Message:
     """Request that sets the items an MTData2 sensor sends; without items, one that asks for them."""
-    payload = b"".join(struct.pack(">HH", item.identifier, item.rate_hz) for item in items)
+    payload = b"".join(struct.pack(">HH", *item) for item in items)
     return Message(MessageId.OUTPUT_CONFIGURATION, payload)
 
 
@@ -202,17 +188,10 @@ def utc_time_s(message: Message) -> float:
         return float("nan")
 
 
-def _at_least(message: Message, size: int) -> bytes:
-    if len(message.payload) < size:
-        raise InvalidInputError(
-            f"message {message.mid:#04x}: expected at least {size} bytes, got {len(message.payload)}"
-        )
-    return message.payload
-
-
-def _exactly(message: Message, size: int) -> bytes:
-    if len(message.payload) != size:
-        raise InvalidInputError(
-            f"message {message.mid:#04x}: expected {size} bytes, got {len(message.payload)}"
-        )
+def _payload(message: Message, size: int, at_least: bool = False) -> bytes:
+    """Payload of a message; raise unless it is of that size."""
+    found = len(message.payload)
+    if found < size or (found > size and not at_least):
+        least = "at least " if at_least else ""
+        raise InvalidInputError(f"message {message.mid:#04x}: expected {least}{size} bytes, got {found}")
     return message.payload

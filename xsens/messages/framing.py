@@ -129,7 +129,7 @@ class Frames:
     def payloads(self) -> ByteArray:
         """Payloads as rows, shape (n, size); all must be as long as the first."""
         size = int(self.payload_size[0]) if len(self) else 0
-        if size == 0 or not len(self):
+        if not size:
             return np.zeros((len(self), size), dtype=np.uint8)
         return np.asarray(np.lib.stride_tricks.sliding_window_view(self.data, size)[self.payload_start])
 
@@ -241,7 +241,7 @@ def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> t
     rest = np.flatnonzero(~counts)
     if rest.size:
         chosen = _choose(
-            start[rest].tolist(), end[rest].tolist(), _is_in(end[rest], start).tolist(), unfinished.tolist()
+            start[rest].tolist(), end[rest].tolist(), np.isin(end[rest], start).tolist(), unfinished.tolist()
         )
         counts[rest[chosen]] = True
     start, end = start[counts], end[counts]
@@ -259,11 +259,6 @@ def _clear(start: IntArray, end: IntArray, unfinished: IntArray) -> BoolArray:
     if unfinished.size:
         clear &= reach <= unfinished[0]
     return np.asarray(clear)
-
-
-def _is_in(points: IntArray, increasing: IntArray) -> BoolArray:
-    at = np.minimum(np.searchsorted(increasing, points), increasing.size - 1)
-    return np.asarray(increasing[at] == points)
 
 
 def _choose(start: list[int], end: list[int], followed: list[bool], unfinished: list[int]) -> list[int]:

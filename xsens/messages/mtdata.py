@@ -100,12 +100,7 @@ _RAW = (
     Field("raw_temperature", 1, _U2),
 )
 _COUNTER = Field("counter", 1, _U2)
-_UTC = (
-    Field("utc_nanosecond", 1, ">u4"),
-    Field("utc_year", 1, _U2),
-    Field("utc_month_to_second", 5, _U1),
-    Field("utc_valid", 1, _U1),
-)
+_UTC = Field("utc", 12, _U1)
 _ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9))
 
 
@@ -160,33 +155,25 @@ class DataLayout:
         if self.mode == OutputMode.MT9:
             return (_COUNTER, *_RAW)
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
-        utc = _UTC if self.settings & OutputSettings.UTC else ()
+        utc = (_UTC,) if self.settings & OutputSettings.UTC else ()
         body = _RAW if self.mode == OutputMode.RAW else tuple(self._measured())
         return (*counter, *body, *utc) if self.counter_first else (*body, *counter, *utc)
 
     def _measured(self) -> list[Field]:
-        wanted = (
-            (self._has(OutputMode.TEMPERATURE), Field("temperature_c", 1)),
-            (self._calibrated(OutputSettings.NO_ACCELEROMETER), Field("accelerometer_m_s2", 3)),
-            (self._calibrated(OutputSettings.NO_GYROSCOPE), Field("gyroscope_rad_s", 3)),
-            (self._calibrated(OutputSettings.NO_MAGNETOMETER), Field("magnetometer_au", 3)),
-            (self._has(OutputMode.ORIENTATION), _ORIENTATION[(self.settings >> 2) & 3]),
-            (self._analog(OutputSettings.NO_ANALOG_1), Field("analog_1", 1, _U2)),
-            (self._analog(OutputSettings.NO_ANALOG_2), Field("analog_2", 1, _U2)),
-            (self._has(OutputMode.POSITION), Field("position", 3)),
-            (self._has(OutputMode.VELOCITY), Field("velocity_m_s", 3)),
-            (self._has(OutputMode.STATUS), Field("status", 1, _U1)),
+        calibrated, analog = OutputMode.CALIBRATED, OutputMode.AUXILIARY
+        parts = (
+            (OutputMode.TEMPERATURE, 0, Field("temperature_c", 1)),
+            (calibrated, OutputSettings.NO_ACCELEROMETER, Field("accelerometer_m_s2", 3)),
+            (calibrated, OutputSettings.NO_GYROSCOPE, Field("gyroscope_rad_s", 3)),
+            (calibrated, OutputSettings.NO_MAGNETOMETER, Field("magnetometer_au", 3)),
+            (OutputMode.ORIENTATION, 0, _ORIENTATION[(self.settings >> 2) & 3]),
+            (analog, OutputSettings.NO_ANALOG_1, Field("analog_1", 1, _U2)),
+            (analog, OutputSettings.NO_ANALOG_2, Field("analog_2", 1, _U2)),
+            (OutputMode.POSITION, 0, Field("position", 3)),
+            (OutputMode.VELOCITY, 0, Field("velocity_m_s", 3)),
+            (OutputMode.STATUS, 0, Field("status", 1, _U1)),
         )
-        return [field for there, field in wanted if there]
-
-    def _has(self, part: OutputMode) -> bool:
-        return bool(self.mode & part)
-
-    def _calibrated(self, disabled: OutputSettings) -> bool:
-        return self._has(OutputMode.CALIBRATED) and not self.settings & disabled
-
-    def _analog(self, disabled: OutputSettings) -> bool:
-        return self._has(OutputMode.AUXILIARY) and not self.settings & disabled
+        return [field for part, off, field in parts if self.mode & part and not self.settings & off]
 
     def _width(self, field: Field) -> int:
         one = self.number_format.size if field.kind == "real" else np.dtype(field.kind).itemsize

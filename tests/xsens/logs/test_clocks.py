@@ -39,18 +39,6 @@ def test_a_clock_alone_tells_losses():
     assert line.counter is None
 
 
-def test_a_clock_that_trembles_is_no_loss():
-    ticks = np.cumsum(np.random.default_rng(0).integers(90, 111, 500))
-    assert timeline(Stamps(ticks=ticks)).gaps == ()
-
-
-def test_messages_that_count_but_are_no_samples_are_no_loss():
-    counter = np.delete(np.arange(100), [20, 40])
-    others = np.cumsum(np.isin(counter, [21, 41]))
-    line = timeline(Stamps(counter=counter, ticks=100 * np.arange(98), others=others))
-    assert line.gaps == ()
-
-
 def test_repeated_samples_are_kept_once():
     line = timeline(Stamps(counter=np.array([5, 6, 6, 7]), period_s=0.01))
     assert line.kept.tolist() == [True, True, False, True]

@@ -19,7 +19,7 @@ from imu_logs import (
     raw_values,
     samples,
 )
-from imu_messages import calibration_message, configuration_message, items_payload, mtdata_payloads
+from imu_messages import Item, calibration_message, configuration_message, items_payload, mtdata_payloads
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
@@ -31,7 +31,6 @@ from xsens.logs.textlogs import write_csv
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration, utc_message
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
-from xsens.messages.mtdata2 import Item
 
 UNIT = calibration()
 COUNTED = OutputSettings.COUNTER
@@ -135,12 +134,6 @@ def test_matrices_are_turned_if_gravity_says_so(s):
     assert any("taken by columns" in note for note in log.notes)
 
 
-def test_skipped_samples_make_the_rate_lower(s):
-    layout = DataLayout(EVERYTHING, COUNTED)
-    log = parse_stream(configured(layout, period=1152, skip=3) + b"".join(legacy_messages(s, layout)))
-    assert log.rate_hz == pytest.approx(25.0)
-
-
 def test_legacy_data_without_configuration_need_a_layout(s):
     layout = DataLayout(EVERYTHING, COUNTED)
     data = b"".join(legacy_messages(s, layout))
@@ -194,12 +187,6 @@ def test_self_describing_data_in_every_format_and_world(s, form, world, orientat
     assert_same_samples(log, s, atol=2e-6)
     assert (log.notes, log.gaps) == ((), ())
     np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
-
-
-def test_a_clock_that_wraps_round_goes_on(s):
-    log = parse_stream(b"".join(mtdata2_messages(s, first_tick=2**32 - 5000, first=65500)))
-    np.testing.assert_allclose(np.diff(log.time_s), 0.01)
-    assert log.gaps == ()
 
 
 def test_messages_without_a_measurement_are_no_samples_and_no_loss(s):
@@ -267,13 +254,6 @@ def test_a_quaternion_that_is_none_is_missing(s):
 
 
 # Streams of a live sensor
-
-
-def test_a_stream_that_starts_and_ends_in_mid_message(s):
-    data = b"".join(mtdata2_messages(s))
-    log = parse_stream(data[40:-40])
-    assert len(log) == 198
-    assert_same_samples(log, s, which=slice(1, 199))
 
 
 def test_a_sensor_plugged_in_again_is_away_as_long_as_the_computer_says(s):

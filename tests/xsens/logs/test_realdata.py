@@ -1,18 +1,16 @@
 """Recordings of others, against what their own or the vendor's software says of them."""
 
 import re
-from datetime import datetime
 
 import numpy as np
 import pytest
-from imu_messages import items_payload
 from scipy.spatial.transform import Rotation
 
 from xsens.logs.read import parse_stream, read_log
 from xsens.logs.textlogs import write_csv
 from xsens.messages.control import Configuration, MessageId, output_configuration
-from xsens.messages.framing import Message, decode, find_frames
-from xsens.messages.mtdata2 import decode_items, kind_of, number_format, world_of
+from xsens.messages.framing import Message, encode, find_frames
+from xsens.messages.mtdata2 import columns, kind_of, name_of
 from xsens.messages.rawcounts import RawCalibration
 
 pytestmark = pytest.mark.realdata
@@ -67,100 +65,50 @@ def test_the_mt9_at_rest_feels_gravity(mt9b):
 # MTData2 of an MTi-G, with the decoding of einride/xsens-go
 
 
-WORLDS = {"ENU": "EastNorthUp", "NED": "NorthEastDown", "NWU": "NorthWestUp"}
-FORMATS = ("Float32", "FP1220", "FP1632", "Float64")
 NAMES = {
-    "packet_counter": "PacketCounter",
-    "sample_time_fine": "SampleTimeFine",
-    "utc": "UTCTime",
-    "status_word": "StatusWord",
-    "status_byte": "StatusByte",
-    "acceleration_m_s2": "Acceleration",
-    "delta_v_m_s": "DeltaV",
-    "rate_of_turn_rad_s": "RateOfTurn",
-    "delta_q_wxyz": "DeltaQ",
-    "euler_deg": "EulerAngles",
-    "latitude_longitude_deg": "LatLon",
-    "altitude_above_ellipsoid_m": "AltitudeEllipsoid",
-    "velocity_m_s": "VelocityXYZ",
-    "gnss_position_velocity_time": "GNSSPVTData",
+    "PacketCounter": "packet_counter",
+    "SampleTimeFine": "sample_time_fine",
+    "Acceleration": "acceleration_m_s2",
+    "DeltaV": "delta_v_m_s",
+    "RateOfTurn": "rate_of_turn_rad_s",
+    "DeltaQ": "delta_q_wxyz",
+    "EulerAngles": "euler_deg",
+    "Quaternion": "quaternion_wxyz",
+    "MagneticField": "magnetic_field_au",
 }
-SEEN_FROM_A_WORLD = ("euler_deg", "velocity_m_s")
-PVT = (
-    *("ITOW", "Year", "Month", "Day", "Hour", "Min", "Sec", "Valid", "TAcc", "Nano", "FixType", "Flags"),
-    *("NumSV", "Reserved1", "Lon", "Lat", "Height", "HMSL", "HAcc", "VAcc", "VelN", "VelE", "VelD"),
-    *(
-        "GSpeed",
-        "HeadMot",
-        "SAcc",
-        "HeadAcc",
-        "HeadVeh",
-        "GDOP",
-        "PDOP",
-        "TDOP",
-        "VDOP",
-        "HDOP",
-        "NDOP",
-        "EDOP",
-    ),
-)
-FIELDS = {3: ("X", "Y", "Z"), 4: ("Q0", "Q1", "Q2", "Q3"), 2: ("Lat", "Lon"), 1: ("",)}
+"""The package's name of an item by those of the two programs."""
+
+
+def decoded_rows(frames):
+    """Values of the items of every message by name."""
+    table, damaged = columns(frames)
+    assert damaged == 0
+    rows = [{} for _ in range(len(frames))]
+    for identifier, column in table.items():
+        for row, values in zip(column.rows, column.values, strict=True):
+            rows[row][kind_of(identifier).name] = values
+    return rows
 
 
 def golden_items(text):
-    """Items of each message as (heading, values); the golden text separates messages by a blank line."""
+    """Values of the items of every message by name; the golden text separates messages by a blank line."""
     for block in text.strip("\n").split("\n\n"):
-        items = []
-        for line in block.split("\n"):
-            if not line.startswith(" "):
-                items.append((line.rstrip(":"), []))
-            else:
-                items[-1][1].append(line.strip())
-        yield items
-
-
-def as_golden(item):
-    """Heading and values of an item as the golden text has them; real numbers stay numbers."""
-    name = kind_of(item.identifier).name
-    heading, values = NAMES[name], item.values
-    if name in SEEN_FROM_A_WORLD:
-        heading += f"({WORLDS[world_of(item.identifier)]},{FORMATS[number_format(item.identifier)]})"
-    elif kind_of(item.identifier).reals:
-        heading += f"({FORMATS[number_format(item.identifier)]})"
-    if name == "utc":
-        return heading, [utc(values)]
-    if name in ("status_word", "status_byte"):
-        return heading, [f"{values[0]:0{32 if name == 'status_word' else 8}b}"]
-    if name == "gnss_position_velocity_time":
-        return heading, [f"{field}:{value}" for field, value in zip(PVT, values, strict=True)]
-    if not kind_of(item.identifier).reals:
-        return heading, [str(values[0])]
-    return heading, list(zip(FIELDS[len(values)], values, strict=True))
-
-
-def utc(values):
-    nanosecond, *date, _ = values
-    fraction = f".{nanosecond:09d}".rstrip("0").rstrip(".")
-    return datetime(*date).isoformat() + fraction + "Z"
+        items = re.findall(r"^(\w+)(?:\(.*\))?:\n((?:  .*\n?)+)", block, re.MULTILINE)
+        yield {
+            NAMES[name]: [float(line.rpartition(":")[2]) for line in lines.split("\n") if line]
+            for name, lines in items
+            if name in NAMES
+        }
 
 
 @pytest.mark.parametrize("which", ["1", "2"])
 def test_messages_of_an_mti_g_are_the_golden_ones(realdata, which):
     folder = realdata / "xsens-go" / which
-    found = decode((folder / "output.bin").read_bytes())
+    found = decoded_rows(find_frames((folder / "output.bin").read_bytes()))
     golden = list(golden_items((folder / "output.golden").read_text()))
     assert len(found) == len(golden) == 100
     for message, expected in zip(found, golden, strict=True):
-        items = [as_golden(item) for item in decode_items(message.payload)]
-        assert [heading for heading, _ in items] == [heading for heading, _ in expected]
-        for (_, values), (_, lines) in zip(items, expected, strict=True):
-            for value, line in zip(values, lines, strict=True):
-                if isinstance(value, str):
-                    assert value == line
-                else:
-                    field, _, number = line.rpartition(":")
-                    # The text has all digits of a double.
-                    assert (field, float(number)) == value
+        assert {name: values.tolist() for name, values in message.items()} == expected
 
 
 @pytest.mark.parametrize("which", ["1", "2"])
@@ -170,7 +118,6 @@ def test_messages_of_an_mti_g_are_cut_and_made_as_recorded(realdata, which):
     frames = find_frames(data)
     recorded = (folder / "messages.golden").read_text().split()
     assert [data[a:b].hex() for a, b in zip(frames.start, frames.end, strict=True)] == recorded
-    assert all(items_payload(decode_items(m.payload)) == m.payload for m in frames.messages())
 
 
 @pytest.mark.parametrize("which", ["1", "2"])
@@ -180,7 +127,7 @@ def test_output_configurations_are_the_golden_ones(realdata, which):
     items = output_configuration(Message(MessageId.OUTPUT_CONFIGURATION_ACK, payload))
     lines = (folder / "outputconfig.golden").read_text().strip().split("\n")
     for item, heading, rate in zip(items, lines[::2], lines[1::2], strict=True):
-        assert heading.split("(")[0].rstrip(":") == NAMES[kind_of(item.identifier).name]
+        assert name_of(item.identifier) == NAMES.get(heading.split("(")[0].rstrip(":"), "")
         assert rate.strip() == ("Max" if item.rate_hz == 0xFFFF else f"{item.rate_hz} Hz")
 
 
@@ -210,34 +157,17 @@ def vendor_packets(text):
         )
 
 
-VENDOR_NAMES = {
-    "PacketCounter": "packet_counter",
-    "SampleTimeFine": "sample_time_fine",
-    "Quaternion": "quaternion_wxyz",
-    "Acceleration": "acceleration_m_s2",
-    "DeltaV": "delta_v_m_s",
-    "FreeAcceleration": "free_acceleration_m_s2",
-    "RateOfTurn": "rate_of_turn_rad_s",
-    "DeltaQ": "delta_q_wxyz",
-    "MagneticField": "magnetic_field_au",
-    "Temperature": "temperature_c",
-    "BaroPressure": "pressure_pa",
-    "StatusWord": "status_word",
-}
-
-
 def test_packets_of_an_mti_are_as_the_vendors_program_decodes_them(realdata):
     text = (realdata / "xsens-mti" / "mtmanager_packets.md").read_text()
     packets = list(vendor_packets(text))
     assert len(packets) == 6
     for payload, decoded in packets:
-        items = decode_items(payload)
-        assert [item.name for item in items] == [VENDOR_NAMES[name] for name, _ in decoded]
-        for item, (name, numbers) in zip(items, decoded, strict=True):
-            expected = [int(numbers[0], 2)] if name == "StatusWord" else [float(n) for n in numbers]
+        (found,) = decoded_rows(find_frames(encode(Message(MessageId.MT_DATA2, payload))))
+        expected = {NAMES[name]: [float(n) for n in numbers] for name, numbers in decoded if name in NAMES}
+        assert found.keys() == expected.keys()
+        for name, values in expected.items():
             # The program shows eight decimals.
-            np.testing.assert_allclose(item.values, expected, rtol=0, atol=5.1e-9)
-        assert items_payload(items) == payload
+            np.testing.assert_allclose(found[name], values, rtol=0, atol=5.1e-9)
 
 
 def test_the_configuration_of_an_mti_is_as_the_vendors_program_decodes_it(realdata):

@@ -14,16 +14,15 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
-from imu_messages import items_payload
+from imu_messages import Item, items_payload
 
 from speckle3d.core.errors import FileError, Speckle3DError
 from xsens.logs.read import MOST_BYTES, parse_stream, read_log
 from xsens.logs.samples import ImuLog
-from xsens.logs.textlogs import parse_text, write_csv
+from xsens.logs.textlogs import parse_text
 from xsens.messages.control import Configuration, MessageId
 from xsens.messages.framing import Framer, Message, encode, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
-from xsens.messages.mtdata2 import Item, decode_items
 from xsens.messages.rawcounts import RawCalibration
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
@@ -202,7 +201,6 @@ def test_fuzzed(inputs, seconds, tmp_path):
 @given(st.binary(max_size=300))
 def test_decoders_of_single_messages_refuse_with_one_line(data):
     readers = (
-        decode_items,
         lambda b: Configuration.from_message(Message(MessageId.CONFIGURATION, b)),
         lambda b: RawCalibration.from_message(Message(MessageId.EMTS, b[:168].ljust(168, b"\x01"))),
         lambda b: DataLayout(int.from_bytes(b[:2], "big"), int.from_bytes(b[2:6], "big")).decode(b[6:]),
@@ -314,10 +312,3 @@ def test_time_and_memory_grow_with_the_size_alone(name, tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 70 * len(data)
     finally:
         tracemalloc.stop()
-
-
-def test_what_is_read_can_be_written(tmp_path):
-    for data in STREAMS.values():
-        log = survives(data)
-        write_csv(tmp_path / "log.csv", log)
-        assert len(read_log(tmp_path / "log.csv")) == len(log) == 8

@@ -57,13 +57,6 @@ def test_matrices_of_the_mt9_software_are_told_from_vectors(s):
     assert any("row by row" in note for note in log.notes)
 
 
-def test_samples_missing_from_an_export_are_gaps(s):
-    text = lines([s["time_s"], s["world_from_sensor"].as_euler("xyz", degrees=True)]).split("\n")
-    del text[20:23]
-    log = parse_text("\n".join(text))
-    assert [(g.after_index, g.lost) for g in log.gaps] == [(19, 3)]
-
-
 def test_times_rounded_to_hundredths_are_no_gaps():
     time_s = np.round(np.arange(100) / 64, 2)
     log = parse_text(lines([time_s, np.zeros((100, 3))], digits=2))
@@ -120,15 +113,6 @@ def test_lines_between_and_after_are_left_out_and_counted(s):
     assert len(log) == 59
     assert log.notes[0].startswith("3 lines")
     assert [(g.after_index, g.lost) for g in log.gaps] == [(6, 1)]
-
-
-def test_cells_that_are_no_number_are_missing(s):
-    text = mt_manager(s).split("\n")
-    cells = text[10].split("\t")
-    cells[3] = "-nan(ind)"
-    text[10] = "\t".join(cells)
-    log = parse_text("\n".join(text))
-    assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [5]
 
 
 def test_windows_line_ends_and_wide_characters(s, tmp_path):

@@ -8,12 +8,11 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[2]))
 
 from imu_logs import calibration, configured, items_of, legacy_messages, mt9_bin, mtdata2_messages, samples  # noqa: E402
-from imu_messages import configuration_message, items_payload  # noqa: E402
+from imu_messages import Item, configuration_message, items_payload  # noqa: E402
 
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration  # noqa: E402
 from xsens.messages.framing import Message, encode  # noqa: E402
 from xsens.messages.mtdata import DataLayout  # noqa: E402
-from xsens.messages.mtdata2 import Item  # noqa: E402
 
 
 def of_items(*messages):
