@@ -1,6 +1,6 @@
-"""Reslices: any plane through a sweep, straight from its frames.
+"""Reslices: any plane through a sweep, straight from its frames or from voxels.
 
-Each pixel blends the two images nearest to it, one on either side, sampled
+Resliced from the frames, each pixel blends the two images nearest to it, one on either side, sampled
 bilinearly where the pixel projects onto them: no voxels, no hole filling, and the images' own resolution.
 """
 
@@ -11,11 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages, require_poses
 
 MAX_PIXELS = 100_000_000
@@ -160,6 +162,27 @@ def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float)
     plane = image_plane(RigidTransform.identity(), grid, pixel_mm)
     alone = ChosenImages(images, np.array([frame]))
     return reslice_frames(alone, grid, RigidTransform.identity(1), plane, 1.0)
+
+
+def reslice_volume(volume: Volume, plane: ReslicePlane) -> Float32Array:
+    """Cut a plane through voxels, linear between them.
+
+    Parameters
+    ----------
+    volume : Volume
+    plane : ReslicePlane
+
+    Returns
+    -------
+    ndarray of float32, shape (rows, columns)
+        NaN outside the volume and beside NaN voxels.
+    """
+    index_from_pixel = np.linalg.solve(volume.world_from_index, plane.world_from_pixel())[:3]
+    rows, columns = np.indices(plane.shape, dtype=np.float64, sparse=True)
+    # NumPy adds the sparse row and column terms: no array of homogeneous pixels is made.
+    index = np.stack([a * columns + b * rows + c for a, b, c in index_from_pixel])
+    cut = map_coordinates(volume.voxels, index, output=np.float32, order=1, cval=np.nan)
+    return np.asarray(cut, dtype=np.float32)
 
 
 def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:

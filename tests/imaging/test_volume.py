@@ -12,6 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.reslice import ReslicePlane, reslice_volume
 from speckle3d.imaging.volume import compound, grid_around
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
@@ -141,3 +143,20 @@ def test_absurd_sizes_are_refused_before_a_frame_is_read():
 def test_no_values_is_an_error():
     with pytest.raises(InsufficientDataError):
         compound(np.full((1, 9, 14), np.nan), GRID, RigidTransform.identity(1), 0.5)
+
+
+def test_reslice_of_a_volume_is_exact_on_a_linear_field():
+    rng = np.random.default_rng(4)
+    pose = RigidTransform.from_components([5.0, -3.0, 2.0], Rotation.random(rng=rng))
+    volume = Volume(np.zeros((12, 10, 9), dtype=np.float32), (0.5, 0.6, 0.7), pose)
+    gradient = np.array([1.0, -2.0, 0.5])
+    volume = Volume((voxel_centres(volume) @ gradient).astype(np.float32), volume.spacing_mm, pose)
+    middle = pose * RigidTransform.from_translation([1.0, 2.0, 2.5])
+    plane = ReslicePlane(middle, 6.0, 3.0, 0.5)
+    cut = reslice_volume(volume, plane)
+    rows, columns = np.indices(plane.shape)
+    local = np.stack([columns, rows, 0 * rows], axis=-1) * 0.5
+    expected = plane.world_from_plane.apply(local.reshape(-1, 3)).reshape(*plane.shape, 3) @ gradient
+    expected[columns * 0.5 + 1.0 > 11 * 0.5] = np.nan
+    # Single precision of voxel values of order ten.
+    np.testing.assert_allclose(cut, expected, atol=1e-5)
