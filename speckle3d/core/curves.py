@@ -11,6 +11,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
+PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
+"""Numbers in a `CurveKey` beside those of the signal."""
+
 
 @dataclass(frozen=True)
 class CurveKey:
@@ -128,10 +131,8 @@ def _differing(a: CurveKey, b: CurveKey) -> Iterable[tuple[str, object, object]]
     if a.correlation_of != b.correlation_of:
         yield "correlation_of", a.correlation_of, b.correlation_of
         return
-    names = vars(a.signal).keys()
-    pairs = [(name, getattr(a.signal, name), getattr(b.signal, name)) for name in names]
-    own = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
-    pairs += [(name, getattr(a, name), getattr(b, name)) for name in own]
+    pairs = [(name, mine, getattr(b.signal, name)) for name, mine in vars(a.signal).items()]
+    pairs += [(name, getattr(a, name), getattr(b, name)) for name in PATCH_NUMBERS]
     for name, mine, theirs in pairs:
         if not np.allclose(np.asarray(mine, float), np.asarray(theirs, float), rtol=1e-3, atol=1e-9):
             yield name, mine, theirs

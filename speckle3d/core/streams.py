@@ -23,7 +23,7 @@ Samples = TypeVar("Samples", Rotation, RigidTransform)
 
 
 @dataclass(frozen=True)
-class _TimedSamples(Generic[Samples]):
+class TimedSamples(Generic[Samples]):
     """Samples on a clock: validation, coverage and lookup, whatever the samples are."""
 
     time_s: FloatArray
@@ -81,7 +81,7 @@ class _TimedSamples(Generic[Samples]):
 
 
 @dataclass(frozen=True)
-class TimedRotations(_TimedSamples[Rotation]):
+class TimedRotations(TimedSamples[Rotation]):
     """Orientation samples of one sensor.
 
     Parameters
@@ -108,7 +108,7 @@ class TimedRotations(_TimedSamples[Rotation]):
 
 
 @dataclass(frozen=True)
-class TimedPoses(_TimedSamples[RigidTransform]):
+class TimedPoses(TimedSamples[RigidTransform]):
     """Position and orientation samples of one sensor.
 
     Parameters

@@ -15,12 +15,12 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.headers import SequenceHeader, image_library, read_header
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -299,14 +299,11 @@ def image_orientation(header: SequenceHeader) -> str:
 
 def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
     """Pixels as (frame, second axis, first axis)."""
-    import SimpleITK
-
-    try:
+    with image_library(header.path, "read") as itk:
         # The reader is named, because the library otherwise chooses it by the suffix.
-        image = SimpleITK.ReadImage(header.path, imageIO=f"{header.file_format}IO")
-    except RuntimeError as error:
-        raise FileError(f"{header.path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error
-    pixels = SimpleITK.GetArrayFromImage(image)
+        pixels: npt.NDArray[Any] = itk.GetArrayFromImage(
+            itk.ReadImage(header.path, imageIO=f"{header.file_format}IO")
+        )
     expected = (header.frame_count, header.size[1], header.size[0])
     if "list" in header.fields.get("kinds", "") and pixels.shape == (*expected[1:], expected[0]):
         pixels = np.moveaxis(pixels, -1, 0)  # an NRRD list of frames arrives as one image of many components

@@ -13,17 +13,17 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from xml.etree.ElementTree import Element, TreeBuilder
-from xml.parsers import expat
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.io.hdf5 import PathLike, one_line, reading
 from speckle3d.io.text import numbers
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
@@ -168,29 +168,18 @@ def _clip(segmentation: Element) -> Clip | None:
 
 
 def _read_xml(path: PathLike) -> Element:
-    try:
-        with open(path, "rb") as stream:
-            text = stream.read(_SIZE_LIMIT_BYTES + 1)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), open(path, "rb") as stream:
+        text = stream.read(_SIZE_LIMIT_BYTES + 1)
     if len(text) > _SIZE_LIMIT_BYTES:
         raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")
     try:
-        return _parse(text)
-    except (expat.ExpatError, ValueError, LookupError) as error:
+        return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InvalidInputError(f"{path}: expected well-formed XML, got: {one_line(error)}") from error
 
 
-def _parse(text: bytes) -> Element:
-    """Build the tree of a document without a type declaration, so that it has no entities of its own."""
-    builder = TreeBuilder()
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.StartDoctypeDeclHandler = _refuse_doctype
-    parser.Parse(text, True)
-    return builder.close()
+class _PlainTree(ElementTree.TreeBuilder):
+    """The tree of a document without a type declaration, so that it has no entities of its own."""
 
-
-def _refuse_doctype(name: str, *_: object) -> None:
-    raise ValueError(f"a document type declaration ({name})")
+    def doctype(self, name: str, *_: object) -> None:
+        raise ValueError(f"a document type declaration ({name})")

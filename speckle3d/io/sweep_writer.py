@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
-from types import TracebackType
 from typing import Any, Literal
 
 import h5py
@@ -16,8 +14,16 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, atomic_hdf5, atomic_path, open_hdf5, opened
+from speckle3d.core.sweep import (
+    INERTIAL,
+    BModeSettings,
+    ImageGrid,
+    OrientationSensor,
+    RFSettings,
+    Sweep,
+    Tracker,
+)
+from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames
 
 Compression = Literal["gzip", "lzf"] | None
@@ -27,7 +33,7 @@ _GZIP_LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
 
 
-class SweepWriter:
+class SweepWriter(HDF5Writer):
     """Write a sweep file frame by frame; it appears whole when the block ends, or not at all.
 
     Parameters
@@ -50,7 +56,8 @@ class SweepWriter:
         dtype: npt.DTypeLike | None = None,
         compression: Compression = "gzip",
     ) -> None:
-        self._path, self._grid, self._signal = path, grid, signal
+        super().__init__(path, FORMAT, VERSION)
+        self._grid, self._signal = grid, signal
         self._name = "rf" if isinstance(signal, RFSettings) else "bmode"
         self._dtype = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
         if self._dtype not in SAMPLE_TYPES[self._name]:
@@ -60,25 +67,11 @@ class SweepWriter:
             )
         self._compression = compression
         self._time_s: list[float] = []
-        self._stack = ExitStack()
 
-    def __enter__(self) -> SweepWriter:
-        with ExitStack() as stack:
-            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, FORMAT, VERSION))
-            self._frames = self._create_frames().id
-            self._in_memory = h5py.h5s.create_simple((self._grid.vectors, self._grid.samples))
-            self._kind = h5py.h5t.py_create(self._dtype)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is not None:
-            self._stack.__exit__(kind, error, trace)
-            return
-        with self._stack:
-            self._finish()
+    def _begin(self) -> None:
+        self._frames = self._create_frames().id
+        self._in_memory = h5py.h5s.create_simple((self._grid.vectors, self._grid.samples))
+        self._kind = h5py.h5t.py_create(self._dtype)
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
@@ -90,8 +83,8 @@ class SweepWriter:
         """
         i = len(self._time_s)
         where = f"{self._path}: /{self._name}[{i}]"
-        if frame.shape != (self._grid.vectors, self._grid.samples):
-            expected = (self._grid.vectors, self._grid.samples)
+        expected = (self._grid.vectors, self._grid.samples)
+        if frame.shape != expected:
             raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
         if not np.can_cast(frame.dtype, self._dtype, "same_kind"):
             raise InvalidInputError(f"{where}: expected samples of type {self._dtype}, got {frame.dtype}")
@@ -155,8 +148,7 @@ class SweepWriter:
             compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
             shuffle=self._compression is not None,
         )
-        for name, value in _attributes(self._grid, self._signal).items():
-            node.attrs[name] = value
+        node.attrs.update(_attributes(self._grid, self._signal))
         return node
 
     def _finish(self) -> None:
@@ -248,7 +240,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool 
 def _fill_orientation(group: h5py.Group, sensor: OrientationSensor) -> None:
     group["time_s"] = sensor.readings.time_s
     group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
-    for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+    for name in INERTIAL:
         if (values := getattr(sensor, name)) is not None:
             group[name] = np.asarray(values, dtype=np.float64)
     if sensor.sensor_from_image is not None:
@@ -257,19 +249,8 @@ def _fill_orientation(group: h5py.Group, sensor: OrientationSensor) -> None:
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
+    held = vars(signal) | {"first_sample_depth_mm": grid.first_sample_depth_mm}
     if isinstance(signal, RFSettings):
-        return {
-            "sampling_rate_hz": signal.sampling_rate_hz,
-            "vector_pitch_mm": grid.vector_pitch_mm,
-            "speed_of_sound_m_s": signal.speed_of_sound_m_s,
-            "first_sample_depth_mm": grid.first_sample_depth_mm,
-            "centre_frequency_hz": signal.centre_frequency_hz,
-            "bandwidth_hz": np.asarray(signal.bandwidth_hz, dtype=float),
-        }
-    return {
-        "column_pitch_mm": grid.vector_pitch_mm,
-        "row_spacing_mm": grid.sample_spacing_mm,
-        "first_sample_depth_mm": grid.first_sample_depth_mm,
-        "dynamic_range_db": signal.dynamic_range_db,
-        "full_scale": signal.full_scale,
-    }
+        band = np.asarray(signal.bandwidth_hz, dtype=float)
+        return held | {"vector_pitch_mm": grid.vector_pitch_mm, "bandwidth_hz": band}
+    return held | {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}

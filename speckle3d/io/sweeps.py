@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
@@ -23,7 +23,15 @@ from speckle3d.core.geometry import (
     transforms_from_matrices,
 )
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import (
+    INERTIAL,
+    BModeSettings,
+    ImageGrid,
+    OrientationSensor,
+    RFSettings,
+    Sweep,
+    Tracker,
+)
 from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
@@ -44,7 +52,8 @@ KNOWN = frozenset({"rf", "bmode", "frame_time_s", "orientation", "tracker", "tru
 
 SAMPLE_TYPES = {"rf": (np.dtype(np.int16), np.dtype(np.float32)), "bmode": (np.dtype(np.uint8),)}
 
-_OPTIONAL_VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+RF_NUMBERS = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
+"""Attributes of /rf that are a number each of `RFSettings`."""
 
 
 class HDF5Frames:
@@ -181,65 +190,56 @@ def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BM
 def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BModeSettings:
     """Read how the samples were made from attributes; `kind` is ``"rf"`` or ``"bmode"``."""
     if kind == "bmode":
-        return BModeSettings(
-            dynamic_range_db=read_attribute(node, "dynamic_range_db"),
-            full_scale=read_attribute(node, "full_scale", default=255.0),
-        )
-    band = read_vector_attribute(node, "bandwidth_hz", 2)
-    if band is None:
-        raise InvalidInputError("expected attribute bandwidth_hz, got none")
-    return RFSettings(
-        sampling_rate_hz=read_attribute(node, "sampling_rate_hz"),
-        speed_of_sound_m_s=read_attribute(node, "speed_of_sound_m_s"),
-        centre_frequency_hz=read_attribute(node, "centre_frequency_hz"),
-        bandwidth_hz=(float(band[0]), float(band[1])),
-    )
+        dynamic_range_db = read_attribute(node, "dynamic_range_db")
+        return BModeSettings(dynamic_range_db, read_attribute(node, "full_scale", default=255.0))
+    low, high = read_vector_attribute(node, "bandwidth_hz", 2).tolist()
+    return RFSettings(**{name: read_attribute(node, name) for name in RF_NUMBERS}, bandwidth_hz=(low, high))
 
 
 def _read_grid(node: h5py.Dataset, signal: RFSettings | BModeSettings) -> ImageGrid:
     _, vectors, samples = node.shape
+    first_mm = read_attribute(node, "first_sample_depth_mm")
     if isinstance(signal, RFSettings):
         pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
     else:
         pitch_mm, spacing_mm = (read_attribute(node, name) for name in ("column_pitch_mm", "row_spacing_mm"))
-    return ImageGrid(vectors, samples, pitch_mm, spacing_mm, read_attribute(node, "first_sample_depth_mm"))
+    return ImageGrid(vectors, samples, pitch_mm, spacing_mm, first_mm)
 
 
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
     group = find_group(file, "orientation")
     if group is None:
         return None
-    time_s = _read_clock(group)
+    time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
     quaternions = read_checked(group, "quaternion_wxyz", (time_s.size, 4))
     rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
-    wxyz = read_vector_attribute(group, "sensor_from_image_wxyz", 4)
-    vectors = {name: _read_vectors(group, name, time_s.size) for name in _OPTIONAL_VECTORS if name in group}
+    vectors = {name: _read_vectors(group, name, time_s.size) for name in INERTIAL if name in group}
+    mounting, name = None, "sensor_from_image_wxyz"
+    if name in group.attrs:
+        wxyz = read_vector_attribute(group, name, 4)
+        mounting = rotations_from_quaternions(wxyz[None], f"{locate(group)} attribute {name}")[0]
+    offset_s = read_attribute(group, "time_offset_s", default=0.0)
     with naming(locate(group)):
-        return OrientationSensor(
-            readings=TimedRotations(time_s, rotations),
-            sensor_from_image=None if wxyz is None else _calibrated_rotation(wxyz),
-            time_offset_s=read_attribute(group, "time_offset_s", default=0.0),
-            **vectors,
-        )
+        return OrientationSensor(TimedRotations(time_s, rotations), mounting, offset_s, **vectors)
 
 
 def _read_tracker(file: h5py.File) -> Tracker | None:
     group = find_group(file, "tracker")
     if group is None:
         return None
-    time_s = _read_clock(group)
+    time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
     valid = _read_valid(group, time_s.size)
     matrices = read_checked(group, "world_from_sensor", (time_s.size, 4, 4))
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
-    matrix = read_vector_attribute(group, "sensor_from_image", 16)
+    mounting, name = None, "sensor_from_image"
+    if name in group.attrs:
+        matrix = read_vector_attribute(group, name, 16).reshape(1, 4, 4)
+        mounting = transforms_from_matrices(matrix, f"{locate(group)} attribute {name}")[0]
+    offset_s = read_attribute(group, "time_offset_s", default=0.0)
     with naming(locate(group)):
-        return Tracker(
-            readings=TimedPoses(time_s[valid], poses[valid]),
-            sensor_from_image=None if matrix is None else _calibrated_pose(matrix),
-            time_offset_s=read_attribute(group, "time_offset_s", default=0.0),
-        )
+        return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s)
 
 
 def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:
@@ -248,10 +248,6 @@ def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:
         return None
     matrices = read_checked(group, "world_from_image", (frames, 4, 4))
     return transforms_from_matrices(matrices, locate(group, "world_from_image"))
-
-
-def _read_clock(group: h5py.Group) -> FloatArray:
-    return require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
 
 
 def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
@@ -267,11 +263,3 @@ def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
     if samples and not valid.any():
         raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
     return valid
-
-
-def _calibrated_rotation(wxyz: FloatArray) -> Rotation:
-    return rotations_from_quaternions(wxyz[None], "attribute sensor_from_image_wxyz")[0]
-
-
-def _calibrated_pose(flat: FloatArray) -> RigidTransform:
-    return transforms_from_matrices(flat.reshape(1, 4, 4), "attribute sensor_from_image")[0]
