@@ -64,32 +64,17 @@ class Landmarks:
         return int(self.frame.size)
 
 
-class ScanFrames:
+class ScanFrames(HDF5Frames):
     """Frames of a scan, read one at a time and turned to (vector, sample)."""
-
-    def __init__(self, stored: HDF5Frames) -> None:
-        self._stored = stored
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
-        n, height, width = self._stored.shape
+        n, height, width = self.stored_shape
         return n, width, height
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Sample type."""
-        return self._stored.dtype
-
-    def __len__(self) -> int:
-        return len(self._stored)
-
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return np.ascontiguousarray(self._stored[index].T)
-
-    def close(self) -> None:
-        """Close the file if it is open; the next frame opens it again."""
-        self._stored.close()
+        return np.ascontiguousarray(super().__getitem__(index).T)
 
 
 def is_challenge_scan(file: h5py.File) -> bool:
@@ -166,7 +151,7 @@ def _frames(scan: Path) -> ScanFrames:
             raise InvalidInputError(
                 f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
             )
-        return ScanFrames(HDF5Frames(scan, "frames", node.shape, node.dtype))
+        return ScanFrames(scan, "frames", node.shape, node.dtype)
 
 
 def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:

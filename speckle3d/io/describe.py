@@ -13,8 +13,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
-from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
@@ -23,7 +22,6 @@ from speckle3d.io.headers import read_header
 from speckle3d.io.load import IMAGE, kind_of
 from speckle3d.io.metaimage import image_orientation, image_type
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweeps import open_sweep
 
 Row = tuple[str, str, str]
 """Description, value, unit."""
@@ -55,11 +53,6 @@ def _describe_scan(path: PathLike) -> list[Row]:
         *_sweep_rows(challenge.read_challenge_scan(path)),
         ("landmarks", str(0 if marks is None else len(marks)), ""),
     ]
-
-
-def _describe_sweep(path: PathLike) -> list[Row]:
-    with open_sweep(path) as sweep:
-        return _sweep_rows(sweep)
 
 
 def _sweep_rows(sweep: Sweep) -> list[Row]:
@@ -120,7 +113,9 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
     result = read_reconstruction(path)
     rows = [("frames", str(result.frame_time_s.size), "")]
     rows += _rate_rows("", result.frame_time_s, "frames/s") if result.frame_time_s.size else []
-    rows += [(f"length, mode {mode}", f"{_length_mm(result, mode):.2f}", "mm") for mode in result.poses]
+    for mode, poses in result.poses.items() if result.frame_time_s.size else ():
+        length_mm = abs(elevational_steps(poses, result.grid.centre_mm).sum())
+        rows.append((f"length, mode {mode}", f"{length_mm:.2f}", "mm"))
     pairs = result.pairs
     return [
         *rows,
@@ -131,14 +126,6 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
         ("package version", result.provenance.package_version, ""),
         *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
     ]
-
-
-def _length_mm(result: Reconstruction, mode: str) -> float:
-    """Elevational travel of the image's centre, summed from frame to frame."""
-    if result.frame_time_s.size < 2:
-        return 0.0
-    centre = result.grid.centre_mm
-    return float(abs((relative_poses(result.poses[mode]).apply(centre) - centre)[:, 2].sum()))
 
 
 def _describe_calibration(path: PathLike) -> list[Row]:
@@ -222,7 +209,7 @@ def _describe_header(path: PathLike) -> list[Row]:
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
-    sweeps.FORMAT: _describe_sweep,
+    sweeps.FORMAT: lambda path: _sweep_rows(sweeps.read_sweep(path)),
     reconstructions.FORMAT: _describe_reconstruction,
     curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,

@@ -34,27 +34,6 @@ _SIZE_LIMIT_BYTES = 2**26
 
 
 @dataclass(frozen=True)
-class Clip:
-    """The part of an image in which dots are looked for, in pixels."""
-
-    column: int
-    row: int
-    columns: int
-    rows: int
-
-    def __post_init__(self) -> None:
-        if min(self.column, self.row) < 0 or min(self.columns, self.rows) < 1:
-            raise InvalidInputError(f"clip: expected a rectangle inside an image, got {self}")
-
-    @property
-    def corners_px(self) -> FloatArray:
-        """Column and row of the centres of its corner pixels, clockwise from the top left, shape (4, 2)."""
-        left, right = float(self.column), float(self.column + self.columns - 1)
-        top, bottom = float(self.row), float(self.row + self.rows - 1)
-        return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-
-
-@dataclass(frozen=True)
 class WireConfig:
     """What a device set says about a wire phantom and the images of it.
 
@@ -64,12 +43,14 @@ class WireConfig:
         With ``world_from_phantom`` where the file holds it; the world is PLUS's reference frame.
     pixel_mm : float, optional
         Roughly, as somebody read it off the machine.
-    clip : Clip, optional
+    clip_px : ndarray, shape (4, 2), optional
+        The part of an image in which dots are looked for: column and row of the centres of its corner pixels,
+        clockwise from the top left.
     """
 
     phantom: WirePhantom
     pixel_mm: float | None = None
-    clip: Clip | None = None
+    clip_px: FloatArray | None = None
 
 
 def read_wire_phantom(path: PathLike) -> WireConfig:
@@ -91,7 +72,7 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
         segmentation = root.find(".//Segmentation")
         if segmentation is None:
             return WireConfig(phantom)
-        return WireConfig(phantom, _pixel_mm(segmentation), _clip(segmentation))
+        return WireConfig(phantom, _pixel_mm(segmentation), _clip_px(segmentation))
 
 
 def _wires(
@@ -158,13 +139,16 @@ def _pixel_mm(segmentation: Element) -> float | None:
     return spacing
 
 
-def _clip(segmentation: Element) -> Clip | None:
+def _clip_px(segmentation: Element) -> FloatArray | None:
     if not {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
         return None
-    column, row = _vector(segmentation, "ClipRectangleOrigin", 2)
-    columns, rows = _vector(segmentation, "ClipRectangleSize", 2)
-    with naming("Segmentation"):
-        return Clip(int(column), int(row), int(columns), int(rows))
+    left, top = map(int, _vector(segmentation, "ClipRectangleOrigin", 2))
+    columns, rows = map(int, _vector(segmentation, "ClipRectangleSize", 2))
+    if min(left, top) < 0 or min(columns, rows) < 1:
+        got = f"{columns} x {rows} from {left}, {top}"
+        raise InvalidInputError(f"Segmentation: clip: expected a rectangle inside an image, got {got}")
+    right, bottom = left + columns - 1, top + rows - 1
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
 
 
 def _read_xml(path: PathLike) -> Element:

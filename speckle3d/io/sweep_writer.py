@@ -208,7 +208,7 @@ def write_sweep(
             writer.write_truth(sweep.truth)
         if simulation is not None:
             writer.write_simulation(simulation)
-        if isinstance(sweep.frames, HDF5Frames):
+        if type(sweep.frames) is HDF5Frames:
             writer.copy_unknown(sweep.frames.path)
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import operator
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -65,24 +63,17 @@ class HDF5Frames:
 
     def __init__(self, path: PathLike, name: str, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self.path = Path(path).absolute()
-        self.name = name
-        self._shape = shape
-        self._dtype = dtype
+        self.name, self.stored_shape, self.dtype = name, shape, dtype
         self._open: _OpenFrames | None = None
         self._lock = threading.Lock()
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
-        return self._shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Sample type."""
-        return self._dtype
+        return self.stored_shape
 
     def __len__(self) -> int:
-        return self._shape[0]
+        return self.stored_shape[0]
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         i = operator.index(index)
@@ -104,11 +95,8 @@ class HDF5Frames:
                 self._open.file.close()
                 self._open = None
 
-    def __getstate__(self) -> tuple[Any, ...]:
-        return self.path, self.name, self._shape, self._dtype
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.__init__(*state)  # type: ignore[misc]
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, self.name, self.stored_shape, self.dtype)
 
 
 class _OpenFrames:
@@ -120,7 +108,7 @@ class _OpenFrames:
 
     def __init__(self, frames: HDF5Frames) -> None:
         self.file = open_hdf5(frames.path)
-        self._frame_shape, self._dtype = frames.shape[1:], frames.dtype
+        self._frame_shape, self._dtype = frames.stored_shape[1:], frames.dtype
         self._node = self.file[frames.name].id
         self._on_disk = self._node.get_space()
         self._in_memory = h5py.h5s.create_simple(self._frame_shape)
@@ -157,17 +145,6 @@ def read_sweep(path: PathLike) -> Sweep:
             truth=_read_truth(file, n),
             name=Path(path).stem,
         )
-
-
-@contextmanager
-def open_sweep(path: PathLike) -> Iterator[Sweep]:
-    """Read a sweep file for the length of a block, then close it."""
-    sweep = read_sweep(path)
-    try:
-        yield sweep
-    finally:
-        if isinstance(sweep.frames, HDF5Frames):
-            sweep.frames.close()
 
 
 def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
