@@ -110,7 +110,15 @@ def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransfo
 
     The challenge counts pixels from 1; here the image's origin is the first pixel.
     """
-    matrices = _calibration_rows(path).reshape(2, 4, 4)
+    # Lines that begin with a letter are headings.
+    rows = [
+        numbers(text.replace(",", " "), 4, f"{path}: line {number}")
+        for number, text in text_lines(path)
+        if not text[0].isalpha()
+    ]
+    if len(rows) != 8:
+        raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
+    matrices = np.reshape(rows, (2, 4, 4))
     scale = matrices[0]
     size = np.diag(scale)[:2].copy()
     if not (np.array_equal(scale, np.diag(np.diag(scale))) and (size > 0).all() and scale[3, 3] == 1):
@@ -155,12 +163,10 @@ def _frames(scan: Path) -> ScanFrames:
 
 
 def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:
-    with reading(scan), open_hdf5(scan) as file:
-        held = "tforms" in file
-    source = scan if held else _transforms_file(scan)
-    if source is None:
-        return None
+    source = _transforms_file(scan) or scan
     with reading(source), open_hdf5(source) as file:
+        if source == scan and "tforms" not in file:
+            return None
         matrices = read_checked(file, "tforms", (frames, 4, 4))
         return transforms_from_matrices(matrices, locate(file, "tforms"))
 
@@ -191,15 +197,3 @@ def _landmark_file(scan: Path) -> Path | None:
     named = f"landmark_{scan.absolute().parent.name}.h5"
     paths = (folder / kind / named for folder in _folders(scan) for kind in _LANDMARK_FOLDERS)
     return next((path for path in paths if path.is_file()), None)
-
-
-def _calibration_rows(path: PathLike) -> FloatArray:
-    """Read the eight rows of four numbers, shape (8, 4); lines that begin with a letter are headings."""
-    rows = [
-        numbers(text.replace(",", " "), 4, f"{path}: line {number}")
-        for number, text in text_lines(path)
-        if not text[0].isalpha()
-    ]
-    if len(rows) != 8:
-        raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
-    return np.array(rows)

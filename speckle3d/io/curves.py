@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import h5py
 import numpy as np
 
 from speckle3d.core.curves import PATCH_NUMBERS, CurveKey, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.sweep import BModeSettings, RFSettings
+from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
@@ -72,20 +71,16 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         cells = read_checked(file, "cells", (depth.size,))
         numbers = read_attributes(file, dict.fromkeys(PATCH_NUMBERS, float))
         of = read_text(file, "correlation_of") if "correlation_of" in file.attrs else "intensity"
-        key = CurveKey(_read_signal(file), **numbers, correlation_of=of)
+        kind = read_text(file, "signal")
+        if kind not in ("rf", "bmode"):
+            raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
+        key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of)
         pairs = int(read_attribute(file, "pairs_used", 0))
         tilt = None
         if "tilt" in file:
             names = ("tilt/pivot_mm", "tilt/spread_mm")
             tilt = TiltResponse(*(read_checked(file, name, (depth.size,)) for name in names))
         return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt)
-
-
-def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:
-    kind = read_text(file, "signal")
-    if kind not in ("rf", "bmode"):
-        raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-    return read_signal(file, kind)
 
 
 load_curves = read_curves

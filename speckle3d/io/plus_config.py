@@ -66,24 +66,19 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
     """
     root = _read_xml(path)
     with naming(str(path)):
-        names, ends, patterns = _wires(root)
-        pose = _phantom_pose(root)
-        phantom = WirePhantom.from_ends(names, np.reshape(ends, (-1, 2, 3)), patterns, pose)
+        phantom = _phantom(root)
         segmentation = root.find(".//Segmentation")
         if segmentation is None:
             return WireConfig(phantom)
         return WireConfig(phantom, _pixel_mm(segmentation), _clip_px(segmentation))
 
 
-def _wires(
-    root: Element,
-) -> tuple[tuple[str, ...], list[list[tuple[float, ...]]], tuple[tuple[int, ...], ...]]:
+def _phantom(root: Element) -> WirePhantom:
     geometry = root.find(".//PhantomDefinition/Geometry")
     if geometry is None:
         raise InvalidInputError("expected an element PhantomDefinition/Geometry, got none")
     names: list[str] = []
-    ends: list[list[tuple[float, ...]]] = []
-    patterns = []
+    ends, patterns = [], []
     for number, pattern in enumerate(geometry.findall("Pattern")):
         wires = _pattern_wires(pattern, f"Pattern[{number}]")
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
@@ -94,7 +89,8 @@ def _wires(
         raise InvalidInputError(
             "PhantomDefinition/Geometry: expected an element Pattern with wires, got none"
         )
-    return tuple(names), ends, tuple(patterns)
+    pose = _phantom_pose(root)
+    return WirePhantom.from_ends(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
 
 
 def _pattern_wires(pattern: Element, where: str) -> list[Element]:

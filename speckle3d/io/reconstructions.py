@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
 from speckle3d.core.reconstruction import (
@@ -100,8 +98,10 @@ class ReconstructionWriter(HDF5Writer):
             _create_pairs(group, pairs)
         elif not np.array_equal(group["patch_centre_mm"], pairs.patch_centre_mm):
             raise InvalidInputError(f"{where}/patch_centre_mm: expected the patches of the pairs before")
+        start = len(group["first"])
         for name in _PAIR_FIELDS:
-            _extend(group[name], getattr(pairs, name))
+            group[name].resize(start + len(pairs), axis=0)
+            group[name][start:] = getattr(pairs, name)
 
     def finish(
         self,
@@ -174,16 +174,10 @@ def _create_pairs(group: h5py.Group, pairs: FramePairs) -> None:
         )
 
 
-def _extend(node: h5py.Dataset, rows: npt.NDArray[Any]) -> None:
-    start = node.shape[0]
-    node.resize(start + len(rows), axis=0)
-    node[start:] = rows
-
-
 def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
-    lengths: dict[int | str, int | str] = {"patch": int(pairs.patch_centre_mm.shape[0])}
+    patches = len(pairs.patch_centre_mm)
     for name, (row, _) in _PAIR_FIELDS.items():
-        expected = (len(pairs), *(lengths.get(n, n) for n in row))
+        expected = (len(pairs), *(patches if n == "patch" else n for n in row))
         got = np.shape(getattr(pairs, name))
         if got != expected:
             raise InvalidInputError(f"{where}/{name}: expected shape {expected}, got {got}")
@@ -227,14 +221,10 @@ def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
     group = find_group(file, "pairs")
     if group is None:
         return None
-    first = read_checked(group, "first", ("pair",), np.int64)
-    centres: FloatArray = read_checked(group, "patch_centre_mm", ("patch", 2))
-    lengths: dict[int | str, int | str] = {"patch": len(centres)}
     values = {
-        name: read_checked(group, name, (first.size, *(lengths.get(n, n) for n in row)), dtype)
-        for name, (row, dtype) in _PAIR_FIELDS.items()
+        name: read_checked(group, name, ("pair", *row), dtype) for name, (row, dtype) in _PAIR_FIELDS.items()
     }
-    pairs = FramePairs(patch_centre_mm=centres, **values)
+    pairs = FramePairs(patch_centre_mm=read_checked(group, "patch_centre_mm", ("patch", 2)), **values)
     _check_pairs(pairs, frames, locate(group))
     transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))
     return pairs

@@ -69,8 +69,20 @@ class SweepWriter(HDF5Writer):
         self._time_s: list[float] = []
 
     def _begin(self) -> None:
-        self._frames = self._create_frames().id
-        self._in_memory = h5py.h5s.create_simple((self._grid.vectors, self._grid.samples))
+        shape = (self._grid.vectors, self._grid.samples)
+        node = self._file.create_dataset(
+            self._name,
+            shape=(0, *shape),
+            maxshape=(None, *shape),
+            chunks=(1, *shape),
+            dtype=self._dtype,
+            compression=self._compression,
+            compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
+            shuffle=self._compression is not None,
+        )
+        node.attrs.update(_attributes(self._grid, self._signal))
+        self._frames = node.id
+        self._in_memory = h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
@@ -93,19 +105,9 @@ class SweepWriter(HDF5Writer):
         self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
         self._time_s.append(float(time_s))
 
-    def write_orientation(self, sensor: OrientationSensor) -> None:
-        """Write the orientation sensor's stream."""
-        _fill_orientation(self._file.create_group("orientation"), sensor)
-
-    def write_tracker(self, tracker: Tracker) -> None:
-        """Write the 6-DOF sensor's stream."""
-        group = self._file.create_group("tracker")
-        group["time_s"] = tracker.readings.time_s
-        group["world_from_sensor"] = tracker.readings.world_from_sensor.as_matrix()
-        group["valid"] = np.ones(len(tracker.readings), dtype=bool)
-        if tracker.sensor_from_image is not None:
-            group.attrs["sensor_from_image"] = tracker.sensor_from_image.as_matrix()
-        group.attrs["time_offset_s"] = tracker.time_offset_s
+    def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
+        """Write a sensor's stream."""
+        _write_sensor(self._file, sensor)
 
     def write_truth(self, world_from_image: RigidTransform) -> None:
         """Write the true pose of every frame."""
@@ -135,21 +137,6 @@ class SweepWriter(HDF5Writer):
         self._frames.write(self._in_memory, on_disk, frame, self._kind)
         # Kept until the next frame, so that a Ctrl-C pressed meanwhile is not lost (as in HDF5Frames).
         self._on_disk = on_disk
-
-    def _create_frames(self) -> h5py.Dataset:
-        shape = (self._grid.vectors, self._grid.samples)
-        node = self._file.create_dataset(
-            self._name,
-            shape=(0, *shape),
-            maxshape=(None, *shape),
-            chunks=(1, *shape),
-            dtype=self._dtype,
-            compression=self._compression,
-            compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
-            shuffle=self._compression is not None,
-        )
-        node.attrs.update(_attributes(self._grid, self._signal))
-        return node
 
     def _finish(self) -> None:
         with naming(str(self._path)):
@@ -200,10 +187,9 @@ def write_sweep(
             writer.append(sweep.frames[i], time_s)
             if progress is not None:
                 progress(i + 1, len(sweep))
-        if sweep.orientation is not None:
-            writer.write_orientation(sweep.orientation)
-        if sweep.tracker is not None:
-            writer.write_tracker(sweep.tracker)
+        for sensor in (sweep.orientation, sweep.tracker):
+            if sensor is not None:
+                writer.write_sensor(sensor)
         if sweep.truth is not None:
             writer.write_truth(sweep.truth)
         if simulation is not None:
@@ -234,18 +220,25 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool 
         with h5py.File(part, "r+") as file:
             if "orientation" in file:
                 del file["orientation"]
-            _fill_orientation(file.create_group("orientation"), sensor)
+            _write_sensor(file, sensor)
 
 
-def _fill_orientation(group: h5py.Group, sensor: OrientationSensor) -> None:
+def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
+    group = file.create_group("tracker" if isinstance(sensor, Tracker) else "orientation")
     group["time_s"] = sensor.readings.time_s
+    group.attrs["time_offset_s"] = sensor.time_offset_s
+    if isinstance(sensor, Tracker):
+        group["world_from_sensor"] = sensor.readings.world_from_sensor.as_matrix()
+        group["valid"] = np.ones(len(sensor.readings), dtype=bool)
+        if sensor.sensor_from_image is not None:
+            group.attrs["sensor_from_image"] = sensor.sensor_from_image.as_matrix()
+        return
     group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
     for name in INERTIAL:
         if (values := getattr(sensor, name)) is not None:
             group[name] = np.asarray(values, dtype=np.float64)
     if sensor.sensor_from_image is not None:
         group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
-    group.attrs["time_offset_s"] = sensor.time_offset_s
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
@@ -47,7 +48,7 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     if not Path(path).name.lower().endswith(SUFFIXES):
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
     with atomic_path(path) as part, image_library(path, "written") as itk:
-        itk.WriteImage(_to_image(volume), str(part), useCompression=compress)
+        itk.WriteImage(_to_image(itk, volume), str(part), useCompression=compress)
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -63,30 +64,26 @@ def read_volume(path: PathLike) -> Volume:
     _require_whole(path)
     with image_library(path, "read") as itk:
         image = itk.ReadImage(str(path))
+        # ITK's arrays run (k, j, i), slowest axis first.
+        voxels = itk.GetArrayFromImage(image).T
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
         raise InvalidInputError(
             f"{path}: expected a grey image of three axes, got {image.GetDimension()} axes and "
             f"{image.GetNumberOfComponentsPerPixel()} values per pixel"
         )
     with naming(str(path)):
-        return _from_image(image)
+        return _from_image(image, voxels)
 
 
-def _to_image(volume: Volume) -> Any:
-    import SimpleITK
-
-    # ITK's arrays run (k, j, i), slowest axis first.
-    image: Any = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.voxels.transpose(2, 1, 0)))
+def _to_image(itk: Any, volume: Volume) -> Any:
+    image: Any = itk.GetImageFromArray(np.ascontiguousarray(volume.voxels.T))
     image.SetSpacing(volume.spacing_mm)
     image.SetOrigin(volume.world_from_grid.translation.tolist())
     image.SetDirection(volume.world_from_grid.rotation.as_matrix().ravel().tolist())
     return image
 
 
-def _from_image(image: Any) -> Volume:
-    import SimpleITK
-
-    voxels = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0)
+def _from_image(image: Any, voxels: npt.NDArray[Any]) -> Volume:
     matrix = np.eye(4)
     matrix[:3, :3] = np.reshape(image.GetDirection(), (3, 3))
     matrix[:3, 3] = image.GetOrigin()
