@@ -82,14 +82,8 @@ def test_frames_go_by_the_names_the_file_gives_them(tmp_path):
             {"transforms": POSE.format("Phantom", "Reference").replace("0 -1 0", "0 -2 0")},
             r"Transform Phantom to Reference: Matrix\[0\]",
         ),
-        (
-            {"transforms": '<Transform From="Phantom" To="Reference" />'},
-            "Transform Phantom: Matrix.*16",
-        ),
-        (
-            {"segmentation": SEGMENTATION.replace("0.078", "-1")},
-            "ApproximateSpacing.*-1",
-        ),
+        ({"transforms": '<Transform From="Phantom" To="Reference" />'}, "Transform Phantom: Matrix.*16"),
+        ({"segmentation": SEGMENTATION.replace("0.078", "-1")}, "ApproximateSpacing.*-1"),
         ({"segmentation": SEGMENTATION.replace("766", "0")}, "Segmentation: clip"),
     ],
 )
