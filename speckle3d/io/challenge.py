@@ -31,7 +31,15 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, locate, open_hdf5, read_checked, reading, require_dataset
+from speckle3d.io.hdf5 import (
+    PathLike,
+    locate,
+    open_hdf5,
+    read_checked,
+    read_transforms,
+    reading,
+    require_dataset,
+)
 from speckle3d.io.sweeps import HDF5Frames
 from speckle3d.io.text import numbers, text_lines
 
@@ -167,8 +175,7 @@ def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:
     with reading(source), open_hdf5(source) as file:
         if source == scan and "tforms" not in file:
             return None
-        matrices = read_checked(file, "tforms", (frames, 4, 4))
-        return transforms_from_matrices(matrices, locate(file, "tforms"))
+        return read_transforms(file, "tforms", frames)
 
 
 def _transforms_file(scan: Path) -> Path | None:

@@ -14,9 +14,11 @@ from typing import Any, Self, TypeAlias
 import h5py
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.geometry import transforms_from_matrices
 
 PathLike = str | os.PathLike[str]
 Node: TypeAlias = h5py.Group | h5py.Dataset
@@ -231,6 +233,11 @@ def require_group(group: h5py.Group, name: str) -> h5py.Group:
     if not isinstance(node, h5py.Group):
         raise InvalidInputError(f"{locate(group, name)}: expected a group, got {_kind_of(node)}")
     return node
+
+
+def read_transforms(group: h5py.Group, name: str, count: int) -> RigidTransform:
+    """Read a data set of rigid 4x4 matrices."""
+    return transforms_from_matrices(read_checked(group, name, (count, 4, 4)), locate(group, name))
 
 
 def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:

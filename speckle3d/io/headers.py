@@ -24,16 +24,8 @@ _NRRD_NAMES = {
     "ultrasound image type": "UltrasoundImageType",
 }
 
-_ELEMENT_BYTES = {
-    "MET_CHAR": 1,
-    "MET_UCHAR": 1,
-    "MET_SHORT": 2,
-    "MET_USHORT": 2,
-    "MET_INT": 4,
-    "MET_UINT": 4,
-    "MET_FLOAT": 4,
-    "MET_DOUBLE": 8,
-}
+_ELEMENT_BYTES = {"MET_CHAR": 1, "MET_SHORT": 2, "MET_INT": 4, "MET_FLOAT": 4, "MET_DOUBLE": 8}
+"""By type; those without a sign have a U before the name, as MET_UCHAR."""
 
 
 @dataclass(frozen=True)
@@ -209,7 +201,7 @@ def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) ->
         announced = header.fields.get("CompressedDataSize", "0")
         expected = int(numbers(announced, 1, f"{path}: CompressedDataSize")[0])
     else:
-        element = _ELEMENT_BYTES.get(header.fields.get("ElementType", ""), 1)
+        element = _ELEMENT_BYTES.get(header.fields.get("ElementType", "").replace("_U", "_"), 1)
         channels = int(numbers(header.fields.get("ElementNumberOfChannels", "1"), 1, f"{path}: channels")[0])
         expected = int(np.prod(header.size, dtype=object)) * element * channels
     if found < expected:

@@ -29,6 +29,7 @@ from speckle3d.io.hdf5 import (
     read_attributes,
     read_checked,
     read_texts,
+    read_transforms,
     require_group,
     write_attributes,
 )
@@ -202,11 +203,7 @@ def _read_provenance(file: h5py.File) -> Provenance:
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
     group = require_group(file, "poses")
-    return {
-        mode: transforms_from_matrices(read_checked(group, mode, (frames, 4, 4)), locate(group, mode))
-        for mode in MODES
-        if mode in group
-    }
+    return {mode: read_transforms(group, mode, frames) for mode in MODES if mode in group}
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:

@@ -38,6 +38,7 @@ from speckle3d.io.hdf5 import (
     opened,
     read_attribute,
     read_checked,
+    read_transforms,
     read_vector_attribute,
     reading,
     require_dataset,
@@ -221,10 +222,7 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
 
 def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:
     group = find_group(file, "truth")
-    if group is None:
-        return None
-    matrices = read_checked(group, "world_from_image", (frames, 4, 4))
-    return transforms_from_matrices(matrices, locate(group, "world_from_image"))
+    return None if group is None else read_transforms(group, "world_from_image", frames)
 
 
 def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
