@@ -254,7 +254,6 @@ def _attach(
         mounting = known.rotation
         if known.time_offset_s is not None and time_offset_s == 0.0:
             time_offset_s = known.time_offset_s
-            require_finite_offset(time_offset_s)
     kept = np.isin(log.time_s, rotations.time_s)
     vectors = {}
     for name in INERTIAL:
@@ -263,7 +262,7 @@ def _attach(
         vectors[name] = values[kept] if whole and kept.sum() == len(rotations) else None
     sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
     covered = _cover(sweep_file, sensor, replace_stream)
-    attach_orientation(sweep_file, sensor, replace_stream)
+    attach_orientation(sweep_file, sensor)
     note(f"orientation of {len(rotations)} samples in {sweep_file}{covered}")
 
 

@@ -56,7 +56,7 @@ def correct_mode(
     times = sweep.frame_time_s[covered]
     with naming(sweep.name):
         if isinstance(sensor, Tracker) and mode == "pose":
-            measured = sensor.world_from_image(times)
-            return correct_pose(world_from_image, measured, covered, sweep.grid.corners_mm, settings)
+            poses = sensor.world_from_image(times)
+            return correct_pose(world_from_image, poses, covered, sweep.grid.corners_mm, settings)
         rotation = image_orientation(sensor, times)
         return correct_orientation(world_from_image, rotation, covered, sweep.grid.centre_mm, settings)

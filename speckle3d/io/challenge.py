@@ -17,6 +17,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -184,13 +185,15 @@ def _transforms_file(scan: Path) -> Path | None:
     return beside if subject.parent.name == "frames" and beside.is_file() else None
 
 
-def _folders(scan: Path) -> list[Path]:
-    return list(scan.absolute().parents)[:_LEVELS]
+def _nearby(scan: Path, names: Iterable[str]) -> Path | None:
+    """First file of these names beside or above a scan."""
+    folders = list(scan.absolute().parents)[:_LEVELS]
+    paths = (folder / name for folder in folders for name in names)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _calibration_file(scan: Path) -> Path | None:
-    named = (folder / _CALIBRATION for folder in _folders(scan))
-    return next((path for path in named if path.is_file()), None)
+    return _nearby(scan, [_CALIBRATION])
 
 
 def _require_calibration(scan: Path) -> Path:
@@ -201,6 +204,5 @@ def _require_calibration(scan: Path) -> Path:
 
 
 def _landmark_file(scan: Path) -> Path | None:
-    named = f"landmark_{scan.absolute().parent.name}.h5"
-    paths = (folder / kind / named for folder in _folders(scan) for kind in _LANDMARK_FOLDERS)
-    return next((path for path in paths if path.is_file()), None)
+    subject = scan.absolute().parent.name
+    return _nearby(scan, [f"{folder}/landmark_{subject}.h5" for folder in _LANDMARK_FOLDERS])

@@ -48,11 +48,8 @@ def describe(path: PathLike) -> list[Row]:
 
 
 def _describe_scan(path: PathLike) -> list[Row]:
-    marks = challenge.read_landmarks(path)
-    return [
-        *_sweep_rows(challenge.read_challenge_scan(path)),
-        ("landmarks", str(0 if marks is None else len(marks)), ""),
-    ]
+    marks = str(len(challenge.read_landmarks(path) or ()))
+    return [*_sweep_rows(challenge.read_challenge_scan(path)), ("landmarks", marks, "")]
 
 
 def _sweep_rows(sweep: Sweep) -> list[Row]:

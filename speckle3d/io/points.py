@@ -174,8 +174,6 @@ def _writable(name: str) -> str:
 
 
 def _label(wire: int, names: list[str]) -> str:
-    if not names:
-        return str(wire)
-    if wire >= len(names):
+    if names and wire >= len(names):
         raise InvalidInputError(f"wire: expected one of {len(names)} wires, got number {wire}")
-    return names[wire]
+    return names[wire] if names else str(wire)

@@ -24,7 +24,7 @@ from speckle3d.core.sweep import (
     Tracker,
 )
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
-from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames
+from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None
 Progress = Callable[[int, int], None]
@@ -60,11 +60,7 @@ class SweepWriter(HDF5Writer):
         self._grid, self._signal = grid, signal
         self._name = "rf" if isinstance(signal, RFSettings) else "bmode"
         self._dtype = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
-        if self._dtype not in SAMPLE_TYPES[self._name]:
-            expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[self._name])
-            raise InvalidInputError(
-                f"{path}: expected {self._name} samples of type {expected}, got {self._dtype}"
-            )
+        require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
         self._compression = compression
         self._time_s: list[float] = []
 
@@ -198,8 +194,8 @@ def write_sweep(
             writer.copy_unknown(sweep.frames.path)
 
 
-def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool = False) -> None:
-    """Put an orientation sensor's stream into a sweep file that is already there.
+def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
+    """Put an orientation sensor's stream into a sweep file, in place of the one it may hold.
 
     The file is copied, changed and put back in one step, so that it is never half written.
 
@@ -208,17 +204,14 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool 
     FileError
         If the file cannot be read or written.
     InvalidInputError
-        If it is no sweep file, or has a stream already and `replace` is not given.
+        If it is no sweep file.
     """
     with opened(path, FORMAT, VERSION) as file:
-        if "orientation" in file and not replace:
-            raise InvalidInputError(
-                f"{path}: expected a sweep without an orientation stream, got one: ask to replace it"
-            )
+        held = "orientation" in file
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
         with h5py.File(part, "r+") as file:
-            if "orientation" in file:
+            if held:
                 del file["orientation"]
             _write_sensor(file, sensor)
 

@@ -154,15 +154,21 @@ def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BM
         raise InvalidInputError(f"{locate(file)}: expected a data set rf or bmode, got neither")
     node = require_dataset(file, name)
     where = locate(file, name)
-    if node.dtype.newbyteorder("=") not in SAMPLE_TYPES[name]:
-        expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
-        raise InvalidInputError(f"{where}: expected samples of type {expected}, got {node.dtype}")
+    dtype = node.dtype.newbyteorder("=")
+    require_sample_type(name, dtype, where)
     if node.ndim != 3 or 0 in node.shape:
         raise InvalidInputError(f"{where}: expected shape (frame, vector, sample), got {node.shape}")
-    frames = HDF5Frames(file.filename, name, node.shape, node.dtype.newbyteorder("="))
+    frames = HDF5Frames(file.filename, name, node.shape, dtype)
     with naming(where):
         signal = read_signal(node, name)
         return frames, _read_grid(node, signal), signal
+
+
+def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
+    """Raise `InvalidInputError` unless /rf or /bmode may hold samples of a type."""
+    if dtype not in SAMPLE_TYPES[name]:
+        expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
+        raise InvalidInputError(f"{where}: expected samples of type {expected}, got {dtype}")
 
 
 def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BModeSettings:
