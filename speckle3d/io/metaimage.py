@@ -308,18 +308,17 @@ def _to_samples(header: SequenceHeader, pixels: npt.NDArray[Any]) -> npt.NDArray
     ndarray
         uint8 for B-mode, int16 or float32 for RF, complex64 for I and Q.
     """
-    kind = image_type(header)
-    orientation = image_orientation(header)
+    kind, orientation = image_type(header), image_orientation(header)
     if kind not in (*_RF_TYPES, "BRIGHTNESS"):
         raise InvalidInputError(f"{header.path}: expected a grey B-mode or RF image, got type {kind}")
-    if kind == "BRIGHTNESS":
-        if pixels.dtype != np.uint8:
-            raise InvalidInputError(f"{header.path}: expected B-mode of type uint8, got {pixels.dtype}")
-        return _oriented(header.path, pixels, orientation)
+    if kind == "BRIGHTNESS" and pixels.dtype != np.uint8:
+        raise InvalidInputError(f"{header.path}: expected B-mode of type uint8, got {pixels.dtype}")
     if kind == "RF_REAL":
-        return _oriented(header.path, _narrowed(pixels), orientation)
-    frames = _oriented(header.path, _analytic(header.path, pixels, orientation, kind), orientation)
-    return _positive_carrier(frames)
+        pixels = _narrowed(pixels)
+    elif kind in _RF_TYPES:
+        pixels = _analytic(header.path, pixels, orientation, kind)
+    frames = _oriented(header.path, pixels, orientation)
+    return _positive_carrier(frames) if np.iscomplexobj(frames) else frames
 
 
 def _oriented(path: str, pixels: npt.NDArray[Any], orientation: str) -> npt.NDArray[Any]:
