@@ -10,7 +10,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from speckle3d.cli import (
+# Importing a module of commands registers them.
+from speckle3d.cli import (  # noqa: F401
     calibrate_clock,
     calibrate_curves,
     calibrate_images,
@@ -25,20 +26,7 @@ from speckle3d.cli import (
 from speckle3d.cli.common import app
 from speckle3d.core.errors import Speckle3DError
 
-__all__ = [
-    "app",
-    "calibrate_clock",
-    "calibrate_curves",
-    "calibrate_images",
-    "calibrate_phantoms",
-    "compare",
-    "files",
-    "imu",
-    "imu_accuracy",
-    "main",
-    "reconstruction",
-    "trajectory",
-]
+__all__ = ["app", "main"]
 
 _STOPPED = 130
 """Exit code after Ctrl-C, as shells have it."""

@@ -301,7 +301,7 @@ def _seen_wires(
     with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
         if config is None:
             return Seen.crossings(recording, corners, progress)
-        clip = config.clip.corners_px if corners is None and config.clip is not None else corners
+        clip = config.clip_px if corners is None else corners
         return Seen.nwires(recording, config.phantom, clip, progress)
 
 

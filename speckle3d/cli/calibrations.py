@@ -15,11 +15,10 @@ if TYPE_CHECKING:
 
     from calibration.beam import BeamBias
     from speckle3d.core.calibration import Calibration
-    from speckle3d.core.sweep import ImageGrid, Sweep
+    from speckle3d.core.sweep import Sweep
 
 _BESIDE = (".txt", ".png", ".csv")
 """What lies beside a calibration file: its table, its pictures, and the dots it was made from."""
-
 
 NOTED_SIZE = 0.01
 """Relative difference of pixel sizes that is reported: 0.4 mm over an image of 40 mm."""
@@ -143,9 +142,11 @@ def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
 
 
 def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> None:
-    from speckle3d.core.calibration import pixel_difference
+    from speckle3d.core.calibration import mounting_difference, pixel_difference
+    from speckle3d.matching.intensity import IntensityExtractor
 
-    grid, pixel_mm = _image_grid(sweep), calibration.pixel_mm
+    # A calibration counts the pixels of images; RF has more samples than they.
+    grid, pixel_mm = IntensityExtractor.for_sweep(sweep).grid, calibration.pixel_mm
     if pixel_mm is not None and pixel_difference(grid, calibration) > NOTED_SIZE:
         note(
             f"{path}: found pixels of {pixel_mm[0]:.4g} x {pixel_mm[1]:.4g} mm, "
@@ -156,13 +157,6 @@ def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> Non
     held_s, found_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
     if held_s and found_s is not None and abs(found_s - held_s) > NOTED_OFFSET_S:
         note(f"{path}: time offset {found_s:+.4f} s is used, not the sweep's {held_s:+.4f} s")
-    _note_mounting(sweep, path, calibration)
-
-
-def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
-    """Report a mounting that is far from the sweep's own."""
-    from speckle3d.core.calibration import mounting_difference
-
     turned_deg, moved_mm = mounting_difference(sweep, calibration)
     if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
         moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""
@@ -170,10 +164,3 @@ def _note_mounting(sweep: Sweep, path: Path, calibration: Calibration) -> None:
             f"{path}: puts the image {turned_deg:.0f} degrees{moved} from where the sweep has it on the "
             f"{calibration.sensor} sensor, and is used: is it of this mounting?"
         )
-
-
-def _image_grid(sweep: Sweep) -> ImageGrid:
-    """Return the grid of the images, whose pixels a calibration counts; RF has more samples than they."""
-    from speckle3d.matching.intensity import IntensityExtractor
-
-    return IntensityExtractor.for_sweep(sweep).grid

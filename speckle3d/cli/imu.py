@@ -17,7 +17,6 @@ from speckle3d.core.errors import InvalidInputError, naming
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from speckle3d.core.arrays import FloatArray
     from speckle3d.core.streams import TimedRotations
     from speckle3d.core.sweep import OrientationSensor
     from xsens.fusion.orient import Orientation
@@ -61,6 +60,8 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> No
     """Tell what a log holds, what is missing and what was skipped."""
     import numpy as np
 
+    from speckle3d.core.sweep import INERTIAL
+
     log = read(log_file, rate_hz)
     rows = [
         ("samples", str(len(log)), ""),
@@ -71,19 +72,13 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> No
         ("longest gap", f"{max((gap.duration_s for gap in log.gaps), default=0.0):.3f}", "s"),
         ("own orientation", str(int(log.oriented.sum())), "samples"),
     ]
-    for name, unit in (
-        ("accelerometer_m_s2", "m/s^2"),
-        ("gyroscope_rad_s", "rad/s"),
-        ("magnetometer_au", "a.u."),
-    ):
-        values = getattr(log, name)
-        spoken = name.split("_")[0]
+    for name, unit in zip(INERTIAL, ("m/s^2", "rad/s", "a.u."), strict=True):
+        values, spoken = getattr(log, name), name.split("_")[0]
         if values is None or np.isnan(values).all():
             rows.append((spoken, "none", ""))
         else:
-            rows.append(
-                (f"{spoken}, median norm", f"{np.nanmedian(np.linalg.norm(values, axis=1)):.4f}", unit)
-            )
+            norm = np.nanmedian(np.linalg.norm(values, axis=1))
+            rows.append((f"{spoken}, median norm", f"{norm:.4f}", unit))
     rows += [("note", text, "") for text in log.notes]
     emit_rows(rows, as_json)
 
@@ -142,8 +137,8 @@ def imu_orient(
     rows = _orientation_rows(log, rotations, found)
     if as_json:
         emit_json({name: value for name, value, _ in rows})
-    else:
-        emit_rows([(name, f"{value:.5g}", unit) for name, value, unit in rows], as_json)
+        return
+    emit_rows([(name, f"{value:.5g}", unit) for name, value, unit in rows], as_json)
 
 
 @imu.command("record")
@@ -249,57 +244,50 @@ def _attach(
 ) -> None:
     import numpy as np
 
-    from speckle3d.core.sweep import OrientationSensor
+    from speckle3d.core.sweep import INERTIAL, OrientationSensor
     from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.sweep_writer import attach_orientation
 
-    frame_time_s = _frame_times(sweep_file, replace_stream)
     mounting: Rotation | None = None
     if calibration is not None:
         known = read_calibration(calibration)
         mounting = known.rotation
         if known.time_offset_s is not None and time_offset_s == 0.0:
             time_offset_s = known.time_offset_s
-            require_finite_offset(time_offset_s)
     kept = np.isin(log.time_s, rotations.time_s)
     vectors = {}
-    for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+    for name in INERTIAL:
         values = getattr(log, name)
         whole = values is not None and bool(np.isfinite(values[kept]).all())
         vectors[name] = values[kept] if whole and kept.sum() == len(rotations) else None
     sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
-    covered = _require_cover(sweep_file, sensor, frame_time_s)
-    attach_orientation(sweep_file, sensor, replace_stream)
+    covered = _cover(sweep_file, sensor, replace_stream)
+    attach_orientation(sweep_file, sensor)
     note(f"orientation of {len(rotations)} samples in {sweep_file}{covered}")
 
 
-def _frame_times(sweep_file: Path, replace_stream: bool) -> FloatArray | None:
-    """Read the frame times of a sweep; None if the stream to be replaced cannot be read."""
+def _cover(sweep_file: Path, sensor: OrientationSensor, replace_stream: bool) -> str:
+    """Tell how many frames the stream covers; refuse one that covers none, or replaces one unasked."""
     from speckle3d.io.load import load_sweep
 
     try:
         sweep = load_sweep(sweep_file)
     except InvalidInputError:
         if replace_stream:
-            return None
+            return ""
         raise
     if sweep.orientation is not None and not replace_stream:
         raise InvalidInputError(
             f"{sweep_file}: expected no orientation sensor's stream, got one: --replace replaces it"
         )
-    return sweep.frame_time_s
-
-
-def _require_cover(sweep_file: Path, sensor: OrientationSensor, frame_time_s: FloatArray | None) -> str:
-    """Tell how many frames the stream covers, and refuse a stream that covers none."""
-    if frame_time_s is None:
-        return ""
-    covered = f"covers {int(sensor.covers(frame_time_s).sum())} of {frame_time_s.size} frames"
-    if not sensor.covers(frame_time_s).any():
+    times_s = sweep.frame_time_s
+    frames = int(sensor.covers(times_s).sum())
+    covered = f"covers {frames} of {times_s.size} frames"
+    if not frames:
         first, last = sensor.readings.time_s[[0, -1]] + sensor.time_offset_s
         raise InvalidInputError(
-            f"{sweep_file}: expected a stream that covers frames of the sweep, {frame_time_s[0]:.3f} to "
-            f"{frame_time_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s: {covered}"
+            f"{sweep_file}: expected a stream that covers frames of the sweep, {times_s[0]:.3f} to "
+            f"{times_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s: {covered}"
         )
     return f": {covered}"
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import ImageGrid, Sweep
 
 SENSORS = ("tracker", "orientation")
 
@@ -179,9 +180,14 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     >>> speckle3d.calibrated(sweep, calibration).orientation.time_offset_s
     0.02
     """
-    if calibration.sensor == "tracker":
-        return replace(sweep, tracker=_tracker(sweep, calibration))
-    return replace(sweep, orientation=_orientation(sweep, calibration))
+    name, known_s = calibration.sensor, calibration.time_offset_s
+    held = sweep.tracker if name == "tracker" else sweep.orientation
+    if held is None:
+        raise MismatchError(f"{sweep.name}: expected the calibration's sensor, {name}, got none")
+    mounting = calibration.sensor_from_image if name == "tracker" else calibration.rotation
+    offset_s = held.time_offset_s if known_s is None else known_s
+    mounted: Any = replace(held, sensor_from_image=mounting, time_offset_s=offset_s)  # type: ignore[arg-type]
+    return replace(sweep, **{name: mounted})
 
 
 def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
@@ -206,23 +212,3 @@ def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, 
 
 def _apart_deg(one: Rotation, other: Rotation) -> float:
     return float(np.rad2deg((one.inv() * other).magnitude()))
-
-
-def _tracker(sweep: Sweep, calibration: Calibration) -> Tracker:
-    held = sweep.tracker
-    if held is None:
-        raise MismatchError(f"{sweep.name}: expected the calibration's sensor, a tracker, got none")
-    offset_s = _known(calibration.time_offset_s, held.time_offset_s)
-    return replace(held, sensor_from_image=calibration.sensor_from_image, time_offset_s=offset_s)
-
-
-def _orientation(sweep: Sweep, calibration: Calibration) -> OrientationSensor:
-    held = sweep.orientation
-    if held is None:
-        raise MismatchError(f"{sweep.name}: expected the calibration's sensor, of orientation, got none")
-    offset_s = _known(calibration.time_offset_s, held.time_offset_s)
-    return replace(held, sensor_from_image=calibration.rotation, time_offset_s=offset_s)
-
-
-def _known(found_s: float | None, held_s: float) -> float:
-    return held_s if found_s is None else found_s

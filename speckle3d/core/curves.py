@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings, RFSettings
+
+PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
+"""Numbers in a `CurveKey` beside those of the signal."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,12 @@ class CurveKey:
 
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
-        for name, mine, theirs in _differing(self, other):
-            raise MismatchError(f"{what}: {name} is {mine} and {theirs}")
+        others = _settings(other)
+        for name, mine in _settings(self).items():
+            theirs = others[name]
+            exact = isinstance(mine, str)
+            if not (mine == theirs if exact else np.allclose(mine, theirs, rtol=1e-3, atol=1e-9)):
+                raise MismatchError(f"{what}: {name} is {mine} and {theirs}")
 
 
 @dataclass(frozen=True)
@@ -120,18 +127,7 @@ class DecorrelationCurves:
         )
 
 
-def _differing(a: CurveKey, b: CurveKey) -> Iterable[tuple[str, object, object]]:
-    if type(a.signal) is not type(b.signal):
-        mine, theirs = ("RF" if isinstance(each.signal, RFSettings) else "B-mode" for each in (a, b))
-        yield "signal", mine, theirs
-        return
-    if a.correlation_of != b.correlation_of:
-        yield "correlation_of", a.correlation_of, b.correlation_of
-        return
-    names = vars(a.signal).keys()
-    pairs = [(name, getattr(a.signal, name), getattr(b.signal, name)) for name in names]
-    own = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
-    pairs += [(name, getattr(a, name), getattr(b, name)) for name in own]
-    for name, mine, theirs in pairs:
-        if not np.allclose(np.asarray(mine, float), np.asarray(theirs, float), rtol=1e-3, atol=1e-9):
-            yield name, mine, theirs
+def _settings(key: CurveKey) -> dict[str, Any]:
+    kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
+    numbers = {name: getattr(key, name) for name in PATCH_NUMBERS}
+    return {"signal": kind, "correlation_of": key.correlation_of} | vars(key.signal) | numbers

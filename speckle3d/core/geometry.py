@@ -55,6 +55,12 @@ def relative_poses(world_from_image: RigidTransform) -> RigidTransform:
     return world_from_image[:-1].inv() * world_from_image[1:]
 
 
+def elevational_steps(world_from_image: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Signed travel of the image centre along the previous frame's z, shape (n - 1,), mm."""
+    steps = relative_poses(world_from_image).apply(centre_mm) - centre_mm
+    return np.asarray(steps[:, 2])
+
+
 def mirrored(world_from_image: RigidTransform) -> RigidTransform:
     """The same motion seen in a mirror in the first image's plane: elevation, tilt and yaw change sign.
 

@@ -18,6 +18,11 @@ from speckle3d.core.errors import InvalidInputError
 
 Residuals = Callable[[FloatArray], FloatArray]
 
+_MOST_EVALUATIONS = 200
+
+_ROUNDING = 1e-9
+"""Standard deviation below which the residuals of robust fits are rounding errors."""
+
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -64,7 +69,6 @@ def levenberg_marquardt(
     jacobian: Residuals | None = None,
     names: Sequence[str] = (),
     tolerance: float = 1e-10,
-    max_evaluations: int = 200,
 ) -> Fit:
     """Minimise the sum of squared residuals by SciPy's MINPACK, its columns scaled by the Jacobian's.
 
@@ -104,7 +108,7 @@ def levenberg_marquardt(
         xtol=tolerance,
         ftol=tolerance,
         gtol=tolerance,
-        max_nfev=max_evaluations,
+        max_nfev=_MOST_EVALUATIONS,
     )
     jac = np.asarray(found.jac)
     return Fit(
@@ -171,25 +175,14 @@ class RobustFit:
         ``matrix @ parameters - wanted``.
     weights : ndarray, shape (n,)
         With which the parameters were found.
-    sigma : float
-        Robust standard deviation of the residuals, of their norm where they come in groups.
     rank : int
         Of the weighted matrix.
-    normal : ndarray, shape (p, p)
-        Normal matrix of the weighted equations.
     """
 
     parameters: FloatArray
     residuals: FloatArray
     weights: FloatArray
-    sigma: float
     rank: int
-    normal: FloatArray
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the parameters, shape (p, p); fails where they are not determined."""
-        return np.asarray(np.linalg.inv(self.normal) * self.sigma**2)
 
 
 def robust_linear(
@@ -198,7 +191,6 @@ def robust_linear(
     weights: Callable[[FloatArray], FloatArray] = huber_weights,
     rounds: int = 5,
     rcond: float | None = None,
-    smallest_sigma: float = 1e-9,
 ) -> RobustFit:
     """Solve linear equations, some of which may be wrong, by iteratively reweighted least squares.
 
@@ -214,8 +206,6 @@ def robust_linear(
         Number of solutions; the first has equal weights.
     rcond : float, optional
         Ratio of singular values below which a direction counts as not determined; see `numpy.linalg.lstsq`.
-    smallest_sigma : float
-        Standard deviation below which residuals are rounding errors.
 
     References
     ----------
@@ -236,15 +226,12 @@ def robust_linear(
     weight = np.ones(len(wanted))
     for left in range(rounds, 0, -1):
         root = np.repeat(np.sqrt(weight), group)
-        weighted = rows * root[:, None]
-        found, _, rank, _ = np.linalg.lstsq(weighted, values * root, rcond=rcond)
+        found, _, rank, _ = np.linalg.lstsq(rows * root[:, None], values * root, rcond=rcond)
         residuals = rows @ found - values
-        size = np.abs(residuals) if group == 1 else np.linalg.norm(residuals.reshape(-1, group), axis=1)
-        sigma = robust_sigma(size, smallest_sigma)
         if left > 1:
-            weight = weights(size / sigma)
-    shaped = residuals.reshape(wanted.shape)
-    return RobustFit(np.asarray(found), shaped, weight, sigma, int(rank), weighted.T @ weighted)
+            size = np.linalg.norm(residuals.reshape(-1, group), axis=1)
+            weight = weights(size / robust_sigma(size, _ROUNDING))
+    return RobustFit(np.asarray(found), residuals.reshape(wanted.shape), weight, int(rank))
 
 
 def clustered_covariance(

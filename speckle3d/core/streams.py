@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -23,7 +22,7 @@ Samples = TypeVar("Samples", Rotation, RigidTransform)
 
 
 @dataclass(frozen=True)
-class _TimedSamples(Generic[Samples]):
+class TimedSamples(Generic[Samples]):
     """Samples on a clock: validation, coverage and lookup, whatever the samples are."""
 
     time_s: FloatArray
@@ -71,17 +70,23 @@ class _TimedSamples(Generic[Samples]):
                 f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s, "
                 f"gaps over {self.max_gap_s:g} s are not bridged"
             )
+        samples = self.world_from_sensor
         if len(self) == 1:
-            return self.world_from_sensor[np.zeros(t.shape, dtype=int)]
-        return self._between(t)
+            return samples[np.zeros(t.shape, dtype=int)]
+        turned = self._slerp(t)
+        if isinstance(samples, RigidTransform):
+            moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
+            return RigidTransform.from_components(moved, turned)
+        return turned
 
-    @abstractmethod
-    def _between(self, times_s: FloatArray) -> Samples:
-        """Interpolate between two samples or more, at times that they cover."""
+    @cached_property
+    def _slerp(self) -> Slerp:
+        samples = self.world_from_sensor
+        return Slerp(self.time_s, samples.rotation if isinstance(samples, RigidTransform) else samples)
 
 
 @dataclass(frozen=True)
-class TimedRotations(_TimedSamples[Rotation]):
+class TimedRotations(TimedSamples[Rotation]):
     """Orientation samples of one sensor.
 
     Parameters
@@ -99,16 +104,9 @@ class TimedRotations(_TimedSamples[Rotation]):
     [0.0, 0.0, 0.1]
     """
 
-    def _between(self, times_s: FloatArray) -> Rotation:
-        return self._slerp(times_s)
-
-    @cached_property
-    def _slerp(self) -> Slerp:
-        return Slerp(self.time_s, self.world_from_sensor)
-
 
 @dataclass(frozen=True)
-class TimedPoses(_TimedSamples[RigidTransform]):
+class TimedPoses(TimedSamples[RigidTransform]):
     """Position and orientation samples of one sensor.
 
     Parameters
@@ -120,13 +118,3 @@ class TimedPoses(_TimedSamples[RigidTransform]):
     max_gap_s : float
         The longest pause that `at` interpolates across.
     """
-
-    def _between(self, times_s: FloatArray) -> RigidTransform:
-        translation, slerp = self._paths
-        moved = np.stack([np.interp(times_s, self.time_s, column) for column in translation.T], axis=-1)
-        return RigidTransform.from_components(moved, slerp(times_s))
-
-    @cached_property
-    def _paths(self) -> tuple[FloatArray, Slerp]:
-        translation, rotation = self.world_from_sensor.as_components()
-        return np.asarray(translation), Slerp(self.time_s, rotation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Generic, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
+
+INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+"""Vectors that an orientation sensor may measure beside its orientation, each of shape (m, 3)."""
+
+_UNCALIBRATED = "the sensor is not calibrated to the image: {} lacks the attribute {}"
 
 
 class Frames(Protocol):
@@ -104,22 +109,22 @@ class ImageGrid:
 
 
 @dataclass(frozen=True)
-class OrientationSensor:
-    """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
+class _Sensor(Generic[Samples]):
+    """A sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
 
-    readings: TimedRotations
-    sensor_from_image: Rotation | None = None
+    readings: TimedSamples[Samples]
+    sensor_from_image: Samples | None = None
     time_offset_s: float = 0.0
-    accelerometer_m_s2: FloatArray | None = None
-    gyroscope_rad_s: FloatArray | None = None
-    magnetometer_au: FloatArray | None = None
+
+    uncalibrated: ClassVar[str]
+    """Message that the sensor's mounting is missing, which names the attribute of a sweep file."""
 
     def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
-        """Which frames have an orientation."""
+        """Which frames have a reading."""
         return self.readings.covers(np.asarray(frame_time_s) - self.time_offset_s)
 
-    def world_from_image(self, frame_time_s: npt.ArrayLike) -> Rotation:
-        """Orientation of the image at each frame time.
+    def world_from_image(self, frame_time_s: npt.ArrayLike) -> Samples:
+        """Orientation or pose of the image at each frame time.
 
         Raises
         ------
@@ -127,40 +132,30 @@ class OrientationSensor:
             If the sensor is not calibrated to the image, or does not cover a time.
         """
         if self.sensor_from_image is None:
-            raise InsufficientDataError(
-                "the orientation sensor is not calibrated to the image: /orientation lacks the attribute "
-                "sensor_from_image_wxyz"
-            )
+            raise InsufficientDataError(self.uncalibrated)
         world_from_sensor = self.readings.at(np.asarray(frame_time_s) - self.time_offset_s)
         return world_from_sensor * self.sensor_from_image
 
 
 @dataclass(frozen=True)
-class Tracker:
+class OrientationSensor(_Sensor[Rotation]):
+    """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
+
+    uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/orientation", "sensor_from_image_wxyz")
+
+    readings: TimedRotations
+    accelerometer_m_s2: FloatArray | None = None
+    gyroscope_rad_s: FloatArray | None = None
+    magnetometer_au: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Tracker(_Sensor[RigidTransform]):
     """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
 
+    uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")
+
     readings: TimedPoses
-    sensor_from_image: RigidTransform | None = None
-    time_offset_s: float = 0.0
-
-    def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
-        """Which frames have a pose."""
-        return self.readings.covers(np.asarray(frame_time_s) - self.time_offset_s)
-
-    def world_from_image(self, frame_time_s: npt.ArrayLike) -> RigidTransform:
-        """Pose of the image at each frame time.
-
-        Raises
-        ------
-        InsufficientDataError
-            If the sensor is not calibrated to the image, or does not cover a time.
-        """
-        if self.sensor_from_image is None:
-            raise InsufficientDataError(
-                "the tracker is not calibrated to the image: /tracker lacks the attribute sensor_from_image"
-            )
-        world_from_sensor = self.readings.at(np.asarray(frame_time_s) - self.time_offset_s)
-        return world_from_sensor * self.sensor_from_image
 
 
 @dataclass(frozen=True)

@@ -64,31 +64,22 @@ class WirePhantom:
         _require_vectors(self.directions, (k, 3), "directions")
         if self.ends_mm is not None:
             _require_vectors(self.ends_mm, (k, 2, 3), "ends_mm")
-        self._require_names()
-        self._require_unit()
-        self._require_patterns()
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def _require_names(self) -> None:
         repeated = [name for i, name in enumerate(self.names) if name in self.names[:i]]
         if repeated:
             raise InvalidInputError(f"names: expected different ones, got {repeated[0]!r} twice")
-
-    def _require_unit(self) -> None:
         lengths = np.linalg.norm(self.directions, axis=1)
         bad = np.flatnonzero(np.abs(lengths - 1.0) > _UNIT_TOLERANCE)
         if bad.size:
             length = lengths[bad[0]]
             raise InvalidInputError(f"directions[{bad[0]}]: expected unit length, got {length:.6g}")
-
-    def _require_patterns(self) -> None:
         for number, pattern in enumerate(self.patterns):
-            if not pattern or len(set(pattern)) < len(pattern) or not set(pattern) <= set(range(len(self))):
+            if not pattern or len(set(pattern)) < len(pattern) or not set(pattern) <= set(range(k)):
                 raise InvalidInputError(
-                    f"patterns[{number}]: expected different wires from 0 to {len(self) - 1}, got {pattern}"
+                    f"patterns[{number}]: expected different wires from 0 to {k - 1}, got {pattern}"
                 )
+
+    def __len__(self) -> int:
+        return len(self.names)
 
     @cached_property
     def n_shapes(self) -> tuple[tuple[int, int, int], ...]:
@@ -100,12 +91,9 @@ class WirePhantom:
         left, middle, right = self.directions[list(three)]
         parallel = np.linalg.norm(np.cross(left, right)) < _PARALLEL_SINE
         oblique = np.linalg.norm(np.cross(left, middle)) > _PARALLEL_SINE
-        return bool(parallel and oblique and self._passing_mm(three) < _FLAT_MM)
-
-    def _passing_mm(self, three: tuple[int, int, int]) -> float:
-        """Farthest that the middle wire passes from an outer one."""
-        first, last = (self._nearest(three[1], outer) for outer in (three[0], three[2]))
-        return float(max(np.linalg.norm(p - q) for p, q in (first, last)))
+        crossings = (self._nearest(three[1], outer) for outer in (three[0], three[2]))
+        passing_mm = max(float(np.linalg.norm(p - q)) for p, q in crossings)
+        return bool(parallel and oblique and passing_mm < _FLAT_MM)
 
     def _nearest(self, one: int, other: int) -> tuple[FloatArray, FloatArray]:
         """Points of two wires that are nearest to each other."""

@@ -43,12 +43,6 @@ def cumulative_product(matrices: FloatArray) -> FloatArray:
     return product
 
 
-def elevational_steps(world_from_image: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    """Signed travel of the image centre along the previous frame's z, shape (n - 1,), mm."""
-    steps = relative_poses(world_from_image).apply(centre_mm) - centre_mm
-    return np.asarray(steps[:, 2])
-
-
 def curve_basis(axes: tuple[str, ...], steps_mm: FloatArray, curves: Curves) -> FloatArray:
     """Weight of every coefficient in every frame's correction, shape (n, len(axes), 5).
 

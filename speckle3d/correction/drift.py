@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import roll_yaw_tilt, skew
+from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt, skew
 from speckle3d.core.leastsquares import Fit, levenberg_marquardt
 from speckle3d.correction.curves import (
     AXES,
@@ -24,7 +24,6 @@ from speckle3d.correction.curves import (
     Curves,
     angle_axes,
     curve_basis,
-    elevational_steps,
 )
 
 
@@ -105,8 +104,8 @@ def correct_pose(
     ----------
     world_from_image : RigidTransform, length n
         Image-based poses, in any world, mm.
-    reference : RigidTransform, length n or the number of covered frames
-        The sensor's ``world_from_image``; where not covered its values are ignored.
+    reference : RigidTransform, as long as there are covered frames
+        The sensor's ``world_from_image`` of each of them.
     covered : array_like of bool, shape (n,)
         Which frames have a reading. The others are corrected by the same smooth curves and add no cost.
     corners_mm : array_like, shape (4, 3)
@@ -128,10 +127,9 @@ def correct_pose(
     corners = np.asarray(corners_mm, dtype=float)
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
         raise InvalidInputError(f"corners_mm: expected shape (4, 3), got {corners.shape}")
-    used = _require_coverage(covered, len(world_from_image), settings)
-    measured = reference[_reading_index(len(reference), used)]
-    sensor_from_start = _register(_points(world_from_image[used], corners), _points(measured, corners))
-    target = _points(sensor_from_start.inv() * measured, corners)
+    used = _require_coverage(covered, len(world_from_image), len(reference), settings)
+    sensor_from_start = _register(_points(world_from_image[used], corners), _points(reference, corners))
+    target = _points(sensor_from_start.inv() * reference, corners)
     chain = _chain(world_from_image, corners.mean(axis=0), AXES, settings)
     problem = _CornerProblem(chain, used, corners, target, settings.loss_epsilon_mm)
     fit = _solve(problem, chain, settings)
@@ -156,8 +154,8 @@ def correct_orientation(
     ----------
     world_from_image, covered, settings
         As for `correct_pose`.
-    reference : Rotation, length n or the number of covered frames
-        The sensor's ``world_from_image``; where not covered its values are ignored.
+    reference : Rotation, as long as there are covered frames
+        The sensor's ``world_from_image`` of each of them.
     centre_mm : array_like, shape (3,)
         Image centre in the image frame.
 
@@ -175,10 +173,9 @@ def correct_orientation(
     centre = np.asarray(centre_mm, dtype=float)
     if centre.shape != (3,):
         raise InvalidInputError(f"centre_mm: expected shape (3,), got {centre.shape}")
-    used = _require_coverage(covered, len(world_from_image), settings)
-    measured = reference[_reading_index(len(reference), used)]
-    sensor_from_start = (measured * world_from_image[used].rotation.inv()).mean()
-    target = (sensor_from_start.inv() * measured).as_matrix()
+    used = _require_coverage(covered, len(world_from_image), len(reference), settings)
+    sensor_from_start = (reference * world_from_image[used].rotation.inv()).mean()
+    target = (sensor_from_start.inv() * reference).as_matrix()
     # With the frame's origin moved to the centre, a turn about the centre has no translation.
     image_from_centred = RigidTransform.from_translation(centre)
     chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
@@ -288,18 +285,9 @@ def _register(moving: FloatArray, fixed: FloatArray) -> RigidTransform:
     return RigidTransform.from_components(b_mean - rotation.apply(a_mean), rotation)
 
 
-def _reading_index(readings: int, used: BoolArray) -> BoolArray:
-    """Which of the readings belong to covered frames, in order."""
-    if readings == used.size:
-        return used
-    if readings == int(used.sum()):
-        return np.ones(readings, dtype=bool)
-    raise MismatchError(
-        f"reference: expected {used.size} poses, or {int(used.sum())} for the covered frames, got {readings}"
-    )
-
-
-def _require_coverage(covered: npt.ArrayLike, frames: int, settings: DriftSettings) -> BoolArray:
+def _require_coverage(
+    covered: npt.ArrayLike, frames: int, readings: int, settings: DriftSettings
+) -> BoolArray:
     used = np.asarray(covered, dtype=bool)
     if used.shape != (frames,):
         raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
@@ -320,4 +308,6 @@ def _require_coverage(covered: npt.ArrayLike, frames: int, settings: DriftSettin
             f"drift correction: expected at most {settings.maximum_end_gap:.0%} of {frames} frames without "
             f"sensor readings at either end, got {before} at the start and {after} at the end"
         )
+    if readings != used.sum():
+        raise MismatchError(f"reference: expected {used.sum()} for the covered frames, got {readings}")
     return used

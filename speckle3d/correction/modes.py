@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
-from speckle3d.core.sweep import Sweep, Tracker, image_orientation
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 from speckle3d.correction.drift import DriftCorrection, DriftSettings, correct_orientation, correct_pose
 
 
@@ -21,25 +21,19 @@ def require_modes(sweep: Sweep, modes: Sequence[str]) -> None:
     InsufficientDataError
         If its sensor is missing, not calibrated to the image, or covers no frame.
     """
-    sensors = {
-        "pose": (sweep.tracker, "a tracker in /tracker", "sensor_from_image"),
-        "orientation": (
-            sweep.orientation_source,
-            "an orientation sensor in /orientation",
-            "sensor_from_image_wxyz" if sweep.orientation else "sensor_from_image",
-        ),
+    sensors: dict[str, tuple[OrientationSensor | Tracker | None, str]] = {
+        "pose": (sweep.tracker, "a tracker in /tracker"),
+        "orientation": (sweep.orientation_source, "an orientation sensor in /orientation"),
     }
     for mode in modes:
         if mode not in sensors:
             raise InvalidInputError(f"expected a drift mode among orientation, pose; got {mode!r}")
-        sensor, wanted, attribute = sensors[mode]
+        sensor, wanted = sensors[mode]
         where = f"{sweep.name}: drift mode {mode}"
         if sensor is None:
             raise InsufficientDataError(f"{where}: expected {wanted}, got none")
         if sensor.sensor_from_image is None:
-            raise InsufficientDataError(
-                f"{where}: the sensor is not calibrated to the image: it lacks the attribute {attribute}"
-            )
+            raise InsufficientDataError(f"{where}: {sensor.uncalibrated}")
         if not sensor.covers(sweep.frame_time_s).any():
             raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
 
@@ -62,7 +56,7 @@ def correct_mode(
     times = sweep.frame_time_s[covered]
     with naming(sweep.name):
         if isinstance(sensor, Tracker) and mode == "pose":
-            measured = sensor.world_from_image(times)
-            return correct_pose(world_from_image, measured, covered, sweep.grid.corners_mm, settings)
+            poses = sensor.world_from_image(times)
+            return correct_pose(world_from_image, poses, covered, sweep.grid.corners_mm, settings)
         rotation = image_orientation(sensor, times)
         return correct_orientation(world_from_image, rotation, covered, sweep.grid.centre_mm, settings)

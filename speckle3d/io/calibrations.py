@@ -11,7 +11,6 @@ where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import h5py
 import numpy as np
@@ -26,17 +25,24 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
-    find_group,
     locate,
     opened,
     read_attribute,
+    read_attributes,
     read_checked,
-    read_text,
-    require_dataset,
+    read_texts,
+    require_group,
     sha256_of,
+    write_attributes,
 )
 
 FORMAT = "speckle3d.calibration"
+
+_TEXT = h5py.string_dtype()
+_ATTRIBUTES = dict.fromkeys(("method", "sensor", "rms_unit", "verdict"), str) | {"rms": float}
+_PARAMETER = {"name": _TEXT, "value": np.float64, "standard_error": np.float64, "unit": _TEXT}
+"""Data sets of /parameters."""
+_SOURCE = dict.fromkeys(("input_path", "input_sha256", "package_version", "settings_json"), str)
 
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
@@ -48,8 +54,7 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         If the file cannot be written.
     """
     with atomic_hdf5(path, FORMAT) as file:
-        for name in ("method", "sensor", "rms", "rms_unit", "condition_number", "verdict"):
-            file.attrs[name] = getattr(calibration, name)
+        write_attributes(file, calibration, (*_ATTRIBUTES, "condition_number"))
         if calibration.time_offset_s is not None:
             file.attrs["time_offset_s"] = calibration.time_offset_s
         if calibration.translation_mm is None:
@@ -59,11 +64,15 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         if calibration.pixel_mm is not None:
             file["pixel_mm"] = calibration.pixel_mm
         file["covariance"] = calibration.covariance
-        _write_parameters(file.create_group("parameters"), calibration.parameters)
-        _write_frames(file.create_group("frames"), calibration.frames)
-        source = file.create_group("source")
-        for name, value in vars(calibration.source).items():
-            source.attrs[name] = value
+        for name, dtype in _PARAMETER.items():
+            values = [getattr(one, name) for one in calibration.parameters]
+            file.create_dataset(f"parameters/{name}", data=values, dtype=dtype)
+        frames = calibration.frames
+        file["frames/used"] = np.array(frames.used, dtype=np.int64)
+        file["frames/dropped"] = np.array(list(frames.dropped), dtype=np.int64)
+        file.create_dataset("frames/reason", data=list(frames.dropped.values()), dtype=_TEXT)
+        file["frames"].attrs["given"] = frames.given
+        write_attributes(file.create_group("source"), calibration.source, _SOURCE)
 
 
 def read_calibration(path: PathLike) -> Calibration:
@@ -92,22 +101,17 @@ def read_calibration(path: PathLike) -> Calibration:
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         rotation, translation = _read_pose(file)
-        pixel_mm = read_checked(file, "pixel_mm", (2,)) if "pixel_mm" in file else None
         return Calibration(
-            method=read_text(file, "method"),
-            sensor=read_text(file, "sensor"),
+            **read_attributes(file, _ATTRIBUTES),
             rotation=rotation,
             translation_mm=translation,
-            pixel_mm=pixel_mm,
+            pixel_mm=read_checked(file, "pixel_mm", (2,)) if "pixel_mm" in file else None,
             covariance=_read_covariance(file, 3 if translation is None else 6),
-            parameters=_read_parameters(_group(file, "parameters")),
-            rms=read_attribute(file, "rms"),
-            rms_unit=read_text(file, "rms_unit"),
+            parameters=_read_parameters(require_group(file, "parameters")),
             condition_number=_read_condition(file),
-            frames=_read_frames(_group(file, "frames")),
+            frames=_read_frames(require_group(file, "frames")),
             time_offset_s=read_attribute(file, "time_offset_s") if "time_offset_s" in file.attrs else None,
-            verdict=read_text(file, "verdict"),
-            source=_read_source(_group(file, "source")),
+            source=Source(**read_attributes(require_group(file, "source"), _SOURCE)),
         )
 
 
@@ -133,35 +137,20 @@ def apply_calibrations(sweep: Sweep, paths: Sequence[PathLike]) -> tuple[Sweep, 
     return sweep, tuple(held)
 
 
-def _write_parameters(group: h5py.Group, parameters: tuple[Parameter, ...]) -> None:
-    text = h5py.string_dtype()
-    for name in ("name", "unit"):
-        group.create_dataset(name, data=[getattr(p, name) for p in parameters], dtype=text)
-    for name in ("value", "standard_error"):
-        group[name] = np.array([getattr(p, name) for p in parameters], dtype=float)
-
-
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
     values = read_checked(group, "value", ("p",))
     require_finite(values, locate(group, "value"))
     errors = read_checked(group, "standard_error", (values.size,))
     _require_spread(errors, locate(group, "standard_error"))
-    names, units = (_read_texts(group, name, values.size) for name in ("name", "unit"))
+    names, units = (read_texts(group, name, values.shape) for name in ("name", "unit"))
     rows = zip(names, values.tolist(), errors.tolist(), units, strict=True)
     return tuple(Parameter(*row) for row in rows)
-
-
-def _write_frames(group: h5py.Group, frames: FramesUsed) -> None:
-    group.attrs["given"] = frames.given
-    group["used"] = np.array(frames.used, dtype=np.int64)
-    group["dropped"] = np.array(list(frames.dropped), dtype=np.int64)
-    group.create_dataset("reason", data=list(frames.dropped.values()), dtype=h5py.string_dtype())
 
 
 def _read_frames(group: h5py.Group) -> FramesUsed:
     used = read_checked(group, "used", ("u",), np.int64)
     dropped = read_checked(group, "dropped", ("d",), np.int64)
-    reasons = _read_texts(group, "reason", dropped.size)
+    reasons = read_texts(group, "reason", dropped.shape)
     given = int(read_attribute(group, "given"))
     for name, numbers in (("used", used), ("dropped", dropped)):
         bad = np.flatnonzero((numbers < 0) | (numbers >= given))
@@ -201,26 +190,6 @@ def _read_condition(file: h5py.File) -> float:
     if raw.dtype.kind not in "fiu" or raw.size != 1 or np.isnan(raw).any():
         raise InvalidInputError("attribute condition_number: expected a number, got none")
     return float(raw.ravel()[0])
-
-
-def _read_source(group: h5py.Group) -> Source:
-    return Source(**{one.name: read_text(group, one.name) for one in fields(Source)})
-
-
-def _read_texts(group: h5py.Group, name: str, count: int) -> list[str]:
-    node = require_dataset(group, name)
-    if h5py.check_string_dtype(node.dtype) is None or node.shape != (count,):
-        raise InvalidInputError(
-            f"{locate(group, name)}: expected {count} texts, got {node.shape} {node.dtype}"
-        )
-    return [str(text) for text in node.asstr(errors="replace")[()]]
-
-
-def _group(file: h5py.File, name: str) -> h5py.Group:
-    found = find_group(file, name)
-    if found is None:
-        raise InvalidInputError(f"/{name}: expected a group, got none")
-    return found
 
 
 load_calibration = read_calibration

@@ -17,6 +17,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,15 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, locate, open_hdf5, read_checked, reading, require_dataset
+from speckle3d.io.hdf5 import (
+    PathLike,
+    locate,
+    open_hdf5,
+    read_checked,
+    read_transforms,
+    reading,
+    require_dataset,
+)
 from speckle3d.io.sweeps import HDF5Frames
 from speckle3d.io.text import numbers, text_lines
 
@@ -64,32 +73,17 @@ class Landmarks:
         return int(self.frame.size)
 
 
-class ScanFrames:
+class ScanFrames(HDF5Frames):
     """Frames of a scan, read one at a time and turned to (vector, sample)."""
-
-    def __init__(self, stored: HDF5Frames) -> None:
-        self._stored = stored
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
-        n, height, width = self._stored.shape
+        n, height, width = self.stored_shape
         return n, width, height
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Sample type."""
-        return self._stored.dtype
-
-    def __len__(self) -> int:
-        return len(self._stored)
-
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return np.ascontiguousarray(self._stored[index].T)
-
-    def close(self) -> None:
-        """Close the file if it is open; the next frame opens it again."""
-        self._stored.close()
+        return np.ascontiguousarray(super().__getitem__(index).T)
 
 
 def is_challenge_scan(file: h5py.File) -> bool:
@@ -125,7 +119,15 @@ def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransfo
 
     The challenge counts pixels from 1; here the image's origin is the first pixel.
     """
-    matrices = _calibration_rows(path).reshape(2, 4, 4)
+    # Lines that begin with a letter are headings.
+    rows = [
+        numbers(text.replace(",", " "), 4, f"{path}: line {number}")
+        for number, text in text_lines(path)
+        if not text[0].isalpha()
+    ]
+    if len(rows) != 8:
+        raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
+    matrices = np.reshape(rows, (2, 4, 4))
     scale = matrices[0]
     size = np.diag(scale)[:2].copy()
     if not (np.array_equal(scale, np.diag(np.diag(scale))) and (size > 0).all() and scale[3, 3] == 1):
@@ -166,18 +168,15 @@ def _frames(scan: Path) -> ScanFrames:
             raise InvalidInputError(
                 f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
             )
-        return ScanFrames(HDF5Frames(scan, "frames", node.shape, node.dtype))
+        return ScanFrames(scan, "frames", node.shape, node.dtype)
 
 
 def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:
-    with reading(scan), open_hdf5(scan) as file:
-        held = "tforms" in file
-    source = scan if held else _transforms_file(scan)
-    if source is None:
-        return None
+    source = _transforms_file(scan) or scan
     with reading(source), open_hdf5(source) as file:
-        matrices = read_checked(file, "tforms", (frames, 4, 4))
-        return transforms_from_matrices(matrices, locate(file, "tforms"))
+        if source == scan and "tforms" not in file:
+            return None
+        return read_transforms(file, "tforms", frames)
 
 
 def _transforms_file(scan: Path) -> Path | None:
@@ -186,13 +185,15 @@ def _transforms_file(scan: Path) -> Path | None:
     return beside if subject.parent.name == "frames" and beside.is_file() else None
 
 
-def _folders(scan: Path) -> list[Path]:
-    return list(scan.absolute().parents)[:_LEVELS]
+def _nearby(scan: Path, names: Iterable[str]) -> Path | None:
+    """First file of these names beside or above a scan."""
+    folders = list(scan.absolute().parents)[:_LEVELS]
+    paths = (folder / name for folder in folders for name in names)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _calibration_file(scan: Path) -> Path | None:
-    named = (folder / _CALIBRATION for folder in _folders(scan))
-    return next((path for path in named if path.is_file()), None)
+    return _nearby(scan, [_CALIBRATION])
 
 
 def _require_calibration(scan: Path) -> Path:
@@ -203,18 +204,5 @@ def _require_calibration(scan: Path) -> Path:
 
 
 def _landmark_file(scan: Path) -> Path | None:
-    named = f"landmark_{scan.absolute().parent.name}.h5"
-    paths = (folder / kind / named for folder in _folders(scan) for kind in _LANDMARK_FOLDERS)
-    return next((path for path in paths if path.is_file()), None)
-
-
-def _calibration_rows(path: PathLike) -> FloatArray:
-    """Read the eight rows of four numbers, shape (8, 4); lines that begin with a letter are headings."""
-    rows = [
-        numbers(text.replace(",", " "), 4, f"{path}: line {number}")
-        for number, text in text_lines(path)
-        if not text[0].isalpha()
-    ]
-    if len(rows) != 8:
-        raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
-    return np.array(rows)
+    subject = scan.absolute().parent.name
+    return _nearby(scan, [f"{folder}/landmark_{subject}.h5" for folder in _LANDMARK_FOLDERS])

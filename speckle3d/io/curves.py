@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import h5py
 import numpy as np
 
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, TiltResponse
+from speckle3d.core.curves import PATCH_NUMBERS, CurveKey, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.sweep import BModeSettings, RFSettings
+from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
     opened,
     read_attribute,
+    read_attributes,
     read_checked,
     read_text,
+    write_attributes,
 )
 from speckle3d.io.sweeps import read_signal
 
 FORMAT = "speckle3d.curves"
-KEY_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
 
 
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
@@ -38,12 +38,9 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
             for name, values in vars(curves.tilt).items():
                 file[f"tilt/{name}"] = values
         file.attrs["pairs_used"] = curves.pairs_used
-        for name in KEY_NUMBERS:
-            file.attrs[name] = getattr(curves.key, name)
-        file.attrs["correlation_of"] = curves.key.correlation_of
+        write_attributes(file, curves.key, (*PATCH_NUMBERS, "correlation_of"))
         file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
-        for name, value in vars(curves.key.signal).items():
-            file.attrs[name] = value
+        file.attrs.update(vars(curves.key.signal))
 
 
 def read_curves(path: PathLike) -> DecorrelationCurves:
@@ -72,22 +69,18 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         distance = read_checked(file, "distance_mm", ("k",))
         correlation = read_checked(file, "correlation", (depth.size, distance.size))
         cells = read_checked(file, "cells", (depth.size,))
-        pitch, width, height, equalise = (read_attribute(file, name) for name in KEY_NUMBERS)
+        numbers = read_attributes(file, dict.fromkeys(PATCH_NUMBERS, float))
         of = read_text(file, "correlation_of") if "correlation_of" in file.attrs else "intensity"
-        key = CurveKey(_read_signal(file), pitch, width, height, equalise, of)
+        kind = read_text(file, "signal")
+        if kind not in ("rf", "bmode"):
+            raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
+        key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of)
         pairs = int(read_attribute(file, "pairs_used", 0))
         tilt = None
         if "tilt" in file:
             names = ("tilt/pivot_mm", "tilt/spread_mm")
             tilt = TiltResponse(*(read_checked(file, name, (depth.size,)) for name in names))
         return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt)
-
-
-def _read_signal(file: h5py.File) -> RFSettings | BModeSettings:
-    kind = read_text(file, "signal")
-    if kind not in ("rf", "bmode"):
-        raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-    return read_signal(file, kind)
 
 
 load_curves = read_curves

@@ -5,7 +5,6 @@ To add a kind of file, give `_DESCRIBERS` a function that tells its rows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 
 import h5py
@@ -14,23 +13,20 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
-from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.hdf5 import PathLike, open_hdf5, reading
+from speckle3d.io.hdf5 import Node, PathLike, open_hdf5, reading
 from speckle3d.io.headers import read_header
 from speckle3d.io.load import IMAGE, kind_of
 from speckle3d.io.metaimage import image_orientation, image_type
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweeps import open_sweep
 
 Row = tuple[str, str, str]
 """Description, value, unit."""
 
-_UNITS = ("mm", "s", "hz", "db", "rad", "m_s2", "m_s", "rad_s", "au")
-_UNIT_NAMES = {"hz": "Hz", "db": "dB", "m_s": "m/s", "m_s2": "m/s^2", "rad_s": "rad/s", "au": "a.u."}
+_UNIT_NAMES = {"mm": "mm", "hz": "Hz", "db": "dB", "m_s": "m/s"}
 
 
 def describe(path: PathLike) -> list[Row]:
@@ -52,24 +48,24 @@ def describe(path: PathLike) -> list[Row]:
 
 
 def _describe_scan(path: PathLike) -> list[Row]:
-    marks = challenge.read_landmarks(path)
-    return [
-        *_sweep_rows(challenge.read_challenge_scan(path)),
-        ("landmarks", str(0 if marks is None else len(marks)), ""),
-    ]
-
-
-def _describe_sweep(path: PathLike) -> list[Row]:
-    with open_sweep(path) as sweep:
-        return _sweep_rows(sweep)
+    marks = str(len(challenge.read_landmarks(path) or ()))
+    return [*_sweep_rows(challenge.read_challenge_scan(path)), ("landmarks", marks, "")]
 
 
 def _sweep_rows(sweep: Sweep) -> list[Row]:
-    return [*_clock_rows(sweep), *_image_rows(sweep), *_signal_rows(sweep), *_sensor_rows(sweep)]
-
-
-def _clock_rows(sweep: Sweep) -> list[Row]:
-    return [("frames", str(len(sweep)), ""), *_rate_rows("", sweep.frame_time_s, "frames/s")]
+    grid = sweep.grid
+    return [
+        ("frames", str(len(sweep)), ""),
+        *_rate_rows("", sweep.frame_time_s, "frames/s"),
+        ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
+        ("sample type", str(sweep.frames.dtype), ""),
+        ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
+        ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
+        ("width", f"{grid.width_mm:.2f}", "mm"),
+        ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
+        *_signal_rows(sweep.signal),
+        *_sensor_rows(sweep),
+    ]
 
 
 def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
@@ -80,20 +76,7 @@ def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
     return rows
 
 
-def _image_rows(sweep: Sweep) -> list[Row]:
-    grid = sweep.grid
-    return [
-        ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
-        ("sample type", str(sweep.frames.dtype), ""),
-        ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
-        ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
-        ("width", f"{grid.width_mm:.2f}", "mm"),
-        ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
-    ]
-
-
-def _signal_rows(sweep: Sweep) -> list[Row]:
-    signal = sweep.signal
+def _signal_rows(signal: RFSettings | BModeSettings) -> list[Row]:
     if not isinstance(signal, RFSettings):
         return [("signal", "B-mode", ""), ("dynamic range", f"{signal.dynamic_range_db:g}", "dB")]
     low, high = (f"{edge / 1e6:g}" for edge in signal.bandwidth_hz)
@@ -127,25 +110,19 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
     result = read_reconstruction(path)
     rows = [("frames", str(result.frame_time_s.size), "")]
     rows += _rate_rows("", result.frame_time_s, "frames/s") if result.frame_time_s.size else []
-    rows += [(f"length, mode {mode}", f"{_length_mm(result, mode):.2f}", "mm") for mode in result.poses]
+    for mode, poses in result.poses.items() if result.frame_time_s.size else ():
+        length_mm = abs(elevational_steps(poses, result.grid.centre_mm).sum())
+        rows.append((f"length, mode {mode}", f"{length_mm:.2f}", "mm"))
     pairs = result.pairs
     return [
         *rows,
-        ("frame pairs", str(len(pairs) if pairs is not None else 0), ""),
-        ("patches", str(len(pairs.patch_centre_mm) if pairs is not None else 0), ""),
+        ("frame pairs", str(0 if pairs is None else len(pairs)), ""),
+        ("patches", str(0 if pairs is None else len(pairs.patch_centre_mm)), ""),
         ("input", result.provenance.input_path, ""),
         ("input SHA-256", result.provenance.input_sha256, ""),
         ("package version", result.provenance.package_version, ""),
         *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
     ]
-
-
-def _length_mm(result: Reconstruction, mode: str) -> float:
-    """Elevational travel of the image's centre, summed from frame to frame."""
-    if result.frame_time_s.size < 2:
-        return 0.0
-    centre = result.grid.centre_mm
-    return float(abs((relative_poses(result.poses[mode]).apply(centre) - centre)[:, 2].sum()))
 
 
 def _describe_calibration(path: PathLike) -> list[Row]:
@@ -155,7 +132,7 @@ def _describe_calibration(path: PathLike) -> list[Row]:
         ("method", held.method, ""),
         ("sensor", held.sensor, ""),
         *_mounting_rows(held),
-        *(_parameter_row(one) for one in held.parameters),
+        *((f"parameter {name}", value, unit) for name, value, unit in map(Parameter.row, held.parameters)),
         ("RMS residual", *readable(held.rms, held.rms_unit)),
         ("condition number", f"{held.condition_number:.1f}", ""),
         ("time offset", offset, "" if held.time_offset_s is None else "s"),
@@ -173,69 +150,48 @@ def _mounting_rows(held: Calibration) -> list[Row]:
     angles = zip(("roll", "yaw", "tilt"), np.rad2deg(roll_yaw_tilt(held.rotation)), strict=True)
     spread = np.sqrt(np.diag(held.covariance))
     rows: list[Row] = [(f"sensor_from_image {name}", f"{angle:.3f}", "deg") for name, angle in angles]
-    if held.translation_mm is not None:
-        rows.append(("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
     rows.append(("standard error, tilt, yaw, roll", _listed(np.rad2deg(spread[:3])), "deg"))
     if held.translation_mm is not None:
+        rows.insert(3, ("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
         rows.append(("standard error along the image's x, y, z", _listed(spread[3:]), "mm"))
     if held.pixel_mm is not None:
         rows.append(("pixel", " x ".join(f"{size:.5f}" for size in held.pixel_mm), "mm"))
     return rows
 
 
-def _parameter_row(one: Parameter) -> Row:
-    name, value, unit = one.row()
-    return (f"parameter {name}", value, unit)
-
-
 def _listed(values: FloatArray) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
-def _describe_members(path: PathLike) -> list[Row]:
-    """Attributes and data sets as they are, for the smaller files of the family."""
+def _describe_curves(path: PathLike) -> list[Row]:
+    """Attributes, but for the format, and lengths of data sets as they are."""
     rows: list[Row] = []
 
-    def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
-        rows.extend(_attribute_rows(name, node))
+    def visit(name: str, node: Node) -> None:
         if isinstance(node, h5py.Dataset):
-            rows.append(_dataset_row(name, node))
+            shape = " x ".join(str(n) for n in node.shape)
+            rows.append((_spoken(name)[0], shape, "values"))
 
     with reading(path), open_hdf5(path) as file:
-        rows += [row for row in _attribute_rows("", file) if row[0] != "format"]
+        for name, value in file.attrs.items():
+            if name != "format":
+                spoken, unit = _spoken(name)
+                rows.append((spoken, str(value), unit))
         file.visititems(visit)
     return rows
 
 
-def _attribute_rows(name: str, node: h5py.Group | h5py.Dataset) -> list[Row]:
-    return [_row(f"{name} {key}".strip(), value) for key, value in node.attrs.items()]
-
-
-def _dataset_row(name: str, node: h5py.Dataset) -> Row:
-    if node.shape == () and h5py.check_string_dtype(node.dtype) is None:
-        return _row(name, node[()])
-    shape = " x ".join(str(n) for n in node.shape or ()) or "text"
-    return (_spoken(name), shape, "values" if node.shape else "")
-
-
-def _row(name: str, value: object) -> Row:
-    text = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-    return (_spoken(name), " ".join(text.split()), _unit(name))
-
-
-def _spoken(name: str) -> str:
-    return re.sub(rf"_({'|'.join(_UNITS)})$", "", name).replace("_", " ").replace("/", ", ")
-
-
-def _unit(name: str) -> str:
-    match = re.search(rf"_({'|'.join(_UNITS)})$", name)
-    return "" if match is None else _UNIT_NAMES.get(match[1], match[1])
+def _spoken(name: str) -> tuple[str, str]:
+    """Name in words, and unit, of an attribute or data set."""
+    found = next((unit for unit in _UNIT_NAMES if name.endswith(f"_{unit}")), None)
+    words = name.removesuffix(f"_{found}").replace("_", " ").replace("/", ", ")
+    return words, "" if found is None else _UNIT_NAMES[found]
 
 
 def _describe_header(path: PathLike) -> list[Row]:
     header = read_header(path)
     held = header.transforms
-    spacing = "unknown" if header.spacing_mm is None else " x ".join(f"{s:g}" for s in header.spacing_mm)
+    spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
     return [
         ("format", header.file_format, ""),
         ("size", " x ".join(str(n) for n in header.size), ""),
@@ -250,9 +206,9 @@ def _describe_header(path: PathLike) -> list[Row]:
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
-    sweeps.FORMAT: _describe_sweep,
+    sweeps.FORMAT: lambda path: _sweep_rows(sweeps.read_sweep(path)),
     reconstructions.FORMAT: _describe_reconstruction,
-    curves.FORMAT: _describe_members,
+    curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,
     challenge.FORMAT: _describe_scan,
     IMAGE: _describe_header,

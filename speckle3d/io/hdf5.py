@@ -5,18 +5,23 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self, TypeAlias
 
 import h5py
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.geometry import transforms_from_matrices
 
 PathLike = str | os.PathLike[str]
+Node: TypeAlias = h5py.Group | h5py.Dataset
 
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
@@ -44,9 +49,9 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     try:
         yield part
         os.replace(part, target)
+    except Speckle3DError:
+        raise
     except OSError as error:
-        if isinstance(error, Speckle3DError):
-            raise
         raise FileError(f"{path}: cannot be written: {one_line(error)}") from error
     finally:
         part.unlink(missing_ok=True)
@@ -91,6 +96,37 @@ def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[
         yield file
 
 
+class HDF5Writer:
+    """Write a file of the family in a block; it appears whole when the block ends, or not at all."""
+
+    def __init__(self, path: PathLike, format_name: str, version: int) -> None:
+        self._path, self._format = path, (format_name, version)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, *self._format))
+            stack.push(self._finish_unless)
+            self._begin()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def _begin(self) -> None:
+        """Write what is known before the block."""
+
+    def _finish(self) -> None:
+        """Write what is known when the block has ended without an error."""
+
+    def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
+        if error is None:
+            self._finish()
+
+
 def open_hdf5(path: PathLike) -> h5py.File:
     """Open an HDF5 file for reading.
 
@@ -99,29 +135,29 @@ def open_hdf5(path: PathLike) -> h5py.File:
     FileError
         If it is missing, truncated or not HDF5.
     """
-    if not Path(path).exists():
-        raise FileError(f"{path}: expected a file, got none")
-    if not Path(path).is_file():
-        raise FileError(f"{path}: expected a file, got a folder or device")
-    try:
+    require_file(path)
+    with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
         return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
-    except _READ_FAILURES as error:
-        if isinstance(error, Speckle3DError):
-            raise
-        raise FileError(f"{path}: cannot be opened: {one_line(error)}") from error
+
+
+def require_file(path: PathLike) -> None:
+    """Raise `FileError` unless there is an ordinary file at `path`."""
+    if not Path(path).is_file():
+        got = "a folder or device" if Path(path).exists() else "none"
+        raise FileError(f"{path}: expected a file, got {got}")
 
 
 @contextmanager
-def reading(path: PathLike) -> Iterator[None]:
-    """Turn what h5py raises over damaged structures in the block into a `FileError` of one line."""
+def reading(where: PathLike) -> Iterator[None]:
+    """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line."""
     try:
         yield
+    except Speckle3DError:
+        raise
     except _READ_FAILURES as error:
-        if isinstance(error, Speckle3DError):
-            raise
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+        raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
 @contextmanager
@@ -142,7 +178,7 @@ def file_format(file: h5py.File) -> str:
     return read_text(file, "format")
 
 
-def locate(node: h5py.Group | h5py.Dataset, name: str = "") -> str:
+def locate(node: Node, name: str = "") -> str:
     """Name a place in a file for a message: ``file: /group/name``."""
     inside = f"{node.name.rstrip('/')}/{name}".rstrip("/") or "/"
     return f"{node.file.filename}: {inside}"
@@ -174,10 +210,8 @@ def read_checked(
     if not _fits(node.shape, shape):
         expected = ", ".join(str(n) for n in shape) + ("," if len(shape) == 1 else "")
         raise InvalidInputError(f"{where}: expected shape ({expected}), got {node.shape}")
-    try:
+    with reading(where):
         return np.asarray(node[()], dtype=wanted)
-    except _READ_FAILURES as error:
-        raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
 def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
@@ -190,56 +224,79 @@ def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
 
 def find_group(group: h5py.Group, name: str) -> h5py.Group | None:
     """Return a group inside `group`, None if there is none of that name."""
+    return None if _member(group, name) is None else require_group(group, name)
+
+
+def require_group(group: h5py.Group, name: str) -> h5py.Group:
+    """Return a group inside `group`, or raise `InvalidInputError` naming what is there instead."""
     node = _member(group, name)
-    if node is not None and not isinstance(node, h5py.Group):
+    if not isinstance(node, h5py.Group):
         raise InvalidInputError(f"{locate(group, name)}: expected a group, got {_kind_of(node)}")
     return node
 
 
-def read_attribute(node: h5py.Group | h5py.Dataset, name: str, default: float | None = None) -> float:
+def read_transforms(group: h5py.Group, name: str, count: int) -> RigidTransform:
+    """Read a data set of rigid 4x4 matrices."""
+    return transforms_from_matrices(read_checked(group, name, (count, 4, 4)), locate(group, name))
+
+
+def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
+    """Read a data set of texts of a known shape, as nested lists."""
+    node = require_dataset(group, name)
+    if h5py.check_string_dtype(node.dtype) is None or node.shape != shape:
+        where = locate(group, name)
+        raise InvalidInputError(f"{where}: expected texts of shape {shape}, got {node.shape} {node.dtype}")
+    return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
+
+
+def write_attributes(node: Node, values: object, names: Iterable[str]) -> None:
+    """Write attributes of an object under their own names."""
+    for name in names:
+        node.attrs[name] = getattr(values, name)
+
+
+def read_attributes(node: Node, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """Read attributes into values by name: each a number (`float` or `int`) or a text (`str`)."""
+    return {
+        name: read_text(node, name) if kind is str else kind(read_attribute(node, name))
+        for name, kind in kinds.items()
+    }
+
+
+def read_attribute(node: Node, name: str, default: float | None = None) -> float:
     """Read a finite number; `default` stands in for a missing one unless it is None."""
-    value = read_vector_attribute(node, name, 1)
-    if value is None:
-        if default is None:
-            raise InvalidInputError(f"{locate(node)}: expected attribute {name}, got none")
+    if default is not None and name not in node.attrs:
         return default
-    return float(value[0])
+    return float(read_vector_attribute(node, name, 1)[0])
 
 
-def read_vector_attribute(
-    node: h5py.Group | h5py.Dataset, name: str, size: int
-) -> npt.NDArray[np.float64] | None:
-    """Read an attribute of `size` finite numbers as a flat array; None if it is missing."""
+def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
+    """Read an attribute of `size` finite numbers as a flat array."""
     where = f"{locate(node)} attribute {name}"
-    raw = _raw_attribute(node, name)
-    if raw is None:
-        return None
+    with reading(where):
+        raw = node.attrs.get(name)
     value = np.asarray(raw)
-    if value.dtype.kind not in "fiu" or value.size != size:
-        raise InvalidInputError(f"{where}: expected {size} number(s), got {_shown(raw)}")
-    if not np.isfinite(value).all():
-        raise InvalidInputError(f"{where}: expected finite number(s), got {_shown(raw)}")
+    if value.dtype.kind not in "fiu" or value.size != size or not np.isfinite(value).all():
+        raise InvalidInputError(f"{where}: expected {size} finite number(s), got {_shown(raw)}")
     return value.astype(np.float64).ravel()
 
 
-def read_text(node: h5py.Group | h5py.Dataset, name: str) -> str:
+def read_text(node: Node, name: str) -> str:
     """Read a text attribute."""
-    raw = _raw_attribute(node, name)
+    where = f"{locate(node)} attribute {name}"
+    with reading(where):
+        raw = node.attrs.get(name)
     if isinstance(raw, bytes):
         raw = raw.decode("utf-8", errors="replace")
     if not isinstance(raw, str):
-        got = "none" if raw is None else _shown(raw)
-        raise InvalidInputError(f"{locate(node)}: expected text attribute {name}, got {got}")
+        raise InvalidInputError(f"{where}: expected a text, got {_shown(raw)}")
     return str(raw)
 
 
 def sha256_of(path: PathLike) -> str:
     """SHA-256 of a file's bytes, read in pieces, as 64 hexadecimal digits."""
-    try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def one_line(error: BaseException) -> str:
@@ -249,17 +306,8 @@ def one_line(error: BaseException) -> str:
 
 
 def _member(group: h5py.Group, name: str) -> Any:
-    try:
+    with reading(locate(group, name)):
         return group.get(name)
-    except _READ_FAILURES as error:
-        raise FileError(f"{locate(group, name)}: cannot be read: {one_line(error)}") from error
-
-
-def _raw_attribute(node: h5py.Group | h5py.Dataset, name: str) -> Any:
-    try:
-        return node.attrs.get(name)
-    except _READ_FAILURES as error:
-        raise FileError(f"{locate(node)} attribute {name}: cannot be read: {one_line(error)}") from error
 
 
 def _fits(shape: tuple[int, ...] | None, expected: tuple[int | str, ...]) -> bool:
@@ -273,5 +321,5 @@ def _kind_of(node: object) -> str:
 
 
 def _shown(raw: object) -> str:
-    text = " ".join(repr(raw).split())
+    text = "none" if raw is None else " ".join(repr(raw).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

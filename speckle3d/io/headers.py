@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.io.hdf5 import PathLike, reading
 from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
@@ -23,16 +24,8 @@ _NRRD_NAMES = {
     "ultrasound image type": "UltrasoundImageType",
 }
 
-_ELEMENT_BYTES = {
-    "MET_CHAR": 1,
-    "MET_UCHAR": 1,
-    "MET_SHORT": 2,
-    "MET_USHORT": 2,
-    "MET_INT": 4,
-    "MET_UINT": 4,
-    "MET_FLOAT": 4,
-    "MET_DOUBLE": 8,
-}
+_ELEMENT_BYTES = {"MET_CHAR": 1, "MET_SHORT": 2, "MET_INT": 4, "MET_FLOAT": 4, "MET_DOUBLE": 8}
+"""By type; those without a sign have a U before the name, as MET_UCHAR."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +67,17 @@ class SequenceHeader:
         return sorted(name.removesuffix("Transform") for name in names)
 
 
+@contextmanager
+def image_library(path: PathLike, done: str) -> Iterator[Any]:
+    """Yield SimpleITK; its failures in the block become a `FileError` of one line: "cannot be `done`"."""
+    import SimpleITK
+
+    try:
+        yield SimpleITK
+    except RuntimeError as error:
+        raise FileError(f"{path}: cannot be {done}: {str(error).strip().splitlines()[-1]}") from error
+
+
 def is_metaimage(start: bytes) -> bool:
     """Whether a file's first bytes are those of a MetaImage header."""
     first = start.split(b"\n", 1)[0].split(b"=")[0].strip()
@@ -95,20 +99,15 @@ def read_header(path: PathLike) -> SequenceHeader:
     InvalidInputError
         If it is neither, or the header does not make sense.
     """
-    try:
-        with open(path, "rb") as stream:
-            start = stream.read(512)
-            stream.seek(0)
-            if is_nrrd(start):
-                return _nrrd_header(path, dict(_nrrd_lines(stream)))
-            if is_metaimage(start):
-                header = _meta_header(path, dict(_meta_lines(path, stream)))
-                _require_pixels(path, stream, header)
-                return header
-    except OSError as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), open(path, "rb") as stream:
+        start = stream.read(512)
+        stream.seek(0)
+        if is_nrrd(start):
+            return _nrrd_header(path, dict(_nrrd_lines(stream)))
+        if is_metaimage(start):
+            header = _meta_header(path, dict(_meta_lines(path, stream)))
+            _require_pixels(path, stream, header)
+            return header
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
 
 
@@ -147,9 +146,9 @@ def _meta_header(path: PathLike, lines: dict[str, str]) -> SequenceHeader:
 
 def _nrrd_header(path: PathLike, lines: dict[str, str]) -> SequenceHeader:
     size = _sizes(path, lines, "sizes")
-    known: tuple[float, ...] | None
     if "spacings" in lines:
-        known = _first_two(lines["spacings"].lower().replace("nan", "1"), path, "spacings")
+        first_two = lines["spacings"].lower().replace("nan", "1").split()[:2]
+        known: tuple[float, ...] | None = numbers(" ".join(first_two), 2, f"{path}: spacings")
     else:
         known = _direction_lengths(path, lines.get("space directions", ""))
     return _header(path, size, known, lines)
@@ -180,10 +179,6 @@ def _sizes(path: PathLike, lines: dict[str, str], name: str) -> tuple[int, ...]:
     return sizes
 
 
-def _first_two(text: str, path: PathLike, name: str) -> tuple[float, ...]:
-    return numbers(" ".join(text.split()[:2]), 2, f"{path}: {name}")
-
-
 def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
     vectors = re.findall(r"\(([^)]*)\)", text)[:2]
     if len(vectors) < 2:
@@ -194,8 +189,8 @@ def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
 
 def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) -> None:
     """Refuse a truncated file with a message that names it; the image library's does not."""
-    if header.fields["ElementDataFile"].upper() != "LOCAL":
-        name = header.fields["ElementDataFile"]
+    name = header.fields["ElementDataFile"]
+    if name.upper() != "LOCAL":
         data = Path(path).parent / name
         if not name or not data.is_file():
             raise FileError(f"{path}: ElementDataFile: expected LOCAL or a file beside it, got {name!r}")
@@ -206,7 +201,7 @@ def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) ->
         announced = header.fields.get("CompressedDataSize", "0")
         expected = int(numbers(announced, 1, f"{path}: CompressedDataSize")[0])
     else:
-        element = _ELEMENT_BYTES.get(header.fields.get("ElementType", ""), 1)
+        element = _ELEMENT_BYTES.get(header.fields.get("ElementType", "").replace("_U", "_"), 1)
         channels = int(numbers(header.fields.get("ElementNumberOfChannels", "1"), 1, f"{path}: channels")[0])
         expected = int(np.prod(header.size, dtype=object)) * element * channels
     if found < expected:

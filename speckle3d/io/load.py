@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import PathLike, file_format, one_line, open_hdf5, reading
+from speckle3d.io.hdf5 import PathLike, file_format, open_hdf5, reading, require_file
 from speckle3d.io.headers import is_metaimage, is_nrrd
 from speckle3d.io.metaimage import ImportSettings, read_metaimage
 
@@ -99,13 +99,9 @@ def sniff(path: PathLike) -> str:
     InvalidInputError
         If it is neither.
     """
-    if not Path(path).is_file():
-        raise FileError(f"{path}: expected a file, got {'a folder' if Path(path).is_dir() else 'none'}")
-    try:
-        with open(path, "rb") as stream:
-            start = stream.read(_SNIFFED_BYTES)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    require_file(path)
+    with reading(path), open(path, "rb") as stream:
+        start = stream.read(_SNIFFED_BYTES)
     if start.startswith(_HDF5_SIGNATURE):
         return "hdf5"
     if is_metaimage(start) or is_nrrd(start):

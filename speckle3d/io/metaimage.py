@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.headers import SequenceHeader, image_library, read_header
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -31,8 +31,9 @@ ROUNDING_TOLERANCE = 2e-3
 """How far R^T R of a pose in a header may be from the identity before it is made rigid. An electromagnetic
 tracker that rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
 
+Value = TypeVar("Value")
+
 _RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
-_DEFAULT_TRANSFORMS = ("ProbeToTracker", "ReferenceToTracker")
 
 
 class MissingSettingError(InvalidInputError):
@@ -142,7 +143,7 @@ def _geometry(
             spacing = rf.sample_spacing_mm
             return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm), rf
         if settings.image_to_probe is not None:
-            lateral_mm, axial_mm = _pixel_size(header, settings)
+            lateral_mm, axial_mm = np.linalg.norm(_calibration(settings)[:3, :2], axis=0).tolist()
         pitch = _need(header, "column_pitch_mm", settings.column_pitch_mm, lateral_mm)
         spacing = _need(header, "row_spacing_mm", settings.row_spacing_mm, axial_mm)
         bmode = BModeSettings(_need(header, "dynamic_range_db", settings.dynamic_range_db, None))
@@ -154,17 +155,14 @@ def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: flo
     implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
     rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
     centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
-    if settings.bandwidth_hz is None:
-        message = f"{header.path}: the header lacks the band: give bandwidth_hz (low, high)"
-        raise MissingSettingError(message, "bandwidth_hz")
-    return RFSettings(rate, speed, centre, settings.bandwidth_hz)
+    return RFSettings(rate, speed, centre, _need(header, "bandwidth_hz", settings.bandwidth_hz, None))
 
 
-def _need(header: SequenceHeader, name: str, given: float | None, read: float | None) -> float:
+def _need(header: SequenceHeader, name: str, given: Value | None, read: Value | None) -> Value:
     value = read if given is None else given
     if value is None:
         raise MissingSettingError(f"{header.path}: the header does not say: give {name}", name)
-    return float(value)
+    return value
 
 
 def _header_spacing(header: SequenceHeader) -> tuple[float | None, float | None]:
@@ -197,24 +195,21 @@ def _frame_times(header: SequenceHeader, settings: ImportSettings) -> FloatArray
         if not settings.frame_rate_hz > 0:
             raise InvalidInputError(f"frame_rate_hz: expected above zero, got {settings.frame_rate_hz}")
         return np.arange(header.frame_count) / settings.frame_rate_hz
-    if not header.frames:
-        message = f"{header.path}: the header holds no time stamps: give frame_rate_hz"
-        raise MissingSettingError(message, "frame_rate_hz")
-    return require_increasing(_timestamps(header), f"{header.path}: Timestamp")
+    return _timestamps(header) if header.frames else _need(header, "frame_rate_hz", None, None)
 
 
 def _timestamps(header: SequenceHeader) -> FloatArray:
     where = f"{header.path}: Timestamp"
-    return np.array(
-        [numbers(frame.get("Timestamp", ""), 1, f"{where}[{i}]")[0] for i, frame in enumerate(header.frames)]
-    )
+    texts = [frame.get("Timestamp", "") for frame in header.frames]
+    times = [numbers(text, 1, f"{where}[{i}]")[0] for i, text in enumerate(texts)]
+    return require_increasing(times, where)
 
 
 def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None:
-    sensor = _transform_name(header, settings.tracker_transform, _DEFAULT_TRANSFORMS[0])
+    sensor = _transform_name(header, settings.tracker_transform, "ProbeToTracker")
     if sensor is None:
         return None
-    reference = _transform_name(header, settings.reference_transform, _DEFAULT_TRANSFORMS[1])
+    reference = _transform_name(header, settings.reference_transform, "ReferenceToTracker")
     names = (sensor,) if reference is None else (sensor, reference)
     valid = np.array([_status(frame, *(f"{n}TransformStatus" for n in names)) for frame in header.frames])
     if not valid.any():
@@ -222,9 +217,8 @@ def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None
     poses = _poses(header, sensor, valid)
     if reference is not None:
         poses = _poses(header, reference, valid).inv() * poses
-    times = require_increasing(_timestamps(header), f"{header.path}: Timestamp")[valid]
-    calibration = None if settings.image_to_probe is None else _probe_from_image(header, settings)
-    return Tracker(TimedPoses(times, poses[valid]), sensor_from_image=calibration)
+    calibration = None if settings.image_to_probe is None else _probe_from_image(settings)
+    return Tracker(TimedPoses(_timestamps(header)[valid], poses[valid]), calibration)
 
 
 def _transform_name(header: SequenceHeader, given: str | None, default: str) -> str | None:
@@ -233,10 +227,10 @@ def _transform_name(header: SequenceHeader, given: str | None, default: str) -> 
         return None
     if any(f"{name}Transform" in frame for frame in header.frames):
         return name
-    if given is None:
-        return None
-    held = header.transforms
-    raise InvalidInputError(f"{header.path}: expected a transform {name}, got {', '.join(held) or 'none'}")
+    if given is not None:
+        held = ", ".join(header.transforms) or "none"
+        raise InvalidInputError(f"{header.path}: expected a transform {name}, got {held}")
+    return None
 
 
 def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> RigidTransform:
@@ -258,14 +252,9 @@ def _squared(matrices: FloatArray) -> FloatArray:
     return squared
 
 
-def _pixel_size(header: SequenceHeader, settings: ImportSettings) -> tuple[float, float]:
-    lengths = np.linalg.norm(_calibration(header, settings)[:3, :2], axis=0)
-    return float(lengths[0]), float(lengths[1])
-
-
-def _probe_from_image(header: SequenceHeader, settings: ImportSettings) -> RigidTransform:
+def _probe_from_image(settings: ImportSettings) -> RigidTransform:
     """Nearest rigid transform to PLUS's image calibration, by singular values."""
-    matrix = _calibration(header, settings)
+    matrix = _calibration(settings)
     axes = matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)
     cosine = float(axes[:, 0] @ axes[:, 1])
     if abs(cosine) > SKEW_TOLERANCE:
@@ -273,7 +262,7 @@ def _probe_from_image(header: SequenceHeader, settings: ImportSettings) -> Rigid
     return RigidTransform.from_components(matrix[:3, 3], Rotation.from_matrix(nearest_rotation(axes)))
 
 
-def _calibration(header: SequenceHeader, settings: ImportSettings) -> FloatArray:
+def _calibration(settings: ImportSettings) -> FloatArray:
     matrix = np.asarray(settings.image_to_probe, dtype=float)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InvalidInputError(f"image_to_probe: expected a finite 4x4 matrix, got shape {matrix.shape}")
@@ -299,14 +288,10 @@ def image_orientation(header: SequenceHeader) -> str:
 
 def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
     """Pixels as (frame, second axis, first axis)."""
-    import SimpleITK
-
-    try:
+    with image_library(header.path, "read") as itk:
         # The reader is named, because the library otherwise chooses it by the suffix.
-        image = SimpleITK.ReadImage(header.path, imageIO=f"{header.file_format}IO")
-    except RuntimeError as error:
-        raise FileError(f"{header.path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error
-    pixels = SimpleITK.GetArrayFromImage(image)
+        image = itk.ReadImage(header.path, imageIO=f"{header.file_format}IO")
+    pixels: npt.NDArray[Any] = itk.GetArrayFromImage(image)
     expected = (header.frame_count, header.size[1], header.size[0])
     if "list" in header.fields.get("kinds", "") and pixels.shape == (*expected[1:], expected[0]):
         pixels = np.moveaxis(pixels, -1, 0)  # an NRRD list of frames arrives as one image of many components
@@ -323,18 +308,17 @@ def _to_samples(header: SequenceHeader, pixels: npt.NDArray[Any]) -> npt.NDArray
     ndarray
         uint8 for B-mode, int16 or float32 for RF, complex64 for I and Q.
     """
-    kind = image_type(header)
-    orientation = image_orientation(header)
+    kind, orientation = image_type(header), image_orientation(header)
     if kind not in (*_RF_TYPES, "BRIGHTNESS"):
         raise InvalidInputError(f"{header.path}: expected a grey B-mode or RF image, got type {kind}")
-    if kind == "BRIGHTNESS":
-        if pixels.dtype != np.uint8:
-            raise InvalidInputError(f"{header.path}: expected B-mode of type uint8, got {pixels.dtype}")
-        return _oriented(header.path, pixels, orientation)
+    if kind == "BRIGHTNESS" and pixels.dtype != np.uint8:
+        raise InvalidInputError(f"{header.path}: expected B-mode of type uint8, got {pixels.dtype}")
     if kind == "RF_REAL":
-        return _oriented(header.path, _narrowed(pixels), orientation)
-    frames = _oriented(header.path, _analytic(header.path, pixels, orientation, kind), orientation)
-    return _positive_carrier(frames)
+        pixels = _narrowed(pixels)
+    elif kind in _RF_TYPES:
+        pixels = _analytic(header.path, pixels, orientation, kind)
+    frames = _oriented(header.path, pixels, orientation)
+    return _positive_carrier(frames) if np.iscomplexobj(frames) else frames
 
 
 def _oriented(path: str, pixels: npt.NDArray[Any], orientation: str) -> npt.NDArray[Any]:

@@ -13,17 +13,17 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from xml.etree.ElementTree import Element, TreeBuilder
-from xml.parsers import expat
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.io.hdf5 import PathLike, one_line, reading
 from speckle3d.io.text import numbers
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
@@ -31,27 +31,6 @@ _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 
 _SIZE_LIMIT_BYTES = 2**26
 """A thousand times the size of a device set; beyond it the file is none."""
-
-
-@dataclass(frozen=True)
-class Clip:
-    """The part of an image in which dots are looked for, in pixels."""
-
-    column: int
-    row: int
-    columns: int
-    rows: int
-
-    def __post_init__(self) -> None:
-        if min(self.column, self.row) < 0 or min(self.columns, self.rows) < 1:
-            raise InvalidInputError(f"clip: expected a rectangle inside an image, got {self}")
-
-    @property
-    def corners_px(self) -> FloatArray:
-        """Column and row of the centres of its corner pixels, clockwise from the top left, shape (4, 2)."""
-        left, right = float(self.column), float(self.column + self.columns - 1)
-        top, bottom = float(self.row), float(self.row + self.rows - 1)
-        return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
 
 
 @dataclass(frozen=True)
@@ -64,12 +43,14 @@ class WireConfig:
         With ``world_from_phantom`` where the file holds it; the world is PLUS's reference frame.
     pixel_mm : float, optional
         Roughly, as somebody read it off the machine.
-    clip : Clip, optional
+    clip_px : ndarray, shape (4, 2), optional
+        The part of an image in which dots are looked for: column and row of the centres of its corner pixels,
+        clockwise from the top left.
     """
 
     phantom: WirePhantom
     pixel_mm: float | None = None
-    clip: Clip | None = None
+    clip_px: FloatArray | None = None
 
 
 def read_wire_phantom(path: PathLike) -> WireConfig:
@@ -85,24 +66,19 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
     """
     root = _read_xml(path)
     with naming(str(path)):
-        names, ends, patterns = _wires(root)
-        pose = _phantom_pose(root)
-        phantom = WirePhantom.from_ends(names, np.reshape(ends, (-1, 2, 3)), patterns, pose)
+        phantom = _phantom(root)
         segmentation = root.find(".//Segmentation")
         if segmentation is None:
             return WireConfig(phantom)
-        return WireConfig(phantom, _pixel_mm(segmentation), _clip(segmentation))
+        return WireConfig(phantom, _pixel_mm(segmentation), _clip_px(segmentation))
 
 
-def _wires(
-    root: Element,
-) -> tuple[tuple[str, ...], list[list[tuple[float, ...]]], tuple[tuple[int, ...], ...]]:
+def _phantom(root: Element) -> WirePhantom:
     geometry = root.find(".//PhantomDefinition/Geometry")
     if geometry is None:
         raise InvalidInputError("expected an element PhantomDefinition/Geometry, got none")
     names: list[str] = []
-    ends: list[list[tuple[float, ...]]] = []
-    patterns = []
+    ends, patterns = [], []
     for number, pattern in enumerate(geometry.findall("Pattern")):
         wires = _pattern_wires(pattern, f"Pattern[{number}]")
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
@@ -113,7 +89,8 @@ def _wires(
         raise InvalidInputError(
             "PhantomDefinition/Geometry: expected an element Pattern with wires, got none"
         )
-    return tuple(names), ends, tuple(patterns)
+    pose = _phantom_pose(root)
+    return WirePhantom.from_ends(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
 
 
 def _pattern_wires(pattern: Element, where: str) -> list[Element]:
@@ -158,39 +135,31 @@ def _pixel_mm(segmentation: Element) -> float | None:
     return spacing
 
 
-def _clip(segmentation: Element) -> Clip | None:
+def _clip_px(segmentation: Element) -> FloatArray | None:
     if not {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
         return None
-    column, row = _vector(segmentation, "ClipRectangleOrigin", 2)
-    columns, rows = _vector(segmentation, "ClipRectangleSize", 2)
-    with naming("Segmentation"):
-        return Clip(int(column), int(row), int(columns), int(rows))
+    left, top = map(int, _vector(segmentation, "ClipRectangleOrigin", 2))
+    columns, rows = map(int, _vector(segmentation, "ClipRectangleSize", 2))
+    if min(left, top) < 0 or min(columns, rows) < 1:
+        got = f"{columns} x {rows} from {left}, {top}"
+        raise InvalidInputError(f"Segmentation: clip: expected a rectangle inside an image, got {got}")
+    right, bottom = left + columns - 1, top + rows - 1
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
 
 
 def _read_xml(path: PathLike) -> Element:
-    try:
-        with open(path, "rb") as stream:
-            text = stream.read(_SIZE_LIMIT_BYTES + 1)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), open(path, "rb") as stream:
+        text = stream.read(_SIZE_LIMIT_BYTES + 1)
     if len(text) > _SIZE_LIMIT_BYTES:
         raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")
     try:
-        return _parse(text)
-    except (expat.ExpatError, ValueError, LookupError) as error:
+        return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InvalidInputError(f"{path}: expected well-formed XML, got: {one_line(error)}") from error
 
 
-def _parse(text: bytes) -> Element:
-    """Build the tree of a document without a type declaration, so that it has no entities of its own."""
-    builder = TreeBuilder()
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.StartDoctypeDeclHandler = _refuse_doctype
-    parser.Parse(text, True)
-    return builder.close()
+class _PlainTree(ElementTree.TreeBuilder):
+    """The tree of a document without a type declaration, so that it has no entities of its own."""
 
-
-def _refuse_doctype(name: str, *_: object) -> None:
-    raise ValueError(f"a document type declaration ({name})")
+    def doctype(self, name: str, *_: object) -> None:
+        raise ValueError(f"a document type declaration ({name})")

@@ -100,17 +100,19 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
     number, heading = next(lines, (1, ""))
     columns = _columns(heading, f"{path}: line {number}")
     rows: list[Row] = []
-    wires_seen: dict[tuple[int, int], int] = {}
+    lines_seen: dict[tuple[int, int], int] = {}
     for number, text in lines:
         where = f"{path}: line {number}"
-        rows.append(_row(text, columns, wire_names, where))
-        if _WIRE in columns:
-            _require_new(rows[-1], wires_seen, number, where)
+        frame, pixel, wire = _row(text, columns, wire_names, where)
+        rows.append((frame, pixel, wire))
+        seen = lines_seen.setdefault((frame, wire), number)
+        if seen != number and _WIRE in columns:
+            got = f"wire {wire} of frame {frame} as on line {seen}"
+            raise InvalidInputError(f"{where}: expected a wire once in a frame, got {got}")
     if not rows:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
-    frame, pixels, wire = zip(*rows, strict=True)
-    wires = np.array(wire) if _WIRE in columns else None
-    return PickedPoints(np.array(frame, dtype=np.int64), np.array(pixels, dtype=float), wires)
+    frames, pixels, wires = (np.array(column) for column in zip(*rows, strict=True))
+    return PickedPoints(frames, pixels, wires if _WIRE in columns else None)
 
 
 def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:
@@ -165,17 +167,6 @@ def _wire(word: str, names: Sequence[str], where: str) -> int:
     raise InvalidInputError(f"{where}: expected {known}, got {word!r}")
 
 
-def _require_new(row: Row, seen: dict[tuple[int, int], int], number: int, where: str) -> None:
-    """Refuse a second point of the same wire in a frame."""
-    frame, _, wire = row
-    if (frame, wire) in seen:
-        raise InvalidInputError(
-            f"{where}: expected a wire once in a frame, got wire {wire} of frame {frame} as on line "
-            f"{seen[frame, wire]}"
-        )
-    seen[frame, wire] = number
-
-
 def _writable(name: str) -> str:
     if not name.strip() or name != name.strip() or any(c in name for c in ",#\r\n"):
         raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
@@ -183,8 +174,6 @@ def _writable(name: str) -> str:
 
 
 def _label(wire: int, names: list[str]) -> str:
-    if not names:
-        return str(wire)
-    if wire >= len(names):
+    if names and wire >= len(names):
         raise InvalidInputError(f"wire: expected one of {len(names)} wires, got number {wire}")
-    return names[wire]
+    return names[wire] if names else str(wire)

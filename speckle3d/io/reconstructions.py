@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
-from types import TracebackType
-from typing import Any
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
 from speckle3d.core.reconstruction import (
@@ -25,15 +21,17 @@ from speckle3d.core.reconstruction import (
 )
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import (
+    HDF5Writer,
     PathLike,
-    atomic_hdf5,
     find_group,
     locate,
     opened,
-    read_attribute,
+    read_attributes,
     read_checked,
-    read_text,
-    require_dataset,
+    read_texts,
+    read_transforms,
+    require_group,
+    write_attributes,
 )
 
 FORMAT = "speckle3d.reconstruction"
@@ -50,18 +48,15 @@ _PAIR_FIELDS: dict[str, tuple[tuple[int | str, ...], npt.DTypeLike]] = {
 }
 """Shape behind the pair axis, and type, of every data set of /pairs but ``patch_centre_mm``."""
 
-_GRID_FIELDS = (
-    "vectors",
-    "samples",
-    "vector_pitch_mm",
-    "sample_spacing_mm",
-    "first_sample_depth_mm",
+_GRID = dict.fromkeys(("vectors", "samples"), int) | dict.fromkeys(
+    ("vector_pitch_mm", "sample_spacing_mm", "first_sample_depth_mm"), float
 )
-_PROVENANCE_FIELDS = ("input_path", "input_sha256", "package_version")
+_PROVENANCE = dict.fromkeys(("input_path", "input_sha256", "package_version"), str)
+_CALIBRATION = dict.fromkeys(("path", "sha256"), str)
 _CHUNK_BYTES = 2**18
 
 
-class ReconstructionWriter:
+class ReconstructionWriter(HDF5Writer):
     """Write a reconstruction file: open it before the work, append pairs as they come, finish it.
 
     It appears whole when the block ends, or not at all. Opening it first shows an unwritable place before
@@ -76,29 +71,18 @@ class ReconstructionWriter:
     """
 
     def __init__(self, path: PathLike, frame_time_s: npt.ArrayLike, grid: ImageGrid) -> None:
-        self._path, self._grid = path, grid
+        super().__init__(path, FORMAT, VERSION)
+        self._grid = grid
         self._times = require_increasing(frame_time_s, f"{path}: /frame_time_s")
-        self._stack = ExitStack()
         self._finished = False
 
-    def __enter__(self) -> ReconstructionWriter:
-        with ExitStack() as stack:
-            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, FORMAT, VERSION))
-            self._file["frame_time_s"] = self._times
-            for name in _GRID_FIELDS:
-                self._file.attrs[name] = getattr(self._grid, name)
-            self._stack = stack.pop_all()
-        return self
+    def _begin(self) -> None:
+        self._file["frame_time_s"] = self._times
+        write_attributes(self._file, self._grid, _GRID)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is not None:
-            self._stack.__exit__(kind, error, trace)
-            return
-        with self._stack:
-            if not self._finished:
-                raise InvalidInputError(f"{self._path}: expected finish() before the end, got none")
+    def _finish(self) -> None:
+        if not self._finished:
+            raise InvalidInputError(f"{self._path}: expected finish() before the end, got none")
 
     def append_pairs(self, pairs: FramePairs) -> None:
         """Append frame pairs; their patches must be those of the pairs before.
@@ -115,8 +99,10 @@ class ReconstructionWriter:
             _create_pairs(group, pairs)
         elif not np.array_equal(group["patch_centre_mm"], pairs.patch_centre_mm):
             raise InvalidInputError(f"{where}/patch_centre_mm: expected the patches of the pairs before")
+        start = len(group["first"])
         for name in _PAIR_FIELDS:
-            _extend(group[name], getattr(pairs, name))
+            group[name].resize(start + len(pairs), axis=0)
+            group[name][start:] = getattr(pairs, name)
 
     def finish(
         self,
@@ -135,12 +121,9 @@ class ReconstructionWriter:
         if trust is not None:
             self._file["pose_covariance/image"] = trust.covariance
             self._file["frame_flags"] = trust.flags
-        for name in _PROVENANCE_FIELDS:
-            self._file.attrs[name] = getattr(provenance, name)
+        write_attributes(self._file, provenance, _PROVENANCE)
         for used in provenance.calibrations:
-            self._file.require_group(f"calibrations/{used.sensor}").attrs.update(
-                path=used.path, sha256=used.sha256
-            )
+            write_attributes(self._file.require_group(f"calibrations/{used.sensor}"), used, _CALIBRATION)
         self._file["config_toml"] = config_toml
         self._finished = True
 
@@ -165,10 +148,10 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
         with naming(str(path)):
             return Reconstruction(
                 frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
-                grid=_read_grid(file),
+                grid=ImageGrid(**read_attributes(file, _GRID)),
                 poses=_read_poses(file, times.size),
                 provenance=_read_provenance(file),
-                config_toml=_read_config(file),
+                config_toml=read_texts(file, "config_toml", ()),
                 pairs=_read_pairs(file, times.size) if with_pairs else None,
                 trust=_read_trust(file, times.size),
             )
@@ -192,16 +175,10 @@ def _create_pairs(group: h5py.Group, pairs: FramePairs) -> None:
         )
 
 
-def _extend(node: h5py.Dataset, rows: npt.NDArray[Any]) -> None:
-    start = node.shape[0]
-    node.resize(start + len(rows), axis=0)
-    node[start:] = rows
-
-
 def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
-    lengths: dict[int | str, int | str] = {"patch": int(pairs.patch_centre_mm.shape[0])}
+    patches = len(pairs.patch_centre_mm)
     for name, (row, _) in _PAIR_FIELDS.items():
-        expected = (len(pairs), *(lengths.get(n, n) for n in row))
+        expected = (len(pairs), *(patches if n == "patch" else n for n in row))
         got = np.shape(getattr(pairs, name))
         if got != expected:
             raise InvalidInputError(f"{where}/{name}: expected shape {expected}, got {got}")
@@ -215,39 +192,18 @@ def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
 
 
 def _read_provenance(file: h5py.File) -> Provenance:
-    held = find_group(file, "calibrations")
     # Older files have no such group.
-    groups = {} if held is None else {sensor: find_group(held, sensor) for sensor in held}
-    calibrations = tuple(
-        CalibrationFile(sensor, read_text(group, "path"), read_text(group, "sha256"))
-        for sensor, group in groups.items()
-        if group is not None
-    )
-    return Provenance(
-        **{name: read_text(file, name) for name in _PROVENANCE_FIELDS}, calibrations=calibrations
-    )
-
-
-def _read_grid(file: h5py.File) -> ImageGrid:
-    return ImageGrid(
-        vectors=int(read_attribute(file, "vectors")),
-        samples=int(read_attribute(file, "samples")),
-        vector_pitch_mm=read_attribute(file, "vector_pitch_mm"),
-        sample_spacing_mm=read_attribute(file, "sample_spacing_mm"),
-        first_sample_depth_mm=read_attribute(file, "first_sample_depth_mm"),
-    )
+    held = find_group(file, "calibrations") or {}
+    calibrations = [
+        CalibrationFile(sensor, **read_attributes(require_group(held, sensor), _CALIBRATION))
+        for sensor in held
+    ]
+    return Provenance(**read_attributes(file, _PROVENANCE), calibrations=tuple(calibrations))
 
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
-    group = find_group(file, "poses")
-    if group is None:
-        raise InvalidInputError(f"{locate(file, 'poses')}: expected a group, got none")
-    held = [mode for mode in MODES if mode in group]
-    return {mode: _read_mode(group, mode, frames) for mode in held}
-
-
-def _read_mode(group: h5py.Group, mode: str, frames: int) -> RigidTransform:
-    return transforms_from_matrices(read_checked(group, mode, (frames, 4, 4)), locate(group, mode))
+    group = require_group(file, "poses")
+    return {mode: read_transforms(group, mode, frames) for mode in MODES if mode in group}
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
@@ -258,25 +214,14 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
     return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64))
 
 
-def _read_config(file: h5py.File) -> str:
-    node = require_dataset(file, "config_toml")
-    if h5py.check_string_dtype(node.dtype) is None or node.shape != ():
-        raise InvalidInputError(f"{locate(file, 'config_toml')}: expected a text, got {node.dtype}")
-    return str(node.asstr(errors="replace")[()])
-
-
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
     group = find_group(file, "pairs")
     if group is None:
         return None
-    first = read_checked(group, "first", ("pair",), np.int64)
-    centres: FloatArray = read_checked(group, "patch_centre_mm", ("patch", 2))
-    lengths: dict[int | str, int | str] = {"patch": len(centres)}
     values = {
-        name: read_checked(group, name, (first.size, *(lengths.get(n, n) for n in row)), dtype)
-        for name, (row, dtype) in _PAIR_FIELDS.items()
+        name: read_checked(group, name, ("pair", *row), dtype) for name, (row, dtype) in _PAIR_FIELDS.items()
     }
-    pairs = FramePairs(patch_centre_mm=centres, **values)
+    pairs = FramePairs(patch_centre_mm=read_checked(group, "patch_centre_mm", ("patch", 2)), **values)
     _check_pairs(pairs, frames, locate(group))
     transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))
     return pairs

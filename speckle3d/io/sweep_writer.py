@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
-from types import TracebackType
 from typing import Any, Literal
 
 import h5py
@@ -16,9 +14,17 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
-from speckle3d.io.hdf5 import PathLike, atomic_hdf5, atomic_path, open_hdf5, opened
-from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames
+from speckle3d.core.sweep import (
+    INERTIAL,
+    BModeSettings,
+    ImageGrid,
+    OrientationSensor,
+    RFSettings,
+    Sweep,
+    Tracker,
+)
+from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
+from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None
 Progress = Callable[[int, int], None]
@@ -27,7 +33,7 @@ _GZIP_LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
 
 
-class SweepWriter:
+class SweepWriter(HDF5Writer):
     """Write a sweep file frame by frame; it appears whole when the block ends, or not at all.
 
     Parameters
@@ -50,35 +56,30 @@ class SweepWriter:
         dtype: npt.DTypeLike | None = None,
         compression: Compression = "gzip",
     ) -> None:
-        self._path, self._grid, self._signal = path, grid, signal
+        super().__init__(path, FORMAT, VERSION)
+        self._grid, self._signal = grid, signal
         self._name = "rf" if isinstance(signal, RFSettings) else "bmode"
         self._dtype = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
-        if self._dtype not in SAMPLE_TYPES[self._name]:
-            expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[self._name])
-            raise InvalidInputError(
-                f"{path}: expected {self._name} samples of type {expected}, got {self._dtype}"
-            )
+        require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
         self._compression = compression
         self._time_s: list[float] = []
-        self._stack = ExitStack()
 
-    def __enter__(self) -> SweepWriter:
-        with ExitStack() as stack:
-            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, FORMAT, VERSION))
-            self._frames = self._create_frames().id
-            self._in_memory = h5py.h5s.create_simple((self._grid.vectors, self._grid.samples))
-            self._kind = h5py.h5t.py_create(self._dtype)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is not None:
-            self._stack.__exit__(kind, error, trace)
-            return
-        with self._stack:
-            self._finish()
+    def _begin(self) -> None:
+        shape = (self._grid.vectors, self._grid.samples)
+        node = self._file.create_dataset(
+            self._name,
+            shape=(0, *shape),
+            maxshape=(None, *shape),
+            chunks=(1, *shape),
+            dtype=self._dtype,
+            compression=self._compression,
+            compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
+            shuffle=self._compression is not None,
+        )
+        node.attrs.update(_attributes(self._grid, self._signal))
+        self._frames = node.id
+        self._in_memory = h5py.h5s.create_simple(shape)
+        self._kind = h5py.h5t.py_create(self._dtype)
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
@@ -90,8 +91,8 @@ class SweepWriter:
         """
         i = len(self._time_s)
         where = f"{self._path}: /{self._name}[{i}]"
-        if frame.shape != (self._grid.vectors, self._grid.samples):
-            expected = (self._grid.vectors, self._grid.samples)
+        expected = (self._grid.vectors, self._grid.samples)
+        if frame.shape != expected:
             raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
         if not np.can_cast(frame.dtype, self._dtype, "same_kind"):
             raise InvalidInputError(f"{where}: expected samples of type {self._dtype}, got {frame.dtype}")
@@ -100,19 +101,9 @@ class SweepWriter:
         self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
         self._time_s.append(float(time_s))
 
-    def write_orientation(self, sensor: OrientationSensor) -> None:
-        """Write the orientation sensor's stream."""
-        _fill_orientation(self._file.create_group("orientation"), sensor)
-
-    def write_tracker(self, tracker: Tracker) -> None:
-        """Write the 6-DOF sensor's stream."""
-        group = self._file.create_group("tracker")
-        group["time_s"] = tracker.readings.time_s
-        group["world_from_sensor"] = tracker.readings.world_from_sensor.as_matrix()
-        group["valid"] = np.ones(len(tracker.readings), dtype=bool)
-        if tracker.sensor_from_image is not None:
-            group.attrs["sensor_from_image"] = tracker.sensor_from_image.as_matrix()
-        group.attrs["time_offset_s"] = tracker.time_offset_s
+    def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
+        """Write a sensor's stream."""
+        _write_sensor(self._file, sensor)
 
     def write_truth(self, world_from_image: RigidTransform) -> None:
         """Write the true pose of every frame."""
@@ -142,22 +133,6 @@ class SweepWriter:
         self._frames.write(self._in_memory, on_disk, frame, self._kind)
         # Kept until the next frame, so that a Ctrl-C pressed meanwhile is not lost (as in HDF5Frames).
         self._on_disk = on_disk
-
-    def _create_frames(self) -> h5py.Dataset:
-        shape = (self._grid.vectors, self._grid.samples)
-        node = self._file.create_dataset(
-            self._name,
-            shape=(0, *shape),
-            maxshape=(None, *shape),
-            chunks=(1, *shape),
-            dtype=self._dtype,
-            compression=self._compression,
-            compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
-            shuffle=self._compression is not None,
-        )
-        for name, value in _attributes(self._grid, self._signal).items():
-            node.attrs[name] = value
-        return node
 
     def _finish(self) -> None:
         with naming(str(self._path)):
@@ -208,20 +183,19 @@ def write_sweep(
             writer.append(sweep.frames[i], time_s)
             if progress is not None:
                 progress(i + 1, len(sweep))
-        if sweep.orientation is not None:
-            writer.write_orientation(sweep.orientation)
-        if sweep.tracker is not None:
-            writer.write_tracker(sweep.tracker)
+        for sensor in (sweep.orientation, sweep.tracker):
+            if sensor is not None:
+                writer.write_sensor(sensor)
         if sweep.truth is not None:
             writer.write_truth(sweep.truth)
         if simulation is not None:
             writer.write_simulation(simulation)
-        if isinstance(sweep.frames, HDF5Frames):
+        if type(sweep.frames) is HDF5Frames:
             writer.copy_unknown(sweep.frames.path)
 
 
-def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool = False) -> None:
-    """Put an orientation sensor's stream into a sweep file that is already there.
+def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
+    """Put an orientation sensor's stream into a sweep file, in place of the one it may hold.
 
     The file is copied, changed and put back in one step, so that it is never half written.
 
@@ -230,46 +204,39 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor, replace: bool 
     FileError
         If the file cannot be read or written.
     InvalidInputError
-        If it is no sweep file, or has a stream already and `replace` is not given.
+        If it is no sweep file.
     """
     with opened(path, FORMAT, VERSION) as file:
-        if "orientation" in file and not replace:
-            raise InvalidInputError(
-                f"{path}: expected a sweep without an orientation stream, got one: ask to replace it"
-            )
+        held = "orientation" in file
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
         with h5py.File(part, "r+") as file:
-            if "orientation" in file:
+            if held:
                 del file["orientation"]
-            _fill_orientation(file.create_group("orientation"), sensor)
+            _write_sensor(file, sensor)
 
 
-def _fill_orientation(group: h5py.Group, sensor: OrientationSensor) -> None:
+def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
+    group = file.create_group("tracker" if isinstance(sensor, Tracker) else "orientation")
     group["time_s"] = sensor.readings.time_s
+    group.attrs["time_offset_s"] = sensor.time_offset_s
+    if isinstance(sensor, Tracker):
+        group["world_from_sensor"] = sensor.readings.world_from_sensor.as_matrix()
+        group["valid"] = np.ones(len(sensor.readings), dtype=bool)
+        if sensor.sensor_from_image is not None:
+            group.attrs["sensor_from_image"] = sensor.sensor_from_image.as_matrix()
+        return
     group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
-    for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+    for name in INERTIAL:
         if (values := getattr(sensor, name)) is not None:
             group[name] = np.asarray(values, dtype=np.float64)
     if sensor.sensor_from_image is not None:
         group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
-    group.attrs["time_offset_s"] = sensor.time_offset_s
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
+    held = vars(signal) | {"first_sample_depth_mm": grid.first_sample_depth_mm}
     if isinstance(signal, RFSettings):
-        return {
-            "sampling_rate_hz": signal.sampling_rate_hz,
-            "vector_pitch_mm": grid.vector_pitch_mm,
-            "speed_of_sound_m_s": signal.speed_of_sound_m_s,
-            "first_sample_depth_mm": grid.first_sample_depth_mm,
-            "centre_frequency_hz": signal.centre_frequency_hz,
-            "bandwidth_hz": np.asarray(signal.bandwidth_hz, dtype=float),
-        }
-    return {
-        "column_pitch_mm": grid.vector_pitch_mm,
-        "row_spacing_mm": grid.sample_spacing_mm,
-        "first_sample_depth_mm": grid.first_sample_depth_mm,
-        "dynamic_range_db": signal.dynamic_range_db,
-        "full_scale": signal.full_scale,
-    }
+        band = np.asarray(signal.bandwidth_hz, dtype=float)
+        return held | {"vector_pitch_mm": grid.vector_pitch_mm, "bandwidth_hz": band}
+    return held | {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}

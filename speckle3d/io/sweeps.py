@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import operator
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
@@ -23,7 +21,15 @@ from speckle3d.core.geometry import (
     transforms_from_matrices,
 )
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import (
+    INERTIAL,
+    BModeSettings,
+    ImageGrid,
+    OrientationSensor,
+    RFSettings,
+    Sweep,
+    Tracker,
+)
 from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
@@ -32,6 +38,7 @@ from speckle3d.io.hdf5 import (
     opened,
     read_attribute,
     read_checked,
+    read_transforms,
     read_vector_attribute,
     reading,
     require_dataset,
@@ -44,7 +51,8 @@ KNOWN = frozenset({"rf", "bmode", "frame_time_s", "orientation", "tracker", "tru
 
 SAMPLE_TYPES = {"rf": (np.dtype(np.int16), np.dtype(np.float32)), "bmode": (np.dtype(np.uint8),)}
 
-_OPTIONAL_VECTORS = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+RF_NUMBERS = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
+"""Attributes of /rf that are a number each of `RFSettings`."""
 
 
 class HDF5Frames:
@@ -56,24 +64,17 @@ class HDF5Frames:
 
     def __init__(self, path: PathLike, name: str, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self.path = Path(path).absolute()
-        self.name = name
-        self._shape = shape
-        self._dtype = dtype
+        self.name, self.stored_shape, self.dtype = name, shape, dtype
         self._open: _OpenFrames | None = None
         self._lock = threading.Lock()
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
-        return self._shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Sample type."""
-        return self._dtype
+        return self.stored_shape
 
     def __len__(self) -> int:
-        return self._shape[0]
+        return self.stored_shape[0]
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         i = operator.index(index)
@@ -95,11 +96,8 @@ class HDF5Frames:
                 self._open.file.close()
                 self._open = None
 
-    def __getstate__(self) -> tuple[Any, ...]:
-        return self.path, self.name, self._shape, self._dtype
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.__init__(*state)  # type: ignore[misc]
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, self.name, self.stored_shape, self.dtype)
 
 
 class _OpenFrames:
@@ -111,7 +109,7 @@ class _OpenFrames:
 
     def __init__(self, frames: HDF5Frames) -> None:
         self.file = open_hdf5(frames.path)
-        self._frame_shape, self._dtype = frames.shape[1:], frames.dtype
+        self._frame_shape, self._dtype = frames.stored_shape[1:], frames.dtype
         self._node = self.file[frames.name].id
         self._on_disk = self._node.get_space()
         self._in_memory = h5py.h5s.create_simple(self._frame_shape)
@@ -150,108 +148,87 @@ def read_sweep(path: PathLike) -> Sweep:
         )
 
 
-@contextmanager
-def open_sweep(path: PathLike) -> Iterator[Sweep]:
-    """Read a sweep file for the length of a block, then close it."""
-    sweep = read_sweep(path)
-    try:
-        yield sweep
-    finally:
-        if isinstance(sweep.frames, HDF5Frames):
-            sweep.frames.close()
-
-
 def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
     name = "rf" if "rf" in file else "bmode"
     if name not in file:
         raise InvalidInputError(f"{locate(file)}: expected a data set rf or bmode, got neither")
     node = require_dataset(file, name)
     where = locate(file, name)
-    if node.dtype.newbyteorder("=") not in SAMPLE_TYPES[name]:
-        expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
-        raise InvalidInputError(f"{where}: expected samples of type {expected}, got {node.dtype}")
+    dtype = node.dtype.newbyteorder("=")
+    require_sample_type(name, dtype, where)
     if node.ndim != 3 or 0 in node.shape:
         raise InvalidInputError(f"{where}: expected shape (frame, vector, sample), got {node.shape}")
-    frames = HDF5Frames(file.filename, name, node.shape, node.dtype.newbyteorder("="))
+    frames = HDF5Frames(file.filename, name, node.shape, dtype)
     with naming(where):
         signal = read_signal(node, name)
         return frames, _read_grid(node, signal), signal
 
 
+def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
+    """Raise `InvalidInputError` unless /rf or /bmode may hold samples of a type."""
+    if dtype not in SAMPLE_TYPES[name]:
+        expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
+        raise InvalidInputError(f"{where}: expected samples of type {expected}, got {dtype}")
+
+
 def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BModeSettings:
     """Read how the samples were made from attributes; `kind` is ``"rf"`` or ``"bmode"``."""
     if kind == "bmode":
-        return BModeSettings(
-            dynamic_range_db=read_attribute(node, "dynamic_range_db"),
-            full_scale=read_attribute(node, "full_scale", default=255.0),
-        )
-    band = read_vector_attribute(node, "bandwidth_hz", 2)
-    if band is None:
-        raise InvalidInputError("expected attribute bandwidth_hz, got none")
-    return RFSettings(
-        sampling_rate_hz=read_attribute(node, "sampling_rate_hz"),
-        speed_of_sound_m_s=read_attribute(node, "speed_of_sound_m_s"),
-        centre_frequency_hz=read_attribute(node, "centre_frequency_hz"),
-        bandwidth_hz=(float(band[0]), float(band[1])),
-    )
+        dynamic_range_db = read_attribute(node, "dynamic_range_db")
+        return BModeSettings(dynamic_range_db, read_attribute(node, "full_scale", default=255.0))
+    low, high = read_vector_attribute(node, "bandwidth_hz", 2).tolist()
+    return RFSettings(**{name: read_attribute(node, name) for name in RF_NUMBERS}, bandwidth_hz=(low, high))
 
 
 def _read_grid(node: h5py.Dataset, signal: RFSettings | BModeSettings) -> ImageGrid:
     _, vectors, samples = node.shape
+    first_mm = read_attribute(node, "first_sample_depth_mm")
     if isinstance(signal, RFSettings):
         pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
     else:
         pitch_mm, spacing_mm = (read_attribute(node, name) for name in ("column_pitch_mm", "row_spacing_mm"))
-    return ImageGrid(vectors, samples, pitch_mm, spacing_mm, read_attribute(node, "first_sample_depth_mm"))
+    return ImageGrid(vectors, samples, pitch_mm, spacing_mm, first_mm)
 
 
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
     group = find_group(file, "orientation")
     if group is None:
         return None
-    time_s = _read_clock(group)
+    time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
     quaternions = read_checked(group, "quaternion_wxyz", (time_s.size, 4))
     rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
-    wxyz = read_vector_attribute(group, "sensor_from_image_wxyz", 4)
-    vectors = {name: _read_vectors(group, name, time_s.size) for name in _OPTIONAL_VECTORS if name in group}
+    vectors = {name: _read_vectors(group, name, time_s.size) for name in INERTIAL if name in group}
+    mounting, name = None, "sensor_from_image_wxyz"
+    if name in group.attrs:
+        wxyz = read_vector_attribute(group, name, 4)
+        mounting = rotations_from_quaternions(wxyz[None], f"{locate(group)} attribute {name}")[0]
+    offset_s = read_attribute(group, "time_offset_s", default=0.0)
     with naming(locate(group)):
-        return OrientationSensor(
-            readings=TimedRotations(time_s, rotations),
-            sensor_from_image=None if wxyz is None else _calibrated_rotation(wxyz),
-            time_offset_s=read_attribute(group, "time_offset_s", default=0.0),
-            **vectors,
-        )
+        return OrientationSensor(TimedRotations(time_s, rotations), mounting, offset_s, **vectors)
 
 
 def _read_tracker(file: h5py.File) -> Tracker | None:
     group = find_group(file, "tracker")
     if group is None:
         return None
-    time_s = _read_clock(group)
+    time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
     valid = _read_valid(group, time_s.size)
     matrices = read_checked(group, "world_from_sensor", (time_s.size, 4, 4))
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
-    matrix = read_vector_attribute(group, "sensor_from_image", 16)
+    mounting, name = None, "sensor_from_image"
+    if name in group.attrs:
+        matrix = read_vector_attribute(group, name, 16).reshape(1, 4, 4)
+        mounting = transforms_from_matrices(matrix, f"{locate(group)} attribute {name}")[0]
+    offset_s = read_attribute(group, "time_offset_s", default=0.0)
     with naming(locate(group)):
-        return Tracker(
-            readings=TimedPoses(time_s[valid], poses[valid]),
-            sensor_from_image=None if matrix is None else _calibrated_pose(matrix),
-            time_offset_s=read_attribute(group, "time_offset_s", default=0.0),
-        )
+        return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s)
 
 
 def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:
     group = find_group(file, "truth")
-    if group is None:
-        return None
-    matrices = read_checked(group, "world_from_image", (frames, 4, 4))
-    return transforms_from_matrices(matrices, locate(group, "world_from_image"))
-
-
-def _read_clock(group: h5py.Group) -> FloatArray:
-    return require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
+    return None if group is None else read_transforms(group, "world_from_image", frames)
 
 
 def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
@@ -267,11 +244,3 @@ def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
     if samples and not valid.any():
         raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
     return valid
-
-
-def _calibrated_rotation(wxyz: FloatArray) -> Rotation:
-    return rotations_from_quaternions(wxyz[None], "attribute sensor_from_image_wxyz")[0]
-
-
-def _calibrated_pose(flat: FloatArray) -> RigidTransform:
-    return transforms_from_matrices(flat.reshape(1, 4, 4), "attribute sensor_from_image")[0]

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.io.hdf5 import PathLike, one_line
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.hdf5 import PathLike, reading
 
 
 def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
@@ -20,15 +20,13 @@ def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
     InvalidInputError
         If its bytes are not UTF-8; a byte order mark, with which editors on Windows begin, is left out.
     """
-    try:
-        with open(path, encoding="utf-8-sig") as stream:
+    with reading(path), open(path, encoding="utf-8-sig") as stream:
+        try:
             for number, line in enumerate(stream, start=1):
                 if text := line.strip():
                     yield number, text
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
-    except UnicodeDecodeError as error:
-        raise InvalidInputError(f"{path}: expected text in UTF-8, got other bytes") from error
+        except UnicodeDecodeError as error:
+            raise InvalidInputError(f"{path}: expected text in UTF-8, got other bytes") from error
 
 
 def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.volume import Volume
-from speckle3d.io.hdf5 import PathLike, atomic_path, one_line
-from speckle3d.io.headers import is_metaimage, is_nrrd, read_header
+from speckle3d.io.hdf5 import PathLike, atomic_path, one_line, reading
+from speckle3d.io.headers import image_library, is_metaimage, is_nrrd, read_header
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz")
 
@@ -46,9 +47,8 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     """
     if not Path(path).name.lower().endswith(SUFFIXES):
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
-    image = _to_image(volume)
-    with atomic_path(path) as part:
-        _write_image(path, image, part, compress)
+    with atomic_path(path) as part, image_library(path, "written") as itk:
+        itk.WriteImage(_to_image(itk, volume), str(part), useCompression=compress)
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -62,31 +62,28 @@ def read_volume(path: PathLike) -> Volume:
         If it is not a grey three-dimensional image.
     """
     _require_whole(path)
-    image = _read_image(path)
+    with image_library(path, "read") as itk:
+        image = itk.ReadImage(str(path))
+        # ITK's arrays run (k, j, i), slowest axis first.
+        voxels = itk.GetArrayFromImage(image).T
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
         raise InvalidInputError(
             f"{path}: expected a grey image of three axes, got {image.GetDimension()} axes and "
             f"{image.GetNumberOfComponentsPerPixel()} values per pixel"
         )
     with naming(str(path)):
-        return _from_image(image)
+        return _from_image(image, voxels)
 
 
-def _to_image(volume: Volume) -> Any:
-    import SimpleITK
-
-    # ITK's arrays run (k, j, i), slowest axis first.
-    image: Any = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.voxels.transpose(2, 1, 0)))
+def _to_image(itk: Any, volume: Volume) -> Any:
+    image: Any = itk.GetImageFromArray(np.ascontiguousarray(volume.voxels.T))
     image.SetSpacing(volume.spacing_mm)
     image.SetOrigin(volume.world_from_grid.translation.tolist())
     image.SetDirection(volume.world_from_grid.rotation.as_matrix().ravel().tolist())
     return image
 
 
-def _from_image(image: Any) -> Volume:
-    import SimpleITK
-
-    voxels = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0)
+def _from_image(image: Any, voxels: npt.NDArray[Any]) -> Volume:
     matrix = np.eye(4)
     matrix[:3, :3] = np.reshape(image.GetDirection(), (3, 3))
     matrix[:3, 3] = image.GetOrigin()
@@ -95,49 +92,23 @@ def _from_image(image: Any) -> Volume:
     return Volume(np.ascontiguousarray(kept), image.GetSpacing(), pose)
 
 
-def _write_image(path: PathLike, image: Any, part: Path, compress: bool) -> None:
-    import SimpleITK
-
-    try:
-        SimpleITK.WriteImage(image, str(part), useCompression=compress)
-    except RuntimeError as error:
-        raise FileError(f"{path}: cannot be written: {str(error).strip().splitlines()[-1]}") from error
-
-
-def _read_image(path: PathLike) -> Any:
-    import SimpleITK
-
-    try:
-        return SimpleITK.ReadImage(str(path))
-    except RuntimeError as error:
-        raise FileError(f"{path}: cannot be read: {str(error).strip().splitlines()[-1]}") from error
-
-
 def _require_whole(path: PathLike) -> None:
     """Refuse damaged files, which ITK fills with zeros or reports without naming them."""
-    try:
-        with open(path, "rb") as stream:
-            start = stream.read(512)
-        if is_metaimage(start):
-            read_header(path)
-        elif start.startswith(_GZIP_SIGNATURE):
-            _unpack(path)
-        elif not is_nrrd(start):
-            raise InvalidInputError(
-                f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else"
-            )
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise FileError(
-            f"{path}: expected a whole gzip file, got a damaged one: {one_line(error)}"
-        ) from error
-    except OSError as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
+    with reading(path), open(path, "rb") as stream:
+        start = stream.read(512)
+    if is_metaimage(start):
+        read_header(path)
+    elif start.startswith(_GZIP_SIGNATURE):
+        _unpack(path)
+    elif not is_nrrd(start):
+        raise InvalidInputError(f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else")
 
 
 def _unpack(path: PathLike) -> None:
     """Read a gzip file to its end, where it keeps its check sum."""
-    with gzip.open(path) as unpacked:
-        while unpacked.read(_PIECE_BYTES):
-            pass
+    try:
+        with reading(path), gzip.open(path) as unpacked:
+            while unpacked.read(_PIECE_BYTES):
+                pass
+    except (EOFError, zlib.error) as error:
+        raise FileError(f"{path}: expected a whole gzip file: {one_line(error)}") from error

@@ -10,6 +10,12 @@ from numba import njit
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
 
+@njit(cache=True, nogil=True)
+def _common(first: int, size: int, length: int, radius: int, shift: int) -> tuple[int, int]:
+    """Start and end of what stays inside both images at every lag, so that all lags share it."""
+    return max(first, 0, radius - shift), min(first + size, length, length - radius - shift)
+
+
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
 def patch_correlations(
     fixed: Float32Array,
@@ -39,21 +45,16 @@ def patch_correlations(
     corners : bool
         Whether to fill lags that are off the centre both ways; else they are NaN, for half the work.
     """
-    rows, columns = fixed.shape
     lateral_radius = out.shape[1] // 2
     axial_radius = out.shape[2] // 2
     for p in range(first.shape[0]):
         dv, ds = shift[p, 0], shift[p, 1]
-        # The part of the patch that stays inside both images at every lag, so that all lags share it.
-        v0 = max(first[p, 0], 0, lateral_radius - dv)
-        v1 = min(first[p, 0] + size[0], rows, rows - lateral_radius - dv)
-        s0 = max(first[p, 1], 0, axial_radius - ds)
-        s1 = min(first[p, 1] + size[1], columns, columns - axial_radius - ds)
-        n = (v1 - v0) * (s1 - s0)
+        v0, v1 = _common(first[p, 0], size[0], fixed.shape[0], lateral_radius, dv)
+        s0, s1 = _common(first[p, 1], size[1], fixed.shape[1], axial_radius, ds)
+        n, width = (v1 - v0) * (s1 - s0), s1 - s0
         if v1 <= v0 or s1 <= s0 or n < least_overlap * size[0] * size[1]:
             out[p] = np.nan
             continue
-        width = s1 - s0
         a_sum = 0.0
         aa_sum = 0.0
         for v in range(v0, v1):
@@ -119,7 +120,6 @@ def patch_coherences(
     first, size, shift, least_overlap, out, corners
         As for `patch_correlations`.
     """
-    rows, columns = fixed.shape[1:]
     lateral_radius = out.shape[1] // 2
     axial_radius = out.shape[2] // 2
     real, imaginary = np.empty(size[1], np.float32), np.empty(size[1], np.float32)
@@ -129,14 +129,12 @@ def patch_coherences(
         cosine[k], sine[k] = np.cos(ramp_rad[1] * k), np.sin(ramp_rad[1] * k)
     for p in range(first.shape[0]):
         dv, ds = shift[p, 0], shift[p, 1]
-        v0 = max(first[p, 0], 0, lateral_radius - dv)
-        v1 = min(first[p, 0] + size[0], rows, rows - lateral_radius - dv)
-        s0 = max(first[p, 1], 0, axial_radius - ds)
-        s1 = min(first[p, 1] + size[1], columns, columns - axial_radius - ds)
-        if v1 <= v0 or s1 <= s0 or (v1 - v0) * (s1 - s0) < least_overlap * size[0] * size[1]:
+        v0, v1 = _common(first[p, 0], size[0], fixed.shape[1], lateral_radius, dv)
+        s0, s1 = _common(first[p, 1], size[1], fixed.shape[2], axial_radius, ds)
+        n, width = (v1 - v0) * (s1 - s0), s1 - s0
+        if v1 <= v0 or s1 <= s0 or n < least_overlap * size[0] * size[1]:
             out[p] = np.nan
             continue
-        width = s1 - s0
         sums[:] = 0.0
         power = 0.0
         for v in range(v0, v1):

@@ -50,7 +50,7 @@ def to_and_fro(source: Path, frames: int, folder: Path = DEFAULT) -> Path:
             writer.append(sweep.frames[each], 0.04 * number)
         writer.write_truth(sweep.truth[index])
         for sensor in _sensors(sweep, index):
-            (writer.write_tracker if isinstance(sensor, Tracker) else writer.write_orientation)(sensor)
+            writer.write_sensor(sensor)
     return path
 
 

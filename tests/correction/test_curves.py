@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.geometry import relative_poses
+from speckle3d.core.geometry import elevational_steps, relative_poses, skew
 from speckle3d.correction.curves import (
     AXES,
     CorrectedChain,
@@ -13,8 +13,6 @@ from speckle3d.correction.curves import (
     correction_matrices,
     cumulative_product,
     curve_basis,
-    elevational_steps,
-    skew,
 )
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, Speckle3DError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.io.calibrations import apply_calibrations, read_calibration, write_calibration
 from speckle3d.io.describe import describe
 from speckle3d.io.hdf5 import sha256_of
@@ -84,12 +84,6 @@ def test_a_calibration_comes_back(tmp_path, written):
     require_same(read_calibration(tmp_path / "c.h5"), written)
 
 
-def test_nothing_is_left_where_writing_fails(tmp_path):
-    with pytest.raises(FileError, match="nowhere"):
-        write_calibration(tmp_path / "nowhere" / "c.h5", made())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_older_file_stays_whole_when_writing_fails(path):
     before = path.read_bytes()
     with pytest.raises(TypeError):
@@ -98,146 +92,12 @@ def test_an_older_file_stays_whole_when_writing_fails(path):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["covariance", "parameters/name", "parameters/value", "parameters/standard_error", "parameters/unit",
-     "frames/used", "frames/dropped", "frames/reason"],
-)  # fmt: skip
-def test_a_missing_data_set_is_named(path, name):
-    with h5py.File(path, "r+") as file:
-        del file[name]
-    with pytest.raises(InvalidInputError, match=rf"cal\.h5: /{name}"):
-        read_calibration(path)
-
-
-@pytest.mark.parametrize("name", ["parameters", "frames", "source"])
-def test_a_missing_group_is_named(path, name):
-    with h5py.File(path, "r+") as file:
-        del file[name]
-    with pytest.raises(InvalidInputError, match=rf"cal\.h5: /{name}"):
-        read_calibration(path)
-
-
-def test_a_file_without_a_mounting_is_refused(path):
-    with h5py.File(path, "r+") as file:
-        del file["sensor_from_image"]
-    with pytest.raises(InvalidInputError, match=r"cal\.h5: /sensor_from_image_wxyz"):
-        read_calibration(path)
-
-
-@pytest.mark.parametrize(
-    ("node", "name"),
-    [(node, name)
-     for node, names in {"/": ("method", "sensor", "rms", "rms_unit", "condition_number", "verdict", "format",
-                               "version"),
-                         "frames": ("given",),
-                         "source": ("input_path", "input_sha256", "package_version", "settings_json")}.items()
-     for name in names],
-)  # fmt: skip
-def test_a_missing_attribute_is_named(path, node, name):
-    with h5py.File(path, "r+") as file:
-        del file[node].attrs[name]
-    with pytest.raises(InvalidInputError, match=name) as error:
-        read_calibration(path)
-    assert str(path) in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("sensor_from_image", lambda a: 1.01 * a, r"/sensor_from_image"),
-        (
-            "sensor_from_image",
-            lambda a: a @ np.diag([1, 1, -1, 1]),
-            r"/sensor_from_image",
-        ),
-        ("sensor_from_image", lambda a: a * np.nan, "/sensor_from_image"),
-        ("sensor_from_image", lambda a: a[:3], r"/sensor_from_image.*\(4, 4\).*\(3, 4\)"),
-        ("pixel_mm", lambda a: -a, "pixel_mm"),
-        ("pixel_mm", lambda a: a[:1], r"/pixel_mm.*\(2,\).*\(1,\)"),
-        ("covariance", lambda a: a[:3, :3], r"/covariance.*\(6, 6\).*\(3, 3\)"),
-        ("covariance", lambda a: -a, r"/covariance\[0\]"),
-        ("covariance", lambda a: a + np.nan, "/covariance"),
-        ("covariance", lambda a: np.where(np.eye(6), a, np.nan), "/covariance"),
-        ("parameters/value", lambda a: a * np.nan, r"/parameters/value\[0\]"),
-        (
-            "parameters/value",
-            lambda a: a[:1],
-            r"/parameters/standard_error.*\(1,\).*\(2,\)",
-        ),
-        ("parameters/standard_error", lambda a: -a, r"/parameters/standard_error\[0\]"),
-        ("parameters/name", lambda a: a[:1], "/parameters/name.*2"),
-        ("parameters/name", lambda a: np.arange(2), "/parameters/name.*2"),
-        ("frames/used", lambda a: a + 5, r"/frames/used\[2\].*9.*9"),
-        ("frames/dropped", lambda a: -a, r"/frames/dropped\[0\].*9.*-2"),
-        ("frames/used", lambda a: a + 0.5, "/frames/used"),
-        ("frames/reason", lambda a: a[:1], "/frames/reason.*3"),
-    ],
-)
-def test_what_is_wrong_is_said_with_the_file(path, name, change, message):
-    with h5py.File(path, "r+") as file:
-        spoiled = change(file[name][()])
-        del file[name]
-        file[name] = spoiled
-    with pytest.raises(InvalidInputError, match=message) as error:
-        read_calibration(path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def test_a_quaternion_must_be_of_length_one(path):
     write_calibration(path, made("orientation"))
     with h5py.File(path, "r+") as file:
         file["sensor_from_image_wxyz"][0] = 2.0
     with pytest.raises(InvalidInputError, match=r"/sensor_from_image_wxyz"):
         read_calibration(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("sensor", "camera", "sensor.*'camera'"),
-        ("format", "speckle3d.sweep", r"'speckle3d\.calibration'.*'speckle3d\.sweep'"),
-        ("version", 2, "version 1, got 2"),
-        ("rms", np.nan, "rms"),
-        ("rms", "small", "rms.*1"),
-        ("condition_number", np.nan, "condition_number"),
-        ("condition_number", "good", "condition_number"),
-        ("condition_number", [1.0, 2.0], "condition_number"),
-        ("time_offset_s", np.inf, "time_offset_s"),
-        ("verdict", 1, "verdict"),
-    ],
-)
-def test_an_attribute_that_is_wrong_is_named(path, name, value, message):
-    with h5py.File(path, "r+") as file:
-        file.attrs[name] = value
-    with pytest.raises(InvalidInputError, match=message) as error:
-        read_calibration(path)
-    assert str(path) in str(error.value)
-
-
-def test_files_that_are_not_calibrations(tmp_path):
-    with pytest.raises(FileError, match="expected a file, got none"):
-        read_calibration(tmp_path / "none.h5")
-    (tmp_path / "text.h5").write_text("calibration")
-    with pytest.raises(FileError, match="expected an HDF5 file"):
-        read_calibration(tmp_path / "text.h5")
-
-
-@settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_a_damaged_file_is_an_error_of_one_line_or_harmless(path, tmp_path, data):
-    whole = path.read_bytes()
-    damaged = bytearray(whole[: data.draw(st.sampled_from([len(whole), len(whole) // 2, 600]))])
-    for _ in range(data.draw(st.integers(1, 4))):
-        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
-    (tmp_path / "damaged.h5").write_bytes(damaged)
-    try:
-        read_calibration(tmp_path / "damaged.h5")
-        describe(tmp_path / "damaged.h5")
-    except Speckle3DError as error:
-        message = str(error)
-        assert "\n" not in message
 
 
 def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):

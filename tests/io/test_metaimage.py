@@ -189,10 +189,7 @@ def test_bad_fields_are_named_with_their_frame(tmp_path, frames, message):
         ({"UltrasoundImageOrientation": "MM"}, "UltrasoundImageOrientation.*MM"),
         ({"UltrasoundImageOrientation": "F"}, "UltrasoundImageOrientation"),
         ({"UltrasoundImageType": "RGB_COLOR"}, "RGB_COLOR"),
-        (
-            {"UltrasoundImageType": "RF_I_LINE_Q_LINE", "ElementType": "MET_UCHAR"},
-            "I and Q",
-        ),
+        ({"UltrasoundImageType": "RF_I_LINE_Q_LINE", "ElementType": "MET_UCHAR"}, "I and Q"),
         ({"DimSize": "5 x 3"}, "DimSize"),
         ({"DimSize": "5 4 3 1"}, "DimSize"),
     ],

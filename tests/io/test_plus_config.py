@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
-from speckle3d.io.plus_config import Clip, read_wire_phantom
+from speckle3d.io.plus_config import read_wire_phantom
 
 N = """<Pattern Type="NWire">
   <Wire Name="a" EndPointFront="30 0 20" EndPointBack="30 40 20" />
@@ -42,15 +42,14 @@ def test_wires_patterns_and_hints_are_read(tmp_path):
     np.testing.assert_array_equal(phantom.ends_mm[3], [[55, 0, 20], [35, 40, 20]])
     assert phantom.world_from_phantom is None
     assert config.pixel_mm == 0.078
-    assert config.clip == Clip(27, 28, 766, 562)
     # 766 columns from number 27 end with number 792.
-    np.testing.assert_array_equal(config.clip.corners_px, [[27, 28], [792, 28], [792, 589], [27, 589]])
+    np.testing.assert_array_equal(config.clip_px, [[27, 28], [792, 28], [792, 589], [27, 589]])
 
 
 def test_a_file_without_segmentation_gives_no_hints(tmp_path):
     config = read_wire_phantom(device_set(tmp_path))
     assert config.pixel_mm is None
-    assert config.clip is None
+    assert config.clip_px is None
 
 
 @pytest.mark.parametrize(
@@ -83,14 +82,8 @@ def test_frames_go_by_the_names_the_file_gives_them(tmp_path):
             {"transforms": POSE.format("Phantom", "Reference").replace("0 -1 0", "0 -2 0")},
             r"Transform Phantom to Reference: Matrix\[0\]",
         ),
-        (
-            {"transforms": '<Transform From="Phantom" To="Reference" />'},
-            "Transform Phantom: Matrix.*16",
-        ),
-        (
-            {"segmentation": SEGMENTATION.replace("0.078", "-1")},
-            "ApproximateSpacing.*-1",
-        ),
+        ({"transforms": '<Transform From="Phantom" To="Reference" />'}, "Transform Phantom: Matrix.*16"),
+        ({"segmentation": SEGMENTATION.replace("0.078", "-1")}, "ApproximateSpacing.*-1"),
         ({"segmentation": SEGMENTATION.replace("766", "0")}, "Segmentation: clip"),
     ],
 )
@@ -136,7 +129,7 @@ def test_the_published_device_set_is_read(realdata):
     config = read_wire_phantom(realdata / "plus" / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml")
     assert config.phantom.n_shapes == ((0, 1, 2), (3, 4, 5), (6, 7, 8))
     assert config.phantom.names[4] == "5:H3_l3"
-    assert config.clip == Clip(27, 27, 766, 562)
+    np.testing.assert_array_equal(config.clip_px[[0, 2]], [[27, 27], [792, 588]])
     np.testing.assert_allclose(config.phantom.world_from_phantom.translation, [15.6642, -25.3628, -40.7799])
 
 

@@ -57,10 +57,7 @@ HEAD = "frame,column_px,row_px,wire\n"
         (HEAD + "1e30,1,2,G1\n", "line 2: frame"),
         (HEAD + "0,1,2,H9\n", "line 2: wire.*'H9'"),
         (HEAD + "0,1,2,3\n", "line 2: wire"),
-        (
-            HEAD + "0,1,2,G1\n\n0,5,5,0\n",
-            "line 4: .*line 2",
-        ),
+        (HEAD + "0,1,2,G1\n\n0,5,5,0\n", "line 4: .*line 2"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(tmp_path, text, message):

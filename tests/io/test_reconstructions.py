@@ -80,14 +80,8 @@ def test_how_far_poses_may_be_trusted_comes_back(path, tmp_path):
 @pytest.mark.parametrize(
     ("trust", "message"),
     [
-        (
-            Trust(TRUST.covariance[1:], TRUST.flags),
-            r"covariance.*\(8, 6, 6\).*\(7, 6, 6\)",
-        ),
-        (
-            Trust(TRUST.covariance[..., 0], TRUST.flags),
-            r"covariance.*\(8, 6, 6\).*\(8, 6\)",
-        ),
+        (Trust(TRUST.covariance[1:], TRUST.flags), r"covariance.*\(8, 6, 6\).*\(7, 6, 6\)"),
+        (Trust(TRUST.covariance[..., 0], TRUST.flags), r"covariance.*\(8, 6, 6\).*\(8, 6\)"),
         (Trust(TRUST.covariance, TRUST.flags[:3]), r"flags.*\(8,\).*\(3,\)"),
     ],
 )
@@ -131,19 +125,10 @@ def test_an_unfinished_reconstruction_is_an_error(tmp_path):
 @pytest.mark.parametrize(
     ("chunk", "message"),
     [
-        (
-            replace(pairs([0]), second=np.array([N])),
-            rf"/pairs\[0\].*{N}",
-        ),
-        (
-            replace(pairs([0]), used=np.ones((1, 2), bool)),
-            r"/pairs/used.*\(1, 6\).*\(1, 2\)",
-        ),
+        (replace(pairs([0]), second=np.array([N])), rf"/pairs\[0\].*{N}"),
+        (replace(pairs([0]), used=np.ones((1, 2), bool)), r"/pairs/used.*\(1, 6\).*\(1, 2\)"),
         (replace(pairs([0]), covariance=np.eye(6)), r"/pairs/covariance.*\(1, 6, 6\)"),
-        (
-            replace(pairs([0]), patch_centre_mm=np.zeros((6, 2))),
-            r"/pairs/patch_centre_mm",
-        ),
+        (replace(pairs([0]), patch_centre_mm=np.zeros((6, 2))), r"/pairs/patch_centre_mm"),
     ],
 )
 def test_pairs_that_do_not_fit_are_refused(tmp_path, chunk, message):
@@ -182,27 +167,15 @@ def replace_entry(node, values):
     ("edit", "message"),
     [
         (edit_entry("poses/image", (4, 1, 1), 7.0), r"/poses/image\[4\]"),
-        (
-            edit_entry("pairs/first_from_second", (2, 0, 0), np.nan),
-            r"first_from_second\[\(2, 0, 0\)\]",
-        ),
+        (edit_entry("pairs/first_from_second", (2, 0, 0), np.nan), r"first_from_second\[\(2, 0, 0\)\]"),
         (edit_entry("pairs/second", 1, 0), r"/pairs\[1\]"),
         (lambda file: file["pairs"].__delitem__("used"), r"/pairs/used"),
         (lambda file: file.__delitem__("poses"), r"/poses"),
         (lambda file: file["poses"].__delitem__("image"), r"r\.h5.*'image'"),
-        (
-            lambda file: file.attrs.__delitem__("input_sha256"),
-            r"input_sha256",
-        ),
-        (
-            lambda file: file.attrs.__setitem__("vector_pitch_mm", 0),
-            r"r\.h5: vector_pitch_mm",
-        ),
+        (lambda file: file.attrs.__delitem__("input_sha256"), r"input_sha256"),
+        (lambda file: file.attrs.__setitem__("vector_pitch_mm", 0), r"r\.h5: vector_pitch_mm"),
         (replace_entry("frame_flags", np.zeros(3, int)), r"/frame_flags.*\(8,\).*\(3,\)"),
-        (
-            replace_entry("pose_covariance/image", np.eye(6)),
-            r"/pose_covariance/image.*\(8, 6, 6\)",
-        ),
+        (replace_entry("pose_covariance/image", np.eye(6)), r"/pose_covariance/image.*\(8, 6, 6\)"),
         (edit_entry("pose_covariance/image", (3, 2, 2), np.nan), r"/pose_covariance/image\[.*3, 2, 2"),
         (lambda file: file.attrs.__setitem__("version", 9), r"speckle3d.reconstruction version 1, got 9"),
     ],
