@@ -14,6 +14,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.curves import read_curves
@@ -22,7 +24,7 @@ from speckle3d.scoring.references import require_reference
 from speckle3d.study.folder import named, only_run
 from speckle3d.study.job import SUBSET
 from speckle3d.study.results import Study, SweepOutcome, write_study
-from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
+from speckle3d.study.schedulers import InProcess, Scheduler
 from speckle3d.study.sweepjob import (
     BlockJob,
     BlockOutcome,
@@ -80,9 +82,12 @@ class StudyProgress:
         self._look_ahead(workers)
 
     def _look_ahead(self, workers: int) -> None:
-        running = min(workers, self.sweeps - self.done + self.blocks)
-        left = self.frames - self.done_frames
-        self.remaining_s = remaining_s(self._timed, left, running) if self.done < self.sweeps else 0.0
+        running = max(1, min(workers, self.sweeps - self.done + self.blocks))
+        rates = [seconds / work for work, seconds in self._timed if work > 0]
+        if self.done == self.sweeps:
+            self.remaining_s = 0.0
+        elif rates:
+            self.remaining_s = float(np.median(rates)) * (self.frames - self.done_frames) / running
 
 
 def compare_sweeps(

@@ -119,7 +119,7 @@ def write_summary(directory: Path, summaries: Sequence[Summary]) -> list[Path]:
         "table.txt": table_text(summaries),
         "table.csv": csv_text(summaries),
     }
-    return _write_texts(directory, texts)
+    return write_texts(directory, texts)
 
 
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
@@ -165,7 +165,7 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
         "table.txt": table,
         "table.csv": csv_text(summaries, outcomes, copies),
     }
-    _write_texts(directory, files)
+    write_texts(directory, files)
     return Study(directory, outcomes, summaries, drift, table, copies)
 
 
@@ -302,7 +302,8 @@ def _listed(value: Any) -> Any:
     raise ValueError(f"got {type(value)}")
 
 
-def _write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Write texts under their names; each appears whole or not at all."""
     make_folder(directory)
     for name, text in texts.items():
         with atomic_path(directory / name) as part:

@@ -78,7 +78,7 @@ def test_turns_are_found_where_they_are_through_jitter():
 def test_parts_share_their_turning_frame():
     parts = monotone_parts(there_and_back(), jitter_frames=1)
     assert [(p.name, p.first, p.last) for p in parts] == [("f", 0, 50), ("r", 50, 100)]
-    assert there_and_back()[parts[1].frames][0] == 10.0
+    assert there_and_back()[parts[1].first] == 10.0
 
 
 @pytest.mark.parametrize(("back_mm", "names"), [(0.4, ["f"]), (0.7, ["f", "r", "f2"])])

@@ -270,3 +270,8 @@ def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path)
     assert at.remaining_s == pytest.approx(20.0)
     at.add(SweepOutcome("c", tmp_path, "failed"), 100, 2)
     assert (at.remaining_s, at.failed, at.done) == (0.0, 1, 3)
+    # Rates 0.1, 0.1 and 5 s a frame: one slow sweep does not change the median.
+    slow = StudyProgress(sweeps=4, frames=360)
+    for frames, seconds in ((100, 10.0), (50, 5.0), (10, 50.0)):
+        slow.add(SweepOutcome("a", tmp_path, "done", seconds=seconds), frames, 2)
+    assert slow.remaining_s == pytest.approx(20.0)
