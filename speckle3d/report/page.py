@@ -20,18 +20,12 @@ from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
 from speckle3d.report import plots as interactive
+from speckle3d.report import tables
 from speckle3d.report.data import Record, StudyData, SweepView, load_view, read_study
-from speckle3d.report.lead import best_of, counted, scored_means, summary_lines
 from speckle3d.report.reslices import Cuts, cut_modes
-from speckle3d.report.tables import (
-    intervals_table,
-    modes_table,
-    paired_table,
-    parts_table,
-    records_table,
-)
 from speckle3d.study.figures import curve_panels, figure_panels
 from speckle3d.study.folder import only_run
+from speckle3d.study.overall import counted
 from speckle3d.study.results import copy_lines
 
 if TYPE_CHECKING:
@@ -121,10 +115,10 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     from plotly.offline import get_plotlyjs
 
     anchors = {each.name: each.anchor for each in sections}
-    found = scored_means(study.single, study.modes)
-    lead = summary_lines(found, len(study.done), len(study.broken), study.paired, study.references)
+    found = tables.scored_means(study.single, study.modes)
+    lead = tables.summary_lines(found, len(study.done), len(study.broken), study.paired, study.references)
     keys = ("name", "path", "sha256", "key", "seconds")
-    best = best_of(found.means, "length_percent") if found.together else None
+    best = tables.best_of(found.means, "length_percent") if found.together else None
     scripts = [get_plotlyjs(), files("speckle3d.report").joinpath("script.js").read_text(encoding="utf-8")]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("speckle3d", "report"),
@@ -136,18 +130,18 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     return environment.get_template("page.html").render(
         shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
         lead=lead + [f"{line}." for line in copy_lines(study.copies)],
-        broken=records_table([_part(entry, ("name", "status", "reason")) for entry in study.broken]),
-        modes=modes_table(found.means, best),
+        broken=tables.records_table([_part(entry, ("name", "status", "reason")) for entry in study.broken]),
+        modes=tables.modes_table(found.means, best),
         overview=overview,
-        parts=parts_table(study.rows, anchors),
-        drift=records_table(study.drift, anchors),
-        intervals=intervals_table(study.intervals),
-        paired=paired_table(study.paired),
+        parts=tables.parts_table(study.rows, anchors),
+        drift=tables.records_table(study.drift, anchors),
+        intervals=tables.intervals_table(study.intervals),
+        paired=tables.paired_table(study.paired),
         sections=sections,
         figures=[*([overview] if overview else []), *(each for some in sections for each in some.figures)],
         configuration=study.settings_toml,
         version=version("speckle3d"),
-        provenance=records_table([_part(entry, keys) for entry in (*study.done, *study.broken)]),
+        provenance=tables.records_table([_part(entry, keys) for entry in (*study.done, *study.broken)]),
         scripts=[Markup(text) for text in scripts],
         script_hashes=" ".join(_hash(text) for text in scripts),
     )

@@ -22,11 +22,19 @@ from speckle3d.report.figures import (
     overview_panels,
     patch_size,
 )
-from speckle3d.report.lead import Scored, scored_means, summary_lines
 from speckle3d.report.page import write_report
 from speckle3d.report.plots import plot_outlines, plot_panels, plot_rejected
 from speckle3d.report.reslices import cut_modes
-from speckle3d.report.tables import heading_of, intervals_table, paired_table, parts_table, records_table
+from speckle3d.report.tables import (
+    Scored,
+    heading_of,
+    intervals_table,
+    paired_table,
+    parts_table,
+    records_table,
+    scored_means,
+    summary_lines,
+)
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import curve_panels, label_of
 from speckle3d.study.overall import over_sweeps
@@ -283,12 +291,12 @@ def test_the_lead_names_the_modes_that_are_not_told_apart_from_the_best():
 
 def test_means_and_differences_over_sweeps_are_tables(page):
     words = " ".join(page.words)
-    assert "1.0 (0.5 to 1.5)" in words
-    assert "+11.1% (+2.1% to +20.0%)" in words
+    assert "1.0 [0.5, 1.5]" in words
+    assert "+11.1% [+2.1%, +20.0%]" in words
     assert f"{label_of('image')} − {label_of('pose')}" in words
     ((_, line),) = paired_table(pairs("FDR", ("image", "pose"))).lines
     assert [cell.is_bold for cell in line] == [False, False, True, False]
-    assert line[1].text.splitlines() == ["+100.0%", "(−50.0% to +250.0%)"]
+    assert line[1].text.splitlines() == ["+100.0%", "[−50.0%, +250.0%]"]
     assert intervals_table([]) is None
 
 
@@ -296,7 +304,7 @@ def test_means_of_fewer_sweeps_say_so():
     held = {"quantity": "FDR", "low": None, "high": None, "mean": 0.5}
     rows = [held | {"mode": mode, "sweeps": sweeps} for mode, sweeps in (("image", 4), ("pose", 1))]
     ((_, line),) = intervals_table(rows).lines
-    assert [len(cell.text.splitlines()) for cell in line] == [1, 1, 2]
+    assert [cell.text for cell in line] == ["FDR", "50.0%", "50.0% (1)"]
 
 
 @pytest.mark.parametrize(
