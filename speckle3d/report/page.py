@@ -19,10 +19,8 @@ from markupsafe import Markup
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
-from speckle3d.report import plots as interactive
 from speckle3d.report import tables
-from speckle3d.report.data import Record, StudyData, SweepView, load_view, read_study
-from speckle3d.report.reslices import Cuts, cut_modes
+from speckle3d.report.data import Cuts, Record, StudyData, SweepView, cut_modes, load_view, read_study
 from speckle3d.study.figures import curve_panels, figure_panels
 from speckle3d.study.folder import only_run
 from speckle3d.study.overall import counted
@@ -100,8 +98,8 @@ def write_report(directory: Path) -> Path:
     """
     study = read_study(directory)
     with only_run(directory):
-        overview = _overview(study)
-        sections = [_section(study, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
+        overview = _overview(study, directory)
+        sections = [_section(directory, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
         stems = {str(entry.get("folder", "")).rpartition("/")[2] for entry in study.done}
         _clear_figures(directory / "figures", stems)
         target = directory / "report.html"
@@ -155,10 +153,10 @@ def _clear_figures(folder: Path, stems: Collection[str]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _overview(study: StudyData) -> PageFigure | None:
+def _overview(study: StudyData, directory: Path) -> PageFigure | None:
     scored = [row for row in study.single if row.get("length_error_mm") is not None]
     if not scored:
-        for path in (study.directory / "figures").glob("overview.*"):
+        for path in (directory / "figures").glob("overview.*"):
             path.unlink()
         return None
     modes = [mode for mode in study.modes if any(row["mode"] == mode for row in scored)]
@@ -167,24 +165,26 @@ def _overview(study: StudyData) -> PageFigure | None:
         "Errors of length and tilt: a point for every part of every sweep, a bar from minus to plus the mean "
         "magnitude over the mode's sweeps."
     )
-    plot = interactive.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
-    return _vector(study.directory, "overview", draw.figure_overview(panels), caption, plot)
+    plot = draw.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
+    return _filed(directory, "overview", draw.figure_overview(panels), caption, plot)
 
 
-def _section(study: StudyData, entry: Record, anchor: str) -> Section:
+def _section(directory: Path, entry: Record, anchor: str) -> Section:
     name = str(entry["name"])
     try:
-        view = load_view(study.directory, entry)
+        view = load_view(directory, entry)
         cuts = cut_modes(view)
-        figures = [_curves(study.directory, view), _outlines(study.directory, view)]
-        if cuts is not None:
-            figures.append(_reslices(study.directory, view, cuts))
-        patches = _patches(study.directory, view, cuts)
+        patches = _patches(directory, view, cuts)
+        drawn = (
+            _curves(directory, view),
+            _outlines(directory, view),
+            None if cuts is None else _reslices(directory, view, cuts),
+            patches,
+        )
     except Speckle3DError as error:
         return Section(anchor, name, broken=str(error))
-    if patches is None:
-        return Section(anchor, name, view.notes, figures, quiet="The file of this sweep holds no patches.")
-    return Section(anchor, name, view.notes, [*figures, patches])
+    quiet = "" if patches else "The file of this sweep holds no patches."
+    return Section(anchor, name, view.notes, [each for each in drawn if each is not None], quiet=quiet)
 
 
 def _curves(directory: Path, view: SweepView) -> PageFigure:
@@ -192,14 +192,13 @@ def _curves(directory: Path, view: SweepView) -> PageFigure:
     panels = curve_panels(curves, frames=frames)
     views = {"accumulated": panels}
     if curves.reference is not None:
-        minus = curve_panels(curves, frames=frames, minus_reference=True)
-        views[f"minus {curves.reference_name}"] = minus
+        views[f"minus {curves.reference_name}"] = curve_panels(curves, frames=frames, minus_reference=True)
     caption = "Accumulated length of travel, tilt, yaw and roll."
     if curves.half_width is not None:
         caption += " The band is the 95 % interval of the uncorrected trajectory, from its covariance."
     drawn = figure_panels(panels, 2, (9.0, 6.0))
-    plot = interactive.plot_panels(views, 2, 620)
-    return _vector(directory, f"{view.folder.name}-curves", drawn, caption, plot)
+    plot = draw.plot_panels(views, 2, 620)
+    return _filed(directory, f"{view.folder.name}-curves", drawn, caption, plot)
 
 
 def _outlines(directory: Path, view: SweepView) -> PageFigure:
@@ -208,8 +207,8 @@ def _outlines(directory: Path, view: SweepView) -> PageFigure:
         f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other"
         f"{'; in print the reference is grey' if view.curves.reference_name in view.poses else ''}."
     )
-    drawn, plot = draw.figure_outlines(series), interactive.plot_outlines(series)
-    return _vector(directory, f"{view.folder.name}-outlines", drawn, caption, plot)
+    drawn, plot = draw.figure_outlines(series), draw.plot_outlines(series)
+    return _filed(directory, f"{view.folder.name}-outlines", drawn, caption, plot)
 
 
 def _reslices(directory: Path, view: SweepView, cuts: Cuts) -> PageFigure:
@@ -217,7 +216,7 @@ def _reslices(directory: Path, view: SweepView, cuts: Cuts) -> PageFigure:
         "The sweep cut along its travel at the middle vector, at the poses of every mode, and the same place "
         f"of the same frame enlarged ({cuts.depth_mm:.0f} mm deep). Blue: no frame reached."
     )
-    return _raster(directory, f"{view.folder.name}-reslices", draw.figure_cuts(cuts), caption, 110)
+    return _filed(directory, f"{view.folder.name}-reslices", draw.figure_cuts(cuts), caption, dpi=110)
 
 
 def _patches(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure | None:
@@ -231,28 +230,26 @@ def _patches(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure 
     )
     caption += ": where in the image, in how many of the pairs, and how many over the sweep."
     drawn = draw.figure_rejected(view.rejected, cuts, view.reconstruction.grid)
-    plot = interactive.plot_rejected(view.rejected)
-    return _raster(directory, f"{view.folder.name}-patches", drawn, caption, 90, plot)
+    plot = draw.plot_rejected(view.rejected)
+    return _filed(directory, f"{view.folder.name}-patches", drawn, caption, plot, 90)
 
 
-def _vector(directory: Path, name: str, drawn: Figure, caption: str, plot: Plot) -> PageFigure:
-    """File a figure and put it on the page as a vector picture, with its interactive twin."""
-    picture = draw.save_both(drawn, directory / "figures" / name)
-    return PageFigure(f"plot-{name}", _data_url("svg+xml", picture), caption, Markup(plot.to_json()))
-
-
-def _raster(
-    directory: Path, name: str, drawn: Figure, caption: str, dots_per_inch: int, plot: Plot | None = None
+def _filed(
+    directory: Path, name: str, drawn: Figure, caption: str, plot: Plot | None = None, dpi: int | None = None
 ) -> PageFigure:
-    """File a figure with an image in it and put it on the page as JPEG: a vector picture would be large."""
-    draw.save_both(drawn, directory / "figures" / name)
-    source = _data_url("jpeg", draw.rendered(drawn, "jpg", dots_per_inch))
-    data = Markup("" if plot is None else plot.to_json())
-    return PageFigure(f"plot-{name}", source, caption, data, round(96 * drawn.get_size_inches()[0]))
+    """File a figure and put it on the page as a vector picture, or as JPEG of `dpi` dots per inch.
 
-
-def _data_url(kind: str, picture: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
+    A vector picture of a figure with an image in it would be large.
+    """
+    kind, picture, width = "svg+xml", draw.save_both(drawn, directory / "figures" / name), None
+    if dpi is not None:
+        kind, picture, width = (
+            "jpeg",
+            draw.rendered(drawn, "jpg", dpi),
+            round(96 * drawn.get_size_inches()[0]),
+        )
+    source = f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
+    return PageFigure(f"plot-{name}", source, caption, Markup("" if plot is None else plot.to_json()), width)
 
 
 def _part(entry: Record, keys: Sequence[str]) -> dict[str, Any]:
