@@ -174,20 +174,14 @@ def _section(directory: Path, entry: Record, anchor: str) -> Section:
     try:
         view = load_view(directory, entry)
         cuts = cut_modes(view)
-        patches = _patches(directory, view, cuts)
-        drawn = (
-            _curves(directory, view),
-            _outlines(directory, view),
-            None if cuts is None else _reslices(directory, view, cuts),
-            patches,
-        )
+        drawn = [each(directory, view, cuts) for each in (_curves, _outlines, _reslices, _patches)]
     except Speckle3DError as error:
         return Section(anchor, name, broken=str(error))
-    quiet = "" if patches else "The file of this sweep holds no patches."
+    quiet = "" if drawn[-1] else "The file of this sweep holds no patches."
     return Section(anchor, name, view.notes, [each for each in drawn if each is not None], quiet=quiet)
 
 
-def _curves(directory: Path, view: SweepView) -> PageFigure:
+def _curves(directory: Path, view: SweepView, _cuts: Cuts | None) -> PageFigure:
     curves, frames = view.curves, draw.decimated(view.curves.frames)
     panels = curve_panels(curves, frames=frames)
     views = {"accumulated": panels}
@@ -201,7 +195,7 @@ def _curves(directory: Path, view: SweepView) -> PageFigure:
     return _filed(directory, f"{view.folder.name}-curves", drawn, caption, plot)
 
 
-def _outlines(directory: Path, view: SweepView) -> PageFigure:
+def _outlines(directory: Path, view: SweepView, _cuts: Cuts | None) -> PageFigure:
     series = draw.outline_series(view.poses, view.reconstruction.grid)
     caption = (
         f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other"
@@ -211,7 +205,9 @@ def _outlines(directory: Path, view: SweepView) -> PageFigure:
     return _filed(directory, f"{view.folder.name}-outlines", drawn, caption, plot)
 
 
-def _reslices(directory: Path, view: SweepView, cuts: Cuts) -> PageFigure:
+def _reslices(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure | None:
+    if cuts is None:
+        return None
     caption = (
         "The sweep cut along its travel at the middle vector, at the poses of every mode, and the same place "
         f"of the same frame enlarged ({cuts.depth_mm:.0f} mm deep). Blue: no frame reached."
@@ -241,13 +237,10 @@ def _filed(
 
     A vector picture of a figure with an image in it would be large.
     """
-    kind, picture, width = "svg+xml", draw.save_both(drawn, directory / "figures" / name), None
+    kind, width, picture = "svg+xml", None, draw.save_both(drawn, directory / "figures" / name)
     if dpi is not None:
-        kind, picture, width = (
-            "jpeg",
-            draw.rendered(drawn, "jpg", dpi),
-            round(96 * drawn.get_size_inches()[0]),
-        )
+        kind, width = "jpeg", round(96 * drawn.get_size_inches()[0])
+        picture = draw.rendered(drawn, "jpg", dpi)
     source = f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
     return PageFigure(f"plot-{name}", source, caption, Markup("" if plot is None else plot.to_json()), width)
 

@@ -31,7 +31,7 @@ from speckle3d.scoring.references import Reference, SweepCurves, find_reference,
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_plane
-from speckle3d.study.results import Summary, table_text, write_summary
+from speckle3d.study.results import Summary, rows_of, table_text, write_summary
 
 SUBSET = "image+subset"
 """Mode of the images alone with the patches that contradict the sensed orientation left out."""
@@ -133,10 +133,11 @@ def run_job(
     rows = _errors(sweep, poses, moved, compared)
     details = _details(tracked, corrections, moved, provenance)
     summary = Summary(sweep.name, name, len(sweep), share, rows, details)
-    files = [path, *write_summary(directory, [summary])]
+    files = [path, *write_summary(directory, summary)]
     files += [save_figure(figure_drift(moved, sweep.name), directory / "drift.png")]
     files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
-    return JobResult(directory, summary, table_text([summary]), tuple(files), time.perf_counter() - began)
+    table, seconds = table_text(rows_of([summary])), time.perf_counter() - began
+    return JobResult(directory, summary, table, tuple(files), seconds)
 
 
 def require_possible(
@@ -229,11 +230,9 @@ def _draw_reslices(
     if reference is not None and reference.covered.all():
         shown[reference.name] = reference.world_from_image
     left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
-    images, extents = {}, {}
+    cuts = {}
     for mode, world_from_image in shown.items():
         of_strip = world_from_image * left
         plane = middle_plane(of_strip, strip.grid)
-        images[mode] = cut_frames(strip, strip.grid, of_strip, plane)
-        extents[mode] = (0.0, plane.width_mm, plane.height_mm, 0.0)
-    figure = figure_reslice(images, extents, title=f"{name}: along the sweep, at the middle vector")
-    return save_figure(figure, path)
+        cuts[mode] = cut_frames(strip, strip.grid, of_strip, plane), plane
+    return save_figure(figure_reslice(cuts, title=f"{name}: along the sweep, at the middle vector"), path)
