@@ -72,20 +72,19 @@ def compare(
     for name, value in (fixed | {"config": config_file}).items():
         if paper and value:
             raise InvalidInputError(f"--paper: expected no {name}, which the study fixes, got {value}")
-    table = None
+    table = ""
     with scheduler_for(scheduler, workers) as where, _shown() as progress:
         if paper:
-            done = paper_study(
+            study, table = paper_study(
                 out, curves_file, where, progress, lambda n, total: note(f"{n} of {total} sweeps simulated")
             )
-            study, table = done.study, done.table
         else:
             study = compare_sweeps(
                 sweeps or [], out, drift, reference, curves_file, settings, calibration or (), where, progress
             )
     write_report(out)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
-    _tell(study, copies=as_json or table is not None)
+    _tell(study, copies=as_json or paper)
 
 
 def _tell(study: Study, copies: bool) -> None:

@@ -28,7 +28,7 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
-from speckle3d.study.images import PIXEL_MM, GreyImages, cut_frames, grey_images, middle_plane, middle_vectors
+from speckle3d.study.images import PIXEL_MM, cut_frames, grey_images, middle_plane, middle_vectors
 
 Record = Mapping[str, Any]
 
@@ -119,19 +119,15 @@ class SweepView:
     Attributes
     ----------
     poses : dict of str to RigidTransform, each of length n
-        By mode, in the first frame's image frame; the reference under its own name, if it covers every frame.
-    own_poses : dict
-        The same in their own worlds.
+        By mode, in their own worlds; the reference under its own name, if it covers every frame.
     sweep : Sweep or None
         None where the file is gone or changed; `notes` then says so.
     """
 
-    name: str
     folder: Path
     reconstruction: Reconstruction
     curves: SweepCurves
     poses: dict[str, RigidTransform]
-    own_poses: dict[str, RigidTransform]
     rejected: RejectedPatches | None
     sweep: Sweep | None
     details: Record
@@ -187,12 +183,10 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     if found.trust is not None:
         notes += [f"{line}: poses there are guesses" for line in describe(found.trust.flags)]
     return SweepView(
-        name=str(entry["name"]),
         folder=folder,
         reconstruction=found,
         curves=sweep_curves(found.poses, found.grid.centre_mm, reference, covariance),
-        poses={mode: each[0].inv() * each for mode, each in own.items()},
-        own_poses=own,
+        poses=own,
         rejected=None if found.pairs is None else rejected_patches(found.pairs, found.frame_time_s.size),
         sweep=sweep,
         details=details,
@@ -281,21 +275,6 @@ class Cuts:
     grid: ImageGrid
 
 
-class _Strip:
-    """The middle vectors of every grey image, made once for all modes."""
-
-    def __init__(self, images: GreyImages) -> None:
-        first, self.grid = middle_vectors(images.grid)
-        self.left_mm = first * self.grid.vector_pitch_mm
-        chosen = slice(first, first + self.grid.vectors)
-        # Each frame is made only to be cut: a sweep of a thousand whole images need not fit in memory.
-        self._images = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(images.shape[0])]
-        self.shape = (len(self._images), *self._images[0].shape)
-
-    def __getitem__(self, index: int) -> Float32Array:
-        return self._images[index].astype(np.float32)
-
-
 def cut_modes(view: SweepView) -> Cuts | None:
     """Reslice the sweep at its middle vector in every mode; None where the sweep itself is gone.
 
@@ -305,23 +284,26 @@ def cut_modes(view: SweepView) -> Cuts | None:
     if view.sweep is None:
         return None
     images = grey_images(view.sweep, _DYNAMIC_RANGE_DB, reconstruction=view.reconstruction)
-    strip = _Strip(images)
-    left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
-    poses = {mode: each * left for mode, each in view.own_poses.items()}
-    planes = {mode: middle_plane(each, strip.grid) for mode, each in poses.items()}
-    whole = {mode: cut_frames(strip, strip.grid, poses[mode], planes[mode]) for mode in poses}
+    first, grid = middle_vectors(images.grid)
+    left = RigidTransform.from_translation([first * grid.vector_pitch_mm, 0.0, 0.0])
+    # The middle vectors, made once for all modes: a sweep of a thousand whole images need not fit in memory.
+    chosen = slice(first, first + grid.vectors)
+    strip = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(len(view.sweep))]
+    poses = {mode: each * left for mode, each in view.poses.items()}
+    planes = {mode: middle_plane(each, grid) for mode, each in poses.items()}
+    whole = {mode: cut_frames(strip, grid, poses[mode], planes[mode]) for mode in poses}
     width_mm = min(DETAIL_MM, _DETAIL_SHARE * min(plane.width_mm for plane in planes.values()))
     size_mm = np.array([1.0, 0.8]) * max(width_mm, 10 * DETAIL_PIXEL_MM)
     last = list(planes)[-1]
-    frame, depth_mm = _detail_place(poses[last], planes[last], whole[last], strip.grid, size_mm)
+    frame, depth_mm = _detail_place(poses[last], planes[last], whole[last], grid, size_mm)
     by_mode = {}
     for mode, plane in planes.items():
-        point = np.array([strip.grid.width_mm / 2, depth_mm, 0.0])
+        point = np.array([grid.width_mm / 2, depth_mm, 0.0])
         centre = plane.world_from_plane.inv().apply(poses[mode][frame].apply(point))[:2]
         corner = centre - size_mm / 2
         placed = plane.world_from_plane * RigidTransform.from_translation([*corner, 0.0])
         window = ReslicePlane(placed, float(size_mm[0]), float(size_mm[1]), DETAIL_PIXEL_MM)
-        detail = cut_frames(strip, strip.grid, poses[mode], window)
+        detail = cut_frames(strip, grid, poses[mode], window)
         by_mode[mode] = Cut(whole[mode], (plane.width_mm, plane.height_mm), detail, corner, size_mm)
     return Cuts(by_mode, depth_mm, images[len(view.sweep) // 2], images.grid)
 

@@ -129,7 +129,9 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
         shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
         lead=lead + [f"{line}." for line in copy_lines(study.copies)],
         broken=tables.records_table([_part(entry, ("name", "status", "reason")) for entry in study.broken]),
-        modes=tables.modes_table(found.means, best),
+        modes=tables.records_table(
+            found.means, styles=["best" if row["mode"] == best else "" for row in found.means]
+        ),
         overview=overview,
         parts=tables.parts_table(study.rows, anchors),
         drift=tables.records_table(study.drift, anchors),
@@ -196,7 +198,8 @@ def _curves(directory: Path, view: SweepView, _cuts: Cuts | None) -> PageFigure:
 
 
 def _outlines(directory: Path, view: SweepView, _cuts: Cuts | None) -> PageFigure:
-    series = draw.outline_series(view.poses, view.reconstruction.grid)
+    laid = {mode: each[0].inv() * each for mode, each in view.poses.items()}
+    series = draw.outline_series(laid, view.reconstruction.grid)
     caption = (
         f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other"
         f"{'; in print the reference is grey' if view.curves.reference_name in view.poses else ''}."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,17 +77,7 @@ def parts_table(rows: Sequence[Record], anchors: Mapping[str, str]) -> Table | N
     columns = [*_PART_COLUMNS, *(["remark"] if any(row.get("remark") for row in rows) else [])]
     places = [(row.get("sweep"), row.get("part")) for row in rows]
     styles = ["first" if i == 0 or places[i - 1] != here else "" for i, here in enumerate(places)]
-    return _of_records(rows, columns, anchors, styles, _ERRORS)
-
-
-def modes_table(means: Sequence[Record], best: str | None) -> Table | None:
-    """Mean magnitudes of the errors by mode; the best in length in bold."""
-    return _of_records(means, styles=["best" if row["mode"] == best else "" for row in means])
-
-
-def records_table(records: Sequence[Record], anchors: Mapping[str, str] | None = None) -> Table | None:
-    """Any list of records, a column for each of their names in the order they first appear."""
-    return _of_records(records, anchors=anchors or {})
+    return records_table(rows, anchors, columns, styles)
 
 
 def intervals_table(intervals: Sequence[Record]) -> Table | None:
@@ -126,42 +116,38 @@ def _of_cells(heads: Sequence[str], lines: Sequence[Sequence[Cell]]) -> Table | 
     return Table(cells, [("", line) for line in lines]) if lines else None
 
 
-def _of_records(
+def records_table(
     records: Sequence[Record],
-    columns: Sequence[str] | None = None,
     anchors: Mapping[str, str] | None = None,
+    columns: Sequence[str] | None = None,
     styles: Sequence[str] | None = None,
-    signed: Collection[str] = (),
 ) -> Table | None:
+    """Any list of records, by default a column for each of their names in the order they first appear.
+
+    Parameters
+    ----------
+    anchors : mapping of str to str, optional
+        Places on the page that the names of sweeps lead to.
+    styles : sequence of str, optional
+        Of each line.
+    """
     if not records:
         return None
     keys = columns or list(dict.fromkeys(key for record in records for key in record))
     words = {key for key in keys if any(isinstance(record.get(key), str) for record in records)}
     heads = [Cell(heading_of(key), is_word=key in words) for key in keys]
-    lines = [
-        [_cell(key, record.get(key), key in words, anchors or {}, key in signed) for key in keys]
-        for record in records
-    ]
+    lines = [[_cell(key, row.get(key), key in words, anchors or {}) for key in keys] for row in records]
     return Table(heads, list(zip(styles or [""] * len(lines), lines, strict=True)))
 
 
-def _cell(key: str, value: Any, is_word: bool, anchors: Mapping[str, str], signed: bool) -> Cell:
+def _cell(key: str, value: Any, is_word: bool, anchors: Mapping[str, str]) -> Cell:
     if key == "mode" and isinstance(value, str):
         return Cell(label_of(value), is_word, colour=colour_of(value))
     link = anchors.get(value, "") if key == "sweep" else ""
-    return Cell(_shown(key, value, signed), is_word, link=link)
-
-
-def _shown(key: str, value: Any, signed: bool = False) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:{'+' if signed else ''}.{_digits(key)}f}"
-    if isinstance(value, list):
-        return ", ".join(_shown(key, one, signed) for one in value)
-    return str(value)
+        # Errors are estimate minus reference, and have a sign.
+        value = f"{value:{'+' if key in _ERRORS else ''}.{_digits(key)}f}"
+    return Cell("–" if value is None else str(value), is_word, link=link)
 
 
 def _digits(key: str) -> int:

@@ -252,11 +252,10 @@ def _pairs(quantity: Quantity, values: Mapping[str, FloatArray]) -> list[dict[st
     for one, other in combinations(values, 2):
         if not np.isfinite(values[one] - values[other]).any():
             continue
-        found = paired_comparison(values[one], values[other])
-        of = found.difference
-        row = {"quantity": quantity.key, "mode": one, "against": other, "sweeps": of.sweeps}
-        rows.append(row | {"difference": of.mean, "low": of.low, "high": of.high,
-                           "wilcoxon_p": found.wilcoxon_p})  # fmt: skip
+        difference, wilcoxon_p = paired_comparison(values[one], values[other])
+        row = {"quantity": quantity.key, "mode": one, "against": other, "sweeps": difference.sweeps}
+        row |= {"difference": difference.mean, "low": difference.low, "high": difference.high}
+        rows.append(row | {"wilcoxon_p": wilcoxon_p})
     for row, corrected in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):
         row["holm_p"], row["better"] = corrected, _better(row, corrected)
     return rows

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -89,14 +90,6 @@ Rows = Mapping[str, Mapping[str, Sequence[ModeError]]]
 
 
 @dataclass(frozen=True)
-class PaperStudy:
-    """The study as `compare_sweeps` left it, and the table beside the paper's."""
-
-    study: Study
-    table: str
-
-
-@dataclass(frozen=True)
 class _Input:
     """A sweep to be simulated into a file."""
 
@@ -111,7 +104,7 @@ def paper_study(
     scheduler: Scheduler | None = None,
     progress: Callable[[StudyProgress], None] | None = None,
     simulated: Callable[[int, int], None] | None = None,
-) -> PaperStudy:
+) -> tuple[Study, str]:
     """Simulate the eleven sweeps, compare the modes, and write it all into `directory`.
 
     Written, beside what `compare_sweeps` writes: ``inputs/``, kept for the next time, ``paper.txt`` and
@@ -123,6 +116,13 @@ def paper_study(
         Decorrelation curves of the simulated probe; by default they are measured, which takes as long again.
     simulated : callable, optional
         Called with the number of sweeps simulated and their total.
+
+    Returns
+    -------
+    study : Study
+        As `compare_sweeps` left it.
+    table : str
+        Beside the paper's.
 
     Raises
     ------
@@ -148,46 +148,32 @@ def paper_study(
         ]
         numbers = json_text({"means": beside(rows), "rows": held})
         write_texts(directory, {"paper.txt": table, "paper.json": numbers})
-        return PaperStudy(study, table)
+        return study, table
 
 
-@dataclass(frozen=True)
-class Beside:
-    """One mode's mean absolute errors over all parts: as published, and ours against each reference.
-
-    Attributes
-    ----------
-    published_percent, published_deg : float
-    length_percent, tilt_deg : mapping of str to MeanInterval
-        By reference. Parts, not sweeps, are the units, as there are 17 in the tables.
-    """
-
-    mode: str
-    published_percent: float
-    published_deg: float
-    length_percent: Mapping[str, MeanInterval]
-    tilt_deg: Mapping[str, MeanInterval]
-
-
-def beside(rows: Rows) -> list[Beside]:
+def beside(rows: Rows) -> list[dict[str, Any]]:
     """Means of absolute errors over all parts, by mode.
 
     Parameters
     ----------
     rows : mapping of str to mapping of str to sequence of ModeError
         By reference, then by data set.
+
+    Returns
+    -------
+    list of dict
+        ``mode``; ``published_percent`` of length and ``published_deg`` of tilt; ``length_percent`` and
+        ``tilt_deg``, ours by reference, as `MeanInterval`. Parts, not sweeps, are the units, as there are 17
+        in the tables.
     """
-    length, tilt = (np.abs([each[k] for each in PUBLISHED.values()]).mean(axis=0) for k in (0, 1))
-    return [
-        Beside(
-            mode,
-            float(length[k]),
-            float(tilt[k]),
-            {name: mean_interval(np.abs(_errors(found, mode)[:, 0])) for name, found in rows.items()},
-            {name: mean_interval(np.abs(_errors(found, mode)[:, 1])) for name, found in rows.items()},
-        )
-        for k, mode in enumerate(MODES)
-    ]
+    published = np.abs(list(PUBLISHED.values())).mean(axis=0).T.tolist()
+    found: list[dict[str, Any]] = []
+    for mode, (percent, deg) in zip(MODES, published, strict=True):
+        ours = {name: np.abs(_errors(some, mode)).T for name, some in rows.items()}
+        length, tilt = ({name: mean_interval(errors[k]) for name, errors in ours.items()} for k in (0, 1))
+        means = {"published_percent": percent, "published_deg": deg}
+        found.append({"mode": mode, **means, "length_percent": length, "tilt_deg": tilt})
+    return found
 
 
 def text_beside(rows: Rows) -> str:
@@ -207,12 +193,10 @@ def text_beside(rows: Rows) -> str:
         lines.append([f"{name} {part}", *cells])
     means = [["mean absolute error of all parts", "", "length %", "tilt deg"]]
     for each in beside(rows):
-        published = [f"{each.published_percent:.1f}", f"{each.published_deg:.3f}"]
-        means.append([each.mode, "published", *published])
-        means += [
-            ["", name, _interval(each.length_percent[name], 2), _interval(each.tilt_deg[name], 3)]
-            for name in rows
-        ]
+        published = [f"{each['published_percent']:.1f}", f"{each['published_deg']:.3f}"]
+        means.append([each["mode"], "published", *published])
+        length, tilt = each["length_percent"], each["tilt_deg"]
+        means += [["", name, _interval(length[name], 2), _interval(tilt[name], 3)] for name in rows]
     return (
         f"Errors as published (Housden 2008, tables 3 and 4) | in simulation, against the {first}.\n"
         "The published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"

@@ -90,6 +90,19 @@ class BlockOutcome:
     skipped: bool = False
 
 
+Task = SweepJob | BlockJob
+
+
+def run_task(task: Task) -> SweepOutcome | BlockOutcome:
+    """Do a sweep's or a block's job."""
+    return run_block(task) if isinstance(task, BlockJob) else run_sweep(task)
+
+
+def lost_task(task: Task, reason: str) -> SweepOutcome | BlockOutcome:
+    """Outcome of a job that was lost with its workers."""
+    return lost_block(task, reason) if isinstance(task, BlockJob) else lost(task, reason)
+
+
 def plan_sweep(
     name: str,
     path: Path,

@@ -419,8 +419,8 @@ def test_outlines_are_closed_and_apart():
 def test_names_of_columns_become_words_with_units():
     assert heading_of("length_error_percent") == "length error / %"
     assert heading_of("GPE_mm") == "GPE / mm"
-    ((_, line),) = records_table([{"name": "x", "share": [0.5, None], "LPE_mm": 0.01234, "ok": True}]).lines
-    assert [cell.text for cell in line] == ["x", "0.500, –", "0.0123", "yes"]
+    ((_, line),) = records_table([{"name": "x", "share": 0.5, "LPE_mm": 0.01234, "GLE_mm": None}]).lines
+    assert [cell.text for cell in line] == ["x", "0.500", "0.0123", "–"]
     assert [cell.is_word for cell in line] == [True, False, False, False]
     assert records_table([]) is None
 

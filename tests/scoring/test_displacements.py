@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep
 from speckle3d.io.tum import write_tum
 from speckle3d.scoring.displacements import (
@@ -69,7 +70,7 @@ def test_pixels_and_landmarks_of_a_known_turn():
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", [[0.0], [90.0], [90.0]], degrees=True))
     still = RigidTransform.identity(3)
     # Frame 2 sits on frame 1, so that its step is right and its place is not.
-    marks = landmark_errors(turned, still, [1, 2], [[3.0, 4.0, 0.0], [0.0, 10.0, 0.0]])
+    marks = landmark_errors(turned, still, Landmarks(np.array([1, 2]), np.array([[3.0, 4, 0], [0, 10, 0]])))
     assert marks.global_mm == pytest.approx(np.sqrt(2) * (5.0 + 10.0) / 2)
     assert marks.local_mm == pytest.approx(np.sqrt(2) * (5.0 + 0.0) / 2)
     pixels = pixel_errors(turned, still, ImageGrid(2, 2, 3.0, 4.0))
@@ -109,17 +110,12 @@ def test_the_error_of_angle_is_about_one_axis_whichever():
 
 
 @pytest.mark.parametrize(
-    ("frames", "points", "message"),
-    [
-        ([], np.empty((0, 3)), "landmarks"),
-        ([1], [[0.0, 0.0]], r"landmarks.*\(1,\).*\(1, 2\)"),
-        ([1, 0], np.zeros((2, 3)), "landmark 1.*0"),
-        ([51], np.zeros((1, 3)), "landmark 0.*1 to 50.*51"),
-    ],
+    ("frames", "message"), [([], "landmarks"), ([1, 0], "landmark 1.*0"), ([51], "landmark 0.*1 to 50.*51")]
 )
-def test_a_landmark_that_has_no_error_is_refused(frames, points, message):
+def test_a_landmark_that_has_no_error_is_refused(frames, message):
+    marks = Landmarks(np.array(frames, dtype=int), np.zeros((len(frames), 3)))
     with pytest.raises(InvalidInputError, match=message):
-        landmark_errors(sliding(1.0), sliding(1.0), frames, points)
+        landmark_errors(sliding(1.0), sliding(1.0), marks)
 
 
 def test_a_constant_angle_between_frames_adds_up_to_its_mean():

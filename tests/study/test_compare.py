@@ -240,7 +240,7 @@ def test_landmarks_that_come_with_a_sweep_are_scored(sweeps, tmp_path, monkeypat
     sweep = load_sweep(sweeps[0])
     (entry,) = held(tmp_path)["sweeps"]
     poses = read_reconstruction(tmp_path / entry["folder"] / "reconstruction.h5").poses["pose"]
-    expected = landmark_errors(poses, sweep.truth, marks.frame, marks.points_mm)
+    expected = landmark_errors(poses, sweep.truth, marks)
     (row,) = [row for row in found.drift if row["mode"] == "pose"]
     assert (row["GLE_mm"], row["LLE_mm"]) == pytest.approx((expected.global_mm, expected.local_mm))
     assert {row["quantity"] for row in held(tmp_path)["intervals"]} >= {"GLE_mm", "LLE_mm"}
@@ -261,17 +261,19 @@ def test_a_scan_is_another_when_a_file_beside_it_is(sweeps, tmp_path):
 
 
 def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path):
+    def done(frames, **more):
+        return SweepOutcome("a", tmp_path, "done", frames=frames, **more)
+
     at = StudyProgress(sweeps=3, frames=300)
+    at.add(done(100, skipped=True), 2)
     assert at.remaining_s is None
-    at.add(SweepOutcome("a", tmp_path, "done", seconds=0.0, skipped=True), 100, 2)
-    assert at.remaining_s is None
-    at.add(SweepOutcome("b", tmp_path, "done", seconds=20.0), 100, 2)
+    at.add(done(100, seconds=20.0), 2)
     # One sweep of 100 frames is left, on one of the two workers, at 0.2 s a frame.
     assert at.remaining_s == pytest.approx(20.0)
-    at.add(SweepOutcome("c", tmp_path, "failed"), 100, 2)
+    at.add(SweepOutcome("c", tmp_path, "failed", "torn", frames=100), 2)
     assert (at.remaining_s, at.failed, at.done) == (0.0, 1, 3)
     # Rates 0.1, 0.1 and 5 s a frame: one slow sweep does not change the median.
     slow = StudyProgress(sweeps=4, frames=360)
     for frames, seconds in ((100, 10.0), (50, 5.0), (10, 50.0)):
-        slow.add(SweepOutcome("a", tmp_path, "done", seconds=seconds), frames, 2)
+        slow.add(done(frames, seconds=seconds), 2)
     assert slow.remaining_s == pytest.approx(20.0)
