@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jinja2
 import numpy as np
@@ -128,7 +128,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     return environment.get_template("page.html").render(
         shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
         lead=lead + [f"{line}." for line in copy_lines(study.copies)],
-        broken=tables.records_table([_part(entry, ("name", "status", "reason")) for entry in study.broken]),
+        broken=tables.records_table(study.broken, columns=("name", "status", "reason")),
         modes=tables.records_table(
             found.means, styles=["best" if row["mode"] == best else "" for row in found.means]
         ),
@@ -141,7 +141,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
         figures=[*([overview] if overview else []), *(each for some in sections for each in some.figures)],
         configuration=study.settings_toml,
         version=version("speckle3d"),
-        provenance=tables.records_table([_part(entry, keys) for entry in (*study.done, *study.broken)]),
+        provenance=tables.records_table([*study.done, *study.broken], columns=keys),
         scripts=[Markup(text) for text in scripts],
         script_hashes=" ".join(_hash(text) for text in scripts),
     )
@@ -246,10 +246,6 @@ def _filed(
         picture = draw.rendered(drawn, "jpg", dpi)
     source = f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
     return PageFigure(f"plot-{name}", source, caption, Markup("" if plot is None else plot.to_json()), width)
-
-
-def _part(entry: Record, keys: Sequence[str]) -> dict[str, Any]:
-    return {key: entry.get(key) for key in keys}
 
 
 def _hash(text: str) -> str:

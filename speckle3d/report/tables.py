@@ -23,15 +23,6 @@ from speckle3d.study.overall import (
 _UNITS = {"_percent": " / %", "_mm": " / mm", "_deg": " / °", "_s": " / s"}
 _ERRORS = ("length_error_mm", "length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
 _PART_COLUMNS = ("sweep", "part", "mode", "reference", "frames", "reference_mm", "estimate_mm", *_ERRORS)
-_SHORT = {
-    "length_error_mm": "length_mm",
-    "length_error_percent": "length_percent",
-    "tilt_error_deg": "tilt_deg",
-    "yaw_error_deg": "yaw_deg",
-    "roll_error_deg": "roll_deg",
-}
-"""Names of the errors in the table of modes."""
-
 _LONG_LETTERS = 40
 """Letters of a cell that may be broken into lines."""
 
@@ -200,7 +191,7 @@ def scored_means(rows: Sequence[Record], modes: Sequence[str]) -> Scored:
     means = []
     for mode in modes:
         mine = [row for row in used if row["mode"] == mode]
-        values = {short: mean_over_sweeps(mine, key) for key, short in _SHORT.items()}
+        values = {key.replace("_error", ""): mean_over_sweeps(mine, key) for key in _ERRORS}
         known = {short: value if np.isfinite(value) else None for short, value in values.items()}
         means.append({"mode": mode, "sweeps": len({row["sweep"] for row in mine}), **known})
     parts = len({(row["sweep"], row["part"]) for row in used})

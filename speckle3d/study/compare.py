@@ -143,14 +143,13 @@ def _run(
     by_name = {job.name: job for job in jobs}
     tasks, after = _tasks(jobs)
     so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
-    if progress:
-        progress(so_far)
+    tell = progress or (lambda at: None)
+    tell(so_far)
     for _, outcome in where.run(sweepjob.run_task, tasks, sweepjob.lost_task, after):
         if isinstance(outcome, SweepOutcome):
             outcome = outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
         so_far.add(outcome, where.workers)
-        if progress:
-            progress(so_far)
+        tell(so_far)
     _clear(jobs)
     return outcomes
 

@@ -40,6 +40,9 @@ _KILLED = "every worker that tried it died: killed, crashed or out of memory"
 class InProcess:
     """Runs one job after another in this process."""
 
+    workers = 1
+    """How many jobs run at a time."""
+
     def run(
         self,
         function: Callable[[Job], Result],
@@ -50,11 +53,6 @@ class InProcess:
         """Yield the number of each job and its result, in order."""
         for number, job in enumerate(jobs):
             yield number, function(job)
-
-    @property
-    def workers(self) -> int:
-        """How many jobs run at a time."""
-        return 1
 
 
 @dataclass(frozen=True)
