@@ -27,7 +27,7 @@ from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
-from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
+from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves
 from speckle3d.study.images import PIXEL_MM, cut_frames, grey_images, middle_plane, middle_vectors
 
 Record = Mapping[str, Any]
@@ -175,7 +175,12 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     details = _read_details(folder)
     notes: list[str] = []
     sweep = _open_sweep(directory, entry, found, notes)
-    reference = _open_reference(sweep, details, notes)
+    reference = None
+    if sweep is not None and details.get("reference") != "none":
+        try:
+            reference = find_reference(sweep, details.get("reference"))
+        except Speckle3DError as error:
+            notes.append(f"The reference cannot be read: {error}")
     own = dict(found.poses)
     if reference is not None and reference.covered.all():
         own[reference.name] = reference.world_from_image
@@ -231,17 +236,6 @@ def _open_sweep(directory: Path, entry: Record, found: Reconstruction, notes: li
         return apply_calibrations(load_sweep(path), [c.path for c in found.provenance.calibrations])[0]
     except Speckle3DError as error:
         notes.append(f"The sweep cannot be read ({error}), {missing}.")
-        return None
-
-
-def _open_reference(sweep: Sweep | None, details: Record, notes: list[str]) -> Reference | None:
-    wanted = details.get("reference")
-    if sweep is None or wanted == "none":
-        return None
-    try:
-        return find_reference(sweep, wanted)
-    except Speckle3DError as error:
-        notes.append(f"The reference cannot be read: {error}")
         return None
 
 

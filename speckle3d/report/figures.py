@@ -36,7 +36,6 @@ from speckle3d.study.figures import (
     Style,
     colour_of,
     draw_panel,
-    figure_panels,
     label_axes,
     label_of,
     new_figure,
@@ -110,11 +109,6 @@ def rejected_panel(rejected: RejectedPatches) -> Panel:
     frames = decimated(rejected.frame_share.size)
     line = Series("", "#404040", np.column_stack([frames, 100.0 * rejected.frame_share[frames]]), "dotted")
     return Panel([line], ("frame", "patches left out / %"), limits=(0.0, 100.0))
-
-
-def figure_overview(panels: Sequence[Panel]) -> Figure:
-    """Draw `overview_panels` side by side."""
-    return figure_panels(panels, 2, (9.0, 1.3 + 0.5 * len(panels[0].levels)))
 
 
 def figure_outlines(series: Sequence[Series]) -> Figure:

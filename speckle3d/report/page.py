@@ -168,7 +168,8 @@ def _overview(study: StudyData, directory: Path) -> PageFigure | None:
         "magnitude over the mode's sweeps."
     )
     plot = draw.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
-    return _filed(directory, "overview", draw.figure_overview(panels), caption, plot)
+    drawn = figure_panels(panels, 2, (9.0, 1.3 + 0.5 * len(modes)))
+    return _filed(directory, "overview", drawn, caption, plot)
 
 
 def _section(directory: Path, entry: Record, anchor: str) -> Section:

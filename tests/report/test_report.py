@@ -73,6 +73,11 @@ def page(text):
     return Page(text)
 
 
+def write_study(folder, sweeps, **more):
+    study = {"format": "speckle3d.study", "version": 1, "modes": ["image"], "sweeps": sweeps, **more}
+    (folder / "study.json").write_text(json.dumps(study))
+
+
 def scored(**length_percent):
     means = [
         {"mode": mode, "sweeps": 2, "length_mm": 0.1 * value, "length_percent": value,
@@ -196,11 +201,8 @@ def named_in(line):
     return sorted((mode for mode, at in labels.items() if at >= 0), key=labels.get)
 
 
-def test_without_a_reference_no_mode_is_called_right():
+def test_without_a_reference_or_any_result_no_mode_is_called_right():
     assert [named_in(line) for line in summary_lines(Scored([]), 2, 0)] == [[]]
-
-
-def test_without_any_result_the_summary_says_so():
     (line,) = summary_lines(Scored([]), 0, 2)
     assert "2 sweeps" in line
 
@@ -254,8 +256,7 @@ def test_the_lead_leaves_copies_out(tmp_path):
     rows = [row | {"reference": "truth"} for row in part_rows(a_image=[1.0], b_image=[1.0])]
     done = {"status": "done", "path": "x.h5", "folder": "sweeps/none"}
     sweeps = [{"name": "a", **done}, {"name": "b", "copy_of": "a", **done}]
-    study = {"format": "speckle3d.study", "version": 1, "modes": ["image"], "sweeps": sweeps, "rows": rows}
-    (tmp_path / "study.json").write_text(json.dumps(study))
+    write_study(tmp_path, sweeps, rows=rows)
     found = read_study(tmp_path)
     assert found.copies == {"b": "a"}
     assert [row["sweep"] for row in found.single] == ["a"]
@@ -299,9 +300,7 @@ def test_means_and_differences_over_sweeps_are_tables(page):
     assert [cell.is_bold for cell in line] == [False, False, True, False]
     assert line[1].text.splitlines() == ["+100.0%", "[−50.0%, +250.0%]"]
     assert intervals_table([]) is None
-
-
-def test_means_of_fewer_sweeps_say_so():
+    # Means of fewer sweeps say so.
     held = {"quantity": "FDR", "low": None, "high": None, "mean": 0.5}
     rows = [held | {"mode": mode, "sweeps": sweeps} for mode, sweeps in (("image", 4), ("pose", 1))]
     ((_, line),) = intervals_table(rows).lines
@@ -323,8 +322,7 @@ def test_what_is_no_study_is_refused(tmp_path, content, message):
 
 def test_figures_of_what_is_no_longer_in_the_study_go_and_others_stay(tmp_path):
     entry = {"name": "a", "path": "a.h5", "status": "done", "folder": "sweeps/a-0123abcd"}
-    study = {"format": "speckle3d.study", "version": 1, "modes": [], "sweeps": [entry]}
-    (tmp_path / "study.json").write_text(json.dumps(study))
+    write_study(tmp_path, [entry])
     (tmp_path / "figures").mkdir()
     stay = {"a-0123abcd-curves.png", "my-figure.png", "b-curves.png", "a-76543210-curves.txt"}
     for name in (*stay, "a-76543210-curves.png", "b-0123abcd-reslices.svg", "overview.png"):
@@ -334,16 +332,9 @@ def test_figures_of_what_is_no_longer_in_the_study_go_and_others_stay(tmp_path):
 
 
 def test_a_study_of_broken_sweeps_alone_is_still_a_page(tmp_path):
-    study = {
-        "format": "speckle3d.study",
-        "version": 1,
-        "modes": ["image"],
-        "sweeps": [
-            {"name": "torn", "path": "t.h5", "status": "failed", "reason": "no speckle"},
-            {"name": "lost", "path": "l.h5", "status": "done", "folder": "sweeps/lost-1"},
-        ],
-    }
-    (tmp_path / "study.json").write_text(json.dumps(study))
+    torn = {"name": "torn", "path": "t.h5", "status": "failed", "reason": "no speckle"}
+    lost = {"name": "lost", "path": "l.h5", "status": "done", "folder": "sweeps/lost-1"}
+    write_study(tmp_path, [torn, lost])
     words = " ".join(Page(write_report(tmp_path).read_text(encoding="utf-8")).words)
     assert "no speckle" in words
     # The sweep whose folder is gone is told with it.

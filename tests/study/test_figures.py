@@ -129,9 +129,8 @@ def test_a_png_of_150_dots_per_inch_appears_whole(sweep, tmp_path):
 
 
 def test_neither_pyplot_nor_a_window_system_is_touched(python):
-    assert (
-        python("import sys, speckle3d.study.figures; print('matplotlib.pyplot' in sys.modules)") == "False\n"
-    )
+    code = "import sys, speckle3d.study.figures; print('matplotlib.pyplot' in sys.modules)"
+    assert python(code) == "False\n"
 
 
 def test_modes_have_colours_of_their_own_and_unknown_ones_too():
@@ -141,9 +140,6 @@ def test_modes_have_colours_of_their_own_and_unknown_ones_too():
 
 
 def test_titles_are_wrapped_to_narrow_panels():
-    assert wrapped("image-based, consistent subset", 1.0).splitlines() == [
-        "image-based,",
-        "consistent",
-        "subset",
-    ]
-    assert wrapped("image-based, consistent subset", 3.0) == "image-based, consistent subset"
+    title = "image-based, consistent subset"
+    assert wrapped(title, 1.0).splitlines() == ["image-based,", "consistent", "subset"]
+    assert wrapped(title, 3.0) == title
