@@ -5,9 +5,8 @@ import signal
 import time
 from pathlib import Path
 
-from speckle3d.study.compare import run_task
 from speckle3d.study.images import Strip
-from speckle3d.study.sweepjob import BlockJob
+from speckle3d.study.sweepjob import BlockJob, run_task
 
 
 def double(number):

@@ -66,24 +66,25 @@ def compare(
     from speckle3d.study.schedulers import scheduler_for
 
     settings = load_settings(config_file)
-    if paper:
-        _require_alone(
-            sweeps=sweeps, drift=drift, reference=reference, calibration=calibration, config=config_file
-        )
-    elif not sweeps:
+    if not (paper or sweeps):
         raise InvalidInputError("expected sweeps to compare, or --paper, got neither")
-    table = None
+    fixed = {"sweeps": sweeps, "drift": drift, "reference": reference, "calibration": calibration}
+    for name, value in (fixed | {"config": config_file}).items():
+        if paper and value:
+            raise InvalidInputError(f"--paper: expected no {name}, which the study fixes, got {value}")
+    table = ""
     with scheduler_for(scheduler, workers) as where, _shown() as progress:
         if paper:
-            done = paper_study(out, curves_file, where, progress, _count_simulated)
-            study, table = done.study, done.table
+            study, table = paper_study(
+                out, curves_file, where, progress, lambda n, total: note(f"{n} of {total} sweeps simulated")
+            )
         else:
             study = compare_sweeps(
                 sweeps or [], out, drift, reference, curves_file, settings, calibration or (), where, progress
             )
     write_report(out)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
-    _tell(study, copies=as_json or table is not None)
+    _tell(study, copies=as_json or paper)
 
 
 def _tell(study: Study, copies: bool) -> None:
@@ -94,26 +95,13 @@ def _tell(study: Study, copies: bool) -> None:
     skipped = sum(each.skipped for each in study.outcomes)
     if skipped:
         note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
-    if copies:
-        for line in copy_lines(study.copies):
-            note(line)
-    for each in failed:
-        note(f"{each.name}: failed: {each.reason}")
+    lines = copy_lines(study.copies) if copies else []
+    for line in lines + [f"{each.name}: failed: {each.reason}" for each in failed]:
+        note(line)
     out = study.directory
     note(f"results in {out}; the report is {out / 'report.html'}")
     if len(failed) == len(study.outcomes):
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")
-
-
-def _require_alone(**given: object) -> None:
-    """Refuse what the paper's study fixes."""
-    for name, value in given.items():
-        if value:
-            raise InvalidInputError(f"--paper: expected no {name}, which the study fixes, got {value}")
-
-
-def _count_simulated(done: int, total: int) -> None:
-    note(f"{done} of {total} sweeps simulated")
 
 
 @contextmanager
@@ -132,9 +120,8 @@ def _shown() -> Iterator[Callable[[StudyProgress], None]]:
 
 def _line(at: StudyProgress) -> str:
     failed = f", {at.failed} failed" if at.failed else ""
-    if at.remaining_s is None:
-        left = "time left is known after the first"
-    else:
+    left = "time left is known after the first"
+    if at.remaining_s is not None:
         minutes, seconds = divmod(round(at.remaining_s), 60)
         left = f"about {minutes} min {seconds:02d} s left"
     return f"{at.done} of {at.sweeps} sweeps{failed}; {left}"

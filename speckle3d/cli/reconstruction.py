@@ -167,7 +167,5 @@ def reslice(
             plane = along_sweep_plane(poses, images.grid, middle if lateral_mm is None else lateral_mm)
             labels = ("elevational / mm", "depth / mm")
         cut = reslice_frames(images, images.grid, poses, plane, reach_mm)
-    extent = (0.0, plane.width_mm, plane.height_mm, 0.0)
     decibel = cut / 255 * dynamic_range_db
-    figure = figure_reslice({mode: decibel}, {mode: extent}, dynamic_range_db, sweep.name, labels)
-    save_figure(figure, out)
+    save_figure(figure_reslice({mode: (decibel, plane)}, dynamic_range_db, sweep.name, labels), out)

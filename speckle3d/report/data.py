@@ -1,4 +1,7 @@
-"""What the report shows: the study's numbers, and of each sweep what its folder and the sweep itself hold."""
+"""What the report shows: a study's numbers, and of each sweep its results, its own data and reslices.
+
+Reslices run along the sweep at the poses of every mode, with one detail of each enlarged.
+"""
 
 from __future__ import annotations
 
@@ -6,55 +9,74 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ValidationError
+from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
-from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
-from speckle3d.study.results import FORMAT, VERSION
+from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves
+from speckle3d.study.images import PIXEL_MM, cut_frames, grey_images, middle_plane, middle_vectors
 
 Record = Mapping[str, Any]
 
+DETAIL_PIXEL_MM = 0.04
+DETAIL_MM = 5.0
+"""Widest enlarged detail; four fifths as high."""
 
-@dataclass(frozen=True)
-class StudyData:
+_DETAIL_SHARE = 0.4
+"""Largest width of the detail as a share of the shortest reslice."""
+
+NEAR_FIELD_MM = 4.0
+_DYNAMIC_RANGE_DB = 55.0
+
+
+class StudyData(BaseModel, frozen=True):
     """What ``study.json`` holds.
 
     Attributes
     ----------
-    directory : path
-        The study's folder.
     modes : list of str
         In the study's order.
-    done, broken : list of mapping
-        Entries of the sweeps with and without results.
-    rows : list of mapping
+    sweeps : list of dict
+        Entries of all sweeps, with and without results.
+    rows : list of dict
         Errors by sweep, part and mode.
-    drift, intervals, paired : list of mapping
+    drift, intervals, paired : list of dict
         Drift by sweep and mode, means over sweeps, and modes compared in pairs.
-    settings_toml : str
     """
 
-    directory: Path
-    modes: list[str]
-    done: list[Record]
-    broken: list[Record]
-    rows: list[Record]
-    drift: list[Record]
-    intervals: list[Record]
-    paired: list[Record]
-    settings_toml: str
+    format: Literal["speckle3d.study"]
+    version: Literal[1]
+    sweeps: list[dict[str, Any]]
+    modes: list[str] = []
+    rows: list[dict[str, Any]] = []
+    drift: list[dict[str, Any]] = []
+    intervals: list[dict[str, Any]] = []
+    paired: list[dict[str, Any]] = []
+    settings_toml: str = ""
+
+    @property
+    def done(self) -> list[dict[str, Any]]:
+        """Entries of the sweeps with results."""
+        return [entry for entry in self.sweeps if entry.get("status") == "done"]
+
+    @property
+    def broken(self) -> list[dict[str, Any]]:
+        """Entries of the sweeps without results."""
+        return [entry for entry in self.sweeps if entry.get("status") != "done"]
 
     @property
     def copies(self) -> dict[str, str]:
@@ -62,10 +84,9 @@ class StudyData:
         return {entry["name"]: entry["copy_of"] for entry in self.done if entry.get("copy_of")}
 
     @property
-    def single(self) -> list[Record]:
+    def single(self) -> list[dict[str, Any]]:
         """Rows of all sweeps but copies."""
-        copies = self.copies
-        return [row for row in self.rows if row["sweep"] not in copies]
+        return [row for row in self.rows if row["sweep"] not in self.copies]
 
     @property
     def references(self) -> dict[str, str]:
@@ -98,19 +119,15 @@ class SweepView:
     Attributes
     ----------
     poses : dict of str to RigidTransform, each of length n
-        By mode, in the first frame's image frame; the reference under its own name, if it covers every frame.
-    own_poses : dict
-        The same in their own worlds.
+        By mode, in their own worlds; the reference under its own name, if it covers every frame.
     sweep : Sweep or None
         None where the file is gone or changed; `notes` then says so.
     """
 
-    name: str
     folder: Path
     reconstruction: Reconstruction
     curves: SweepCurves
     poses: dict[str, RigidTransform]
-    own_poses: dict[str, RigidTransform]
     rejected: RejectedPatches | None
     sweep: Sweep | None
     details: Record
@@ -129,25 +146,13 @@ def read_study(directory: Path) -> StudyData:
     if not path.is_file():
         raise InvalidInputError(f"{directory}: expected a study's folder with study.json, got none")
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        return StudyData.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except ValidationError as error:
+        first = error.errors()[0]
+        name, got = ".".join(map(str, first["loc"])), repr(first["input"])[:60]
+        raise InvalidInputError(f"{path}: {name}: {first['msg']}, got {got}") from error
+    except ValueError as error:
         raise InvalidInputError(f"{path}: expected JSON, got an error: {error}") from error
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InvalidInputError(f"{path}: expected format {FORMAT!r}, got another")
-    if found.get("version") != VERSION:
-        raise InvalidInputError(f"{path}: expected version {VERSION}, got {found.get('version')!r}")
-    rows: list[Record] = [row for row in found.get("rows", []) if isinstance(row, dict)]
-    return StudyData(
-        directory,
-        list(dict.fromkeys([*found.get("modes", []), *(row["mode"] for row in rows)])),
-        [entry for entry in found["sweeps"] if entry.get("status") == "done"],
-        [entry for entry in found["sweeps"] if entry.get("status") != "done"],
-        rows,
-        found.get("drift") or [],
-        found.get("intervals") or [],
-        found.get("paired") or [],
-        str(found.get("settings_toml", "")),
-    )
 
 
 def load_view(directory: Path, entry: Record) -> SweepView:
@@ -170,7 +175,12 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     details = _read_details(folder)
     notes: list[str] = []
     sweep = _open_sweep(directory, entry, found, notes)
-    reference = _open_reference(sweep, details, notes)
+    reference = None
+    if sweep is not None and details.get("reference") != "none":
+        try:
+            reference = find_reference(sweep, details.get("reference"))
+        except Speckle3DError as error:
+            notes.append(f"The reference cannot be read: {error}")
     own = dict(found.poses)
     if reference is not None and reference.covered.all():
         own[reference.name] = reference.world_from_image
@@ -178,12 +188,10 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     if found.trust is not None:
         notes += [f"{line}: poses there are guesses" for line in describe(found.trust.flags)]
     return SweepView(
-        name=str(entry["name"]),
         folder=folder,
         reconstruction=found,
         curves=sweep_curves(found.poses, found.grid.centre_mm, reference, covariance),
-        poses={mode: each[0].inv() * each for mode, each in own.items()},
-        own_poses=own,
+        poses=own,
         rejected=None if found.pairs is None else rejected_patches(found.pairs, found.frame_time_s.size),
         sweep=sweep,
         details=details,
@@ -195,10 +203,9 @@ def rejected_patches(pairs: FramePairs, frames: int) -> RejectedPatches:
     """Count how often each patch, and each frame's patches, were left out though a distance was there."""
     measured = np.isfinite(pairs.distance_mm)
     left_out = measured & ~pairs.used
-    by_frame = [np.bincount(pairs.first, each.sum(axis=1), frames) for each in (left_out, measured)]
-    return RejectedPatches(
-        pairs.patch_centre_mm, _share(left_out.sum(axis=0), measured.sum(axis=0)), _share(*by_frame)
-    )
+    by_patch = (each.sum(axis=0) for each in (left_out, measured))
+    by_frame = (np.bincount(pairs.first, each.sum(axis=1), frames) for each in (left_out, measured))
+    return RejectedPatches(pairs.patch_centre_mm, _share(*by_patch), _share(*by_frame))
 
 
 def _share(part: npt.ArrayLike, whole: npt.ArrayLike) -> FloatArray:
@@ -232,12 +239,88 @@ def _open_sweep(directory: Path, entry: Record, found: Reconstruction, notes: li
         return None
 
 
-def _open_reference(sweep: Sweep | None, details: Record, notes: list[str]) -> Reference | None:
-    wanted = details.get("reference")
-    if sweep is None or wanted == "none":
+@dataclass(frozen=True)
+class Cut:
+    """A reslice, its enlarged detail and where in the reslice that lies.
+
+    Attributes
+    ----------
+    image, detail : ndarray of float32, shape (rows, columns)
+        Grey levels 0 to 255, NaN where no frame reached.
+    extent_mm : (width, height)
+    corner_mm, size_mm : ndarray, shape (2,)
+        Top left of the detail, along the sweep and in depth from the reslice's own top left, and its sides.
+    """
+
+    image: Float32Array
+    extent_mm: tuple[float, float]
+    detail: Float32Array
+    corner_mm: FloatArray
+    size_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class Cuts:
+    """The cuts of all modes, and one image of the sweep."""
+
+    by_mode: dict[str, Cut]
+    depth_mm: float
+    middle: Float32Array
+    grid: ImageGrid
+
+
+def cut_modes(view: SweepView) -> Cuts | None:
+    """Reslice the sweep at its middle vector in every mode; None where the sweep itself is gone.
+
+    The detail shows the place of most contrast in the most trusted trajectory (the reference, else the last
+    mode), and the same place of the same frame in all others.
+    """
+    if view.sweep is None:
         return None
-    try:
-        return find_reference(sweep, wanted)
-    except Speckle3DError as error:
-        notes.append(f"The reference cannot be read: {error}")
-        return None
+    images = grey_images(view.sweep, _DYNAMIC_RANGE_DB, reconstruction=view.reconstruction)
+    first, grid = middle_vectors(images.grid)
+    left = RigidTransform.from_translation([first * grid.vector_pitch_mm, 0.0, 0.0])
+    # The middle vectors, made once for all modes: a sweep of a thousand whole images need not fit in memory.
+    chosen = slice(first, first + grid.vectors)
+    strip = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(len(view.sweep))]
+    poses = {mode: each * left for mode, each in view.poses.items()}
+    planes = {mode: middle_plane(each, grid) for mode, each in poses.items()}
+    whole = {mode: cut_frames(strip, grid, poses[mode], planes[mode]) for mode in poses}
+    width_mm = min(DETAIL_MM, _DETAIL_SHARE * min(plane.width_mm for plane in planes.values()))
+    size_mm = np.array([1.0, 0.8]) * max(width_mm, 10 * DETAIL_PIXEL_MM)
+    last = list(planes)[-1]
+    frame, depth_mm = _detail_place(poses[last], planes[last], whole[last], grid, size_mm)
+    by_mode = {}
+    for mode, plane in planes.items():
+        point = np.array([grid.width_mm / 2, depth_mm, 0.0])
+        centre = plane.world_from_plane.inv().apply(poses[mode][frame].apply(point))[:2]
+        corner = centre - size_mm / 2
+        placed = plane.world_from_plane * RigidTransform.from_translation([*corner, 0.0])
+        window = ReslicePlane(placed, float(size_mm[0]), float(size_mm[1]), DETAIL_PIXEL_MM)
+        detail = cut_frames(strip, grid, poses[mode], window)
+        by_mode[mode] = Cut(whole[mode], (plane.width_mm, plane.height_mm), detail, corner, size_mm)
+    return Cuts(by_mode, depth_mm, images[len(view.sweep) // 2], images.grid)
+
+
+def _detail_place(
+    poses: RigidTransform, plane: ReslicePlane, image: Float32Array, grid: ImageGrid, size_mm: FloatArray
+) -> tuple[int, float]:
+    """Frame and depth of the place with most contrast between its parts, speckle smoothed away."""
+    seen = np.isfinite(image)
+    if not seen.any():
+        return len(poses) // 2, float(grid.centre_mm[1])
+    # Where nothing was seen, the mean stands in, or the rim would have the greatest contrast.
+    smooth = gaussian_filter(np.where(seen, image, image[seen].mean()), 0.4 / PIXEL_MM)
+    size = [max(1, round(side / PIXEL_MM)) for side in size_mm[::-1]]
+    spread = uniform_filter(smooth**2, size) - uniform_filter(smooth, size) ** 2
+    # Only windows that lie wholly on images: the rim of the reslice has contrast but no content.
+    inside = uniform_filter(seen.astype(float), size, mode="constant") > 0.999
+    # The contrast of the near field is the probe's own.
+    inside[: int((NEAR_FIELD_MM + size_mm[1] / 2) / PIXEL_MM)] = False
+    if not inside.any():
+        return len(poses) // 2, float(grid.centre_mm[1])
+    row, column = np.unravel_index(int(np.argmax(np.where(inside, spread, -1.0))), image.shape)
+    point = plane.world_from_plane.apply([column * PIXEL_MM, row * PIXEL_MM, 0.0])
+    in_image = poses.inv().apply(point)
+    frame = int(np.argmin(np.abs(in_image[:, 2])))
+    return frame, float(np.clip(in_image[frame, 1], grid.first_sample_depth_mm, grid.depth_mm))

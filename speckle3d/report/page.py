@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jinja2
 import numpy as np
@@ -19,19 +19,11 @@ from markupsafe import Markup
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
-from speckle3d.report import plots as interactive
-from speckle3d.report.data import Record, StudyData, SweepView, load_view, read_study
-from speckle3d.report.lead import best_of, counted, scored_means, summary_lines
-from speckle3d.report.reslices import Cuts, cut_modes
-from speckle3d.report.tables import (
-    intervals_table,
-    modes_table,
-    paired_table,
-    parts_table,
-    records_table,
-)
+from speckle3d.report import tables
+from speckle3d.report.data import Cuts, Record, StudyData, SweepView, cut_modes, load_view, read_study
 from speckle3d.study.figures import curve_panels, figure_panels
 from speckle3d.study.folder import only_run
+from speckle3d.study.overall import counted
 from speckle3d.study.results import copy_lines
 
 if TYPE_CHECKING:
@@ -106,8 +98,8 @@ def write_report(directory: Path) -> Path:
     """
     study = read_study(directory)
     with only_run(directory):
-        overview = _overview(study)
-        sections = [_section(study, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
+        overview = _overview(study, directory)
+        sections = [_section(directory, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
         stems = {str(entry.get("folder", "")).rpartition("/")[2] for entry in study.done}
         _clear_figures(directory / "figures", stems)
         target = directory / "report.html"
@@ -121,10 +113,10 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     from plotly.offline import get_plotlyjs
 
     anchors = {each.name: each.anchor for each in sections}
-    found = scored_means(study.single, study.modes)
-    lead = summary_lines(found, len(study.done), len(study.broken), study.paired, study.references)
+    found = tables.scored_means(study.single, study.modes)
+    lead = tables.summary_lines(found, len(study.done), len(study.broken), study.paired, study.references)
     keys = ("name", "path", "sha256", "key", "seconds")
-    best = best_of(found.means, "length_percent") if found.together else None
+    best = tables.best_of(found.means, "length_percent") if found.together else None
     scripts = [get_plotlyjs(), files("speckle3d.report").joinpath("script.js").read_text(encoding="utf-8")]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("speckle3d", "report"),
@@ -136,18 +128,20 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     return environment.get_template("page.html").render(
         shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
         lead=lead + [f"{line}." for line in copy_lines(study.copies)],
-        broken=records_table([_part(entry, ("name", "status", "reason")) for entry in study.broken]),
-        modes=modes_table(found.means, best),
+        broken=tables.records_table(study.broken, columns=("name", "status", "reason")),
+        modes=tables.records_table(
+            found.means, styles=["best" if row["mode"] == best else "" for row in found.means]
+        ),
         overview=overview,
-        parts=parts_table(study.rows, anchors),
-        drift=records_table(study.drift, anchors),
-        intervals=intervals_table(study.intervals),
-        paired=paired_table(study.paired),
+        parts=tables.parts_table(study.rows, anchors),
+        drift=tables.records_table(study.drift, anchors),
+        intervals=tables.intervals_table(study.intervals),
+        paired=tables.paired_table(study.paired),
         sections=sections,
         figures=[*([overview] if overview else []), *(each for some in sections for each in some.figures)],
         configuration=study.settings_toml,
         version=version("speckle3d"),
-        provenance=records_table([_part(entry, keys) for entry in (*study.done, *study.broken)]),
+        provenance=tables.records_table([*study.done, *study.broken], columns=keys),
         scripts=[Markup(text) for text in scripts],
         script_hashes=" ".join(_hash(text) for text in scripts),
     )
@@ -161,10 +155,10 @@ def _clear_figures(folder: Path, stems: Collection[str]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _overview(study: StudyData) -> PageFigure | None:
+def _overview(study: StudyData, directory: Path) -> PageFigure | None:
     scored = [row for row in study.single if row.get("length_error_mm") is not None]
     if not scored:
-        for path in (study.directory / "figures").glob("overview.*"):
+        for path in (directory / "figures").glob("overview.*"):
             path.unlink()
         return None
     modes = [mode for mode in study.modes if any(row["mode"] == mode for row in scored)]
@@ -173,57 +167,56 @@ def _overview(study: StudyData) -> PageFigure | None:
         "Errors of length and tilt: a point for every part of every sweep, a bar from minus to plus the mean "
         "magnitude over the mode's sweeps."
     )
-    plot = interactive.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
-    return _vector(study.directory, "overview", draw.figure_overview(panels), caption, plot)
+    plot = draw.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
+    drawn = figure_panels(panels, 2, (9.0, 1.3 + 0.5 * len(modes)))
+    return _filed(directory, "overview", drawn, caption, plot)
 
 
-def _section(study: StudyData, entry: Record, anchor: str) -> Section:
+def _section(directory: Path, entry: Record, anchor: str) -> Section:
     name = str(entry["name"])
     try:
-        view = load_view(study.directory, entry)
+        view = load_view(directory, entry)
         cuts = cut_modes(view)
-        figures = [_curves(study.directory, view), _outlines(study.directory, view)]
-        if cuts is not None:
-            figures.append(_reslices(study.directory, view, cuts))
-        patches = _patches(study.directory, view, cuts)
+        drawn = [each(directory, view, cuts) for each in (_curves, _outlines, _reslices, _patches)]
     except Speckle3DError as error:
         return Section(anchor, name, broken=str(error))
-    if patches is None:
-        return Section(anchor, name, view.notes, figures, quiet="The file of this sweep holds no patches.")
-    return Section(anchor, name, view.notes, [*figures, patches])
+    quiet = "" if drawn[-1] else "The file of this sweep holds no patches."
+    return Section(anchor, name, view.notes, [each for each in drawn if each is not None], quiet=quiet)
 
 
-def _curves(directory: Path, view: SweepView) -> PageFigure:
+def _curves(directory: Path, view: SweepView, _cuts: Cuts | None) -> PageFigure:
     curves, frames = view.curves, draw.decimated(view.curves.frames)
     panels = curve_panels(curves, frames=frames)
     views = {"accumulated": panels}
     if curves.reference is not None:
-        minus = curve_panels(curves, frames=frames, minus_reference=True)
-        views[f"minus {curves.reference_name}"] = minus
+        views[f"minus {curves.reference_name}"] = curve_panels(curves, frames=frames, minus_reference=True)
     caption = "Accumulated length of travel, tilt, yaw and roll."
     if curves.half_width is not None:
         caption += " The band is the 95 % interval of the uncorrected trajectory, from its covariance."
     drawn = figure_panels(panels, 2, (9.0, 6.0))
-    plot = interactive.plot_panels(views, 2, 620)
-    return _vector(directory, f"{view.folder.name}-curves", drawn, caption, plot)
+    plot = draw.plot_panels(views, 2, 620)
+    return _filed(directory, f"{view.folder.name}-curves", drawn, caption, plot)
 
 
-def _outlines(directory: Path, view: SweepView) -> PageFigure:
-    series = draw.outline_series(view.poses, view.reconstruction.grid)
+def _outlines(directory: Path, view: SweepView, _cuts: Cuts | None) -> PageFigure:
+    laid = {mode: each[0].inv() * each for mode, each in view.poses.items()}
+    series = draw.outline_series(laid, view.reconstruction.grid)
     caption = (
         f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other"
         f"{'; in print the reference is grey' if view.curves.reference_name in view.poses else ''}."
     )
-    drawn, plot = draw.figure_outlines(series), interactive.plot_outlines(series)
-    return _vector(directory, f"{view.folder.name}-outlines", drawn, caption, plot)
+    drawn, plot = draw.figure_outlines(series), draw.plot_outlines(series)
+    return _filed(directory, f"{view.folder.name}-outlines", drawn, caption, plot)
 
 
-def _reslices(directory: Path, view: SweepView, cuts: Cuts) -> PageFigure:
+def _reslices(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure | None:
+    if cuts is None:
+        return None
     caption = (
         "The sweep cut along its travel at the middle vector, at the poses of every mode, and the same place "
         f"of the same frame enlarged ({cuts.depth_mm:.0f} mm deep). Blue: no frame reached."
     )
-    return _raster(directory, f"{view.folder.name}-reslices", draw.figure_cuts(cuts), caption, 110)
+    return _filed(directory, f"{view.folder.name}-reslices", draw.figure_cuts(cuts), caption, dpi=110)
 
 
 def _patches(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure | None:
@@ -237,32 +230,23 @@ def _patches(directory: Path, view: SweepView, cuts: Cuts | None) -> PageFigure 
     )
     caption += ": where in the image, in how many of the pairs, and how many over the sweep."
     drawn = draw.figure_rejected(view.rejected, cuts, view.reconstruction.grid)
-    plot = interactive.plot_rejected(view.rejected)
-    return _raster(directory, f"{view.folder.name}-patches", drawn, caption, 90, plot)
+    plot = draw.plot_rejected(view.rejected)
+    return _filed(directory, f"{view.folder.name}-patches", drawn, caption, plot, 90)
 
 
-def _vector(directory: Path, name: str, drawn: Figure, caption: str, plot: Plot) -> PageFigure:
-    """File a figure and put it on the page as a vector picture, with its interactive twin."""
-    picture = draw.save_both(drawn, directory / "figures" / name)
-    return PageFigure(f"plot-{name}", _data_url("svg+xml", picture), caption, Markup(plot.to_json()))
-
-
-def _raster(
-    directory: Path, name: str, drawn: Figure, caption: str, dots_per_inch: int, plot: Plot | None = None
+def _filed(
+    directory: Path, name: str, drawn: Figure, caption: str, plot: Plot | None = None, dpi: int | None = None
 ) -> PageFigure:
-    """File a figure with an image in it and put it on the page as JPEG: a vector picture would be large."""
-    draw.save_both(drawn, directory / "figures" / name)
-    source = _data_url("jpeg", draw.rendered(drawn, "jpg", dots_per_inch))
-    data = Markup("" if plot is None else plot.to_json())
-    return PageFigure(f"plot-{name}", source, caption, data, round(96 * drawn.get_size_inches()[0]))
+    """File a figure and put it on the page as a vector picture, or as JPEG of `dpi` dots per inch.
 
-
-def _data_url(kind: str, picture: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
-
-
-def _part(entry: Record, keys: Sequence[str]) -> dict[str, Any]:
-    return {key: entry.get(key) for key in keys}
+    A vector picture of a figure with an image in it would be large.
+    """
+    kind, width, picture = "svg+xml", None, draw.save_both(drawn, directory / "figures" / name)
+    if dpi is not None:
+        kind, width = "jpeg", round(96 * drawn.get_size_inches()[0])
+        picture = draw.rendered(drawn, "jpg", dpi)
+    source = f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
+    return PageFigure(f"plot-{name}", source, caption, Markup("" if plot is None else plot.to_json()), width)
 
 
 def _hash(text: str) -> str:

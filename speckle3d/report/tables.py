@@ -1,15 +1,24 @@
-"""The report's tables: text and style of every cell, which the page's template turns to HTML."""
+"""The report's words: its first sentences, and text and style of every table cell for the page's template."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from speckle3d.report.data import Record
-from speckle3d.report.lead import counted
 from speckle3d.study.figures import colour_of, label_of
-from speckle3d.study.overall import QUANTITIES, Quantity
+from speckle3d.study.overall import (
+    QUANTITIES,
+    beats,
+    counted,
+    fitted_to_reference,
+    mean_over_sweeps,
+    means_table,
+    reference_words,
+)
 
 _UNITS = {"_percent": " / %", "_mm": " / mm", "_deg": " / °", "_s": " / s"}
 _ERRORS = ("length_error_mm", "length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
@@ -59,37 +68,28 @@ def parts_table(rows: Sequence[Record], anchors: Mapping[str, str]) -> Table | N
     columns = [*_PART_COLUMNS, *(["remark"] if any(row.get("remark") for row in rows) else [])]
     places = [(row.get("sweep"), row.get("part")) for row in rows]
     styles = ["first" if i == 0 or places[i - 1] != here else "" for i, here in enumerate(places)]
-    return _of_records(rows, columns, anchors, styles, _ERRORS)
-
-
-def modes_table(means: Sequence[Record], best: str | None) -> Table | None:
-    """Mean magnitudes of the errors by mode; the best in length in bold."""
-    return _of_records(means, styles=["best" if row["mode"] == best else "" for row in means])
-
-
-def records_table(records: Sequence[Record], anchors: Mapping[str, str] | None = None) -> Table | None:
-    """Any list of records, a column for each of their names in the order they first appear."""
-    return _of_records(records, anchors=anchors or {})
+    return records_table(rows, anchors, columns, styles)
 
 
 def intervals_table(intervals: Sequence[Record]) -> Table | None:
     """Mean and interval of every quantity, a column for each mode."""
-    most = max((row["sweeps"] for row in intervals), default=0)
-    modes = list(dict.fromkeys(str(row["mode"]) for row in intervals))
-    lines = [
-        [_quantity(quantity), *(_with_interval(quantity, found.get((mode,)), most) for mode in modes)]
-        for quantity, found in _by_quantity(intervals, "mode")
-    ]
-    return _of_cells([f"mean of {counted(most, 'sweep')}", *map(label_of, modes)], lines)
+    (title, *modes), *lines = means_table("mean of {}", intervals)
+    # Magnitudes have no sign: a "-" stands for no value.
+    cells = [[_quantity(words), *(Cell(text.replace("-", "–")) for text in texts)] for words, *texts in lines]
+    return _of_cells([title, *map(label_of, modes)], cells)
 
 
 def paired_table(paired: Sequence[Record]) -> Table | None:
     """Difference of every two modes in every quantity, bold where they are told apart."""
-    pairs = list(dict.fromkeys((str(row["mode"]), str(row["against"])) for row in paired))
-    lines = [
-        [_quantity(quantity), *(_difference(quantity, found.get(pair)) for pair in pairs)]
-        for quantity, found in _by_quantity(paired, "mode", "against")
-    ]
+    pairs = list(dict.fromkeys((row["mode"], row["against"]) for row in paired))
+    lines = []
+    for quantity in QUANTITIES:
+        found = {(row["mode"], row["against"]): row for row in paired if row["quantity"] == quantity.key}
+        cells = [Cell("–")] * len(pairs)
+        for i, row in ((pairs.index(pair), row) for pair, row in found.items()):
+            text = quantity.with_interval(row, "difference", signed=True).replace(" [", "\n[")
+            cells[i] = Cell(text.replace("-", "−"), is_bold=bool(row["better"]))
+        lines += [[_quantity(quantity.words), *cells]] if found else []
     heads = [f"{label_of(one)} − {label_of(other)}" for one, other in pairs]
     return _of_cells(["difference", *heads], lines)
 
@@ -107,42 +107,38 @@ def _of_cells(heads: Sequence[str], lines: Sequence[Sequence[Cell]]) -> Table | 
     return Table(cells, [("", line) for line in lines]) if lines else None
 
 
-def _of_records(
+def records_table(
     records: Sequence[Record],
-    columns: Sequence[str] | None = None,
     anchors: Mapping[str, str] | None = None,
+    columns: Sequence[str] | None = None,
     styles: Sequence[str] | None = None,
-    signed: Collection[str] = (),
 ) -> Table | None:
+    """Any list of records, by default a column for each of their names in the order they first appear.
+
+    Parameters
+    ----------
+    anchors : mapping of str to str, optional
+        Places on the page that the names of sweeps lead to.
+    styles : sequence of str, optional
+        Of each line.
+    """
     if not records:
         return None
     keys = columns or list(dict.fromkeys(key for record in records for key in record))
     words = {key for key in keys if any(isinstance(record.get(key), str) for record in records)}
     heads = [Cell(heading_of(key), is_word=key in words) for key in keys]
-    lines = [
-        [_cell(key, record.get(key), key in words, anchors or {}, key in signed) for key in keys]
-        for record in records
-    ]
+    lines = [[_cell(key, row.get(key), key in words, anchors or {}) for key in keys] for row in records]
     return Table(heads, list(zip(styles or [""] * len(lines), lines, strict=True)))
 
 
-def _cell(key: str, value: Any, is_word: bool, anchors: Mapping[str, str], signed: bool) -> Cell:
+def _cell(key: str, value: Any, is_word: bool, anchors: Mapping[str, str]) -> Cell:
     if key == "mode" and isinstance(value, str):
         return Cell(label_of(value), is_word, colour=colour_of(value))
     link = anchors.get(value, "") if key == "sweep" else ""
-    return Cell(_shown(key, value, signed), is_word, link=link)
-
-
-def _shown(key: str, value: Any, signed: bool = False) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:{'+' if signed else ''}.{_digits(key)}f}"
-    if isinstance(value, list):
-        return ", ".join(_shown(key, one, signed) for one in value)
-    return str(value)
+        # Errors are estimate minus reference, and have a sign.
+        value = f"{value:{'+' if key in _ERRORS else ''}.{_digits(key)}f}"
+    return Cell("–" if value is None else str(value), is_word, link=link)
 
 
 def _digits(key: str) -> int:
@@ -152,36 +148,143 @@ def _digits(key: str) -> int:
     return 1 if key.endswith(("percent", "_s")) else 2 if key.endswith(("_mm", "_deg")) else 3
 
 
-def _by_quantity(
-    records: Sequence[Record], *keys: str
-) -> list[tuple[Quantity, Mapping[tuple[str, ...], Record]]]:
-    """Quantities that have records, and these by their values of `keys`."""
-    found = [
-        (each, {tuple(row[key] for key in keys): row for row in records if row["quantity"] == each.key})
-        for each in QUANTITIES
-    ]
-    return [(quantity, rows) for quantity, rows in found if rows]
-
-
-def _quantity(quantity: Quantity) -> Cell:
-    words = quantity.words.replace(" deg", " / °").replace(" mm", " / mm").replace("error %", "error / %")
+def _quantity(words: str) -> Cell:
+    words = words.replace(" deg", " / °").replace(" mm", " / mm").replace("error %", "error / %")
     return Cell(words, is_word=True)
 
 
-def _with_interval(quantity: Quantity, row: Record | None, most: int) -> Cell:
-    if row is None:
-        return Cell("–")
-    text = quantity.shown(row["mean"])
-    if row["low"] is not None:
-        text += f" ({quantity.shown(row['low'])} to {quantity.shown(row['high'])})"
-    return Cell(text if row["sweeps"] == most else f"{text}\n{counted(row['sweeps'], 'sweep')} only")
+@dataclass(frozen=True)
+class Scored:
+    """Mean errors by mode, from which the first sentences are made.
+
+    Attributes
+    ----------
+    means : list of dict
+        By mode: ``mode``, ``sweeps``, and the means over sweeps of each error's magnitude under short names.
+    parts : int
+        Of those sweeps.
+    together : bool
+        Whether the means of all modes are of the same sweeps, those that have every mode.
+    left_out : int
+        Sweeps with a reference that lack a mode.
+    """
+
+    means: list[dict[str, Any]]
+    parts: int = 0
+    together: bool = True
+    left_out: int = 0
 
 
-def _difference(quantity: Quantity, row: Record | None) -> Cell:
-    if row is None:
-        return Cell("–")
-    text = quantity.shown(row["difference"], signed=True)
-    if row["low"] is not None:
-        low, high = (quantity.shown(row[end], signed=True) for end in ("low", "high"))
-        text += f"\n({low} to {high})"
-    return Cell(text.replace("-", "−"), is_bold=bool(row["better"]))
+def scored_means(rows: Sequence[Record], modes: Sequence[str]) -> Scored:
+    """Means by mode over the sweeps that have all modes; where none has, over each mode's own.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Errors by sweep, part and mode, copies left out.
+    """
+    scored = [row for row in rows if row.get("length_error_mm") is not None]
+    modes = [mode for mode in modes if any(row["mode"] == mode for row in scored)]
+    held_by = {s: {row["mode"] for row in scored if row["sweep"] == s} for s in {r["sweep"] for r in scored}}
+    whole = {sweep for sweep, held in held_by.items() if held.issuperset(modes)}
+    used = [row for row in scored if row["sweep"] in whole] or scored
+    means = []
+    for mode in modes:
+        mine = [row for row in used if row["mode"] == mode]
+        values = {key.replace("_error", ""): mean_over_sweeps(mine, key) for key in _ERRORS}
+        known = {short: value if np.isfinite(value) else None for short, value in values.items()}
+        means.append({"mode": mode, "sweeps": len({row["sweep"] for row in mine}), **known})
+    parts = len({(row["sweep"], row["part"]) for row in used})
+    return Scored(means, parts, bool(whole) or not scored, len(held_by) - len(whole))
+
+
+def summary_lines(
+    scored: Scored,
+    done: int,
+    broken: int,
+    paired: Sequence[Record] = (),
+    references: Mapping[str, str] | None = None,
+) -> list[str]:
+    """Say in plain sentences which mode is right, by how much, and whether the sweeps can tell.
+
+    Parameters
+    ----------
+    scored : Scored
+        Mean magnitude of each error by mode.
+    done, broken : int
+        Number of sweeps with and without results.
+    paired : sequence of mapping
+        Modes compared in pairs, as in ``study.json``.
+    references : mapping of str to str, optional
+        What each sweep was compared with.
+    """
+    if not done:
+        return [f"Nothing could be reconstructed from {counted(broken, 'sweep')}; the reasons are below."]
+    lines = []
+    means = scored.means
+    best, straightest = best_of(means, "length_percent"), best_of(means, "tilt_deg")
+    if best is None:
+        lines.append(
+            "No sweep has a reference, so no mode can be called right: the lengths below are estimates alone."
+        )
+    elif not scored.together:
+        lines.append(
+            "No sweep was reconstructed in every mode, so the modes cannot be ranked together: their means "
+            "are of different sweeps. They are compared in pairs below, on the sweeps that have both."
+        )
+    else:
+        lines.append(_length_line(scored, best) + _doubt(means, paired, "length_error_percent", best))
+        if straightest is not None:
+            known = [row for row in means if row["tilt_deg"] is not None]
+            tilts = ", ".join(f"{label_of(row['mode'])} {row['tilt_deg']:.2f}°" for row in known)
+            tilt_line = f"In tilt {label_of(straightest)} is closest. Mean tilt error: {tilts}."
+            lines.append(tilt_line + _doubt(means, paired, "tilt_error_deg", straightest))
+    if words := reference_words(references or {}):
+        lines.append(f"{words[0].upper()}{words[1:]}.")
+    if fitted_to_reference({row["mode"] for row in means}, references or {}):
+        pose = label_of("pose")
+        lines.append(
+            f"{pose[0].upper()}{pose[1:]} was fitted to the tracker that it is compared with: its errors say "
+            "how well it fits, not how right it is."
+        )
+    if broken:
+        lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below.")
+    return lines
+
+
+def best_of(means: Sequence[Record], key: str) -> str | None:
+    """Mode with the smallest mean; None without any."""
+    valued = [row for row in means if row[key] is not None]
+    return str(min(valued, key=lambda row: row[key])["mode"]) if valued else None
+
+
+def _length_line(scored: Scored, best: str) -> str:
+    means = scored.means
+    mine = next(row for row in means if row["mode"] == best)
+    others = [
+        f"{row['length_percent']:.1f} % with {label_of(row['mode'])}"
+        for row in means
+        if row["mode"] != best and row["length_percent"] is not None
+    ]
+    against = f", against {', '.join(others)}" if others else ""
+    which = f" that {'has' if mine['sweeps'] == 1 else 'have'} every mode" if scored.left_out else ""
+    return (
+        f"Over {counted(mine['sweeps'], 'sweep')}{which} ({counted(scored.parts, 'part')}), {label_of(best)} "
+        f"has the smallest error of length: {mine['length_percent']:.1f} % on average over sweeps "
+        f"({mine['length_mm']:.2f} mm){against}."
+    )
+
+
+def _doubt(means: Sequence[Record], paired: Sequence[Record], quantity: str, best: str) -> str:
+    """Say which modes these sweeps do not tell apart from the best."""
+    others = [str(row["mode"]) for row in means if row["mode"] != best]
+    alike = [mode for mode in others if not beats(paired, quantity, best, mode)]
+    if not others:
+        return ""
+    if not alike:
+        apart = "it apart from every other mode" if len(others) > 1 else "them apart"
+        return f" The sweeps tell {apart}."
+    if len(alike) == len(others):
+        others_named = "the other modes" if len(others) > 1 else label_of(others[0])
+        return f" It is not told apart from {others_named} by these sweeps: the difference may be chance."
+    return f" It is not told apart from {' and '.join(map(label_of, alike))}: that difference may be chance."

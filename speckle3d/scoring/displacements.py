@@ -35,8 +35,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -53,8 +52,7 @@ from speckle3d.scoring.references import Reference
 CHALLENGE_ERRORS = ("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm")
 
 
-@dataclass(frozen=True)
-class PointErrors:
+class PointErrors(NamedTuple):
     """Displacement errors, mm.
 
     `global_mm` compares poses relative to the first frame (GPE, or GLE at landmarks), `local_mm` poses
@@ -72,29 +70,19 @@ def pixel_errors(world_from_image: RigidTransform, reference: RigidTransform, gr
 
 
 def landmark_errors(
-    world_from_image: RigidTransform,
-    reference: RigidTransform,
-    frames: npt.ArrayLike,
-    points_mm: npt.ArrayLike,
+    world_from_image: RigidTransform, reference: RigidTransform, landmarks: Landmarks
 ) -> PointErrors:
-    """GLE and LLE: displacement errors of landmarks, each a point of one image.
-
-    Parameters
-    ----------
-    frames : array_like of int, shape (p,)
-        The frame each landmark is in, from 1 on: the first frame has no error.
-    points_mm : array_like, shape (p, 3)
-        In the image frame.
+    """GLE and LLE: displacement errors of landmarks, from frame 1 on: the first frame has no error.
 
     Raises
     ------
     InvalidInputError
         If there are no landmarks, or one is in no frame that has an error.
     """
-    at, points = np.asarray(frames, dtype=int), np.asarray(points_mm, dtype=float)
+    at, points = landmarks.frame, landmarks.points_mm
     whole, steps = _differences(world_from_image, reference)
-    if not at.size or points.shape != (at.size, 3):
-        raise InvalidInputError(f"landmarks: expected a point per frame, got {at.shape} and {points.shape}")
+    if not at.size:
+        raise InvalidInputError("landmarks: expected at least one, got none")
     if (wrong := np.flatnonzero((at < 1) | (at > len(whole)))).size:
         raise InvalidInputError(
             f"landmark {wrong[0]}: expected a frame from 1 to {len(whole)}, got {at[wrong[0]]}"
@@ -223,7 +211,7 @@ def _point_row(
     poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None
 ) -> dict[str, Any]:
     pixels = None if grid is None else pixel_errors(poses, true, grid)
-    marks = None if landmarks is None else landmark_errors(poses, true, landmarks.frame, landmarks.points_mm)
+    marks = None if landmarks is None else landmark_errors(poses, true, landmarks)
     return {
         "GPE_mm": pixels and pixels.global_mm,
         "GLE_mm": marks and marks.global_mm,

@@ -11,8 +11,9 @@ cancels, and that is averaged away (see `compare_modes`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -35,8 +36,7 @@ with a tracker's 0.15 mm and 0.1 degrees per axis, 1, 9, 25 and 51 frames leave 
 of scoring error; against an exact reference the same lines cost 0, 0.006, 0.03 and 0.05 mm."""
 
 
-@dataclass(frozen=True)
-class Accumulated:
+class Accumulated(NamedTuple):
     """Motion summed from the first frame, all of shape (n,), zero at frame 0."""
 
     length_mm: FloatArray
@@ -52,11 +52,6 @@ class Part:
     name: str
     first: int
     last: int
-
-    @property
-    def frames(self) -> slice:
-        """Index of the part's frames, both ends included."""
-        return slice(self.first, self.last + 1)
 
 
 @dataclass(frozen=True)
@@ -104,8 +99,7 @@ def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> A
     steps = relative_poses(world_from_image)
     roll, yaw, tilt = roll_yaw_tilt(steps.rotation).T
     along_z = (steps.apply(centre) - centre)[:, 2]
-    length, tilts, yaws, rolls = (np.concatenate([[0.0], np.cumsum(a)]) for a in (along_z, tilt, yaw, roll))
-    return Accumulated(length, tilts, yaws, rolls)
+    return Accumulated(*(np.concatenate([[0.0], np.cumsum(a)]) for a in (along_z, tilt, yaw, roll)))
 
 
 def monotone_parts(length_mm: npt.ArrayLike, jitter_frames: int = JITTER_FRAMES) -> list[Part]:
@@ -190,15 +184,28 @@ def compare_modes(
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, tables 3 and 4.
     """
-    estimates, true = _accumulated_together(poses, reference, centre_mm, covered)
+    if not poses:
+        raise InvalidInputError("poses: expected at least one mode, got none")
+    frames = len(next(iter(poses.values())))
+    used = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
+    if used.shape != (frames,):
+        raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
+    for mode, each in poses.items():
+        if len(each) != frames:
+            raise MismatchError(f"mode {mode}: expected {frames} poses, got {len(each)}")
+    if len(reference) == frames:
+        reference = reference[used]
+    if len(reference) != used.sum():
+        raise MismatchError(f"reference: expected {used.sum()} poses, got {len(reference)}")
+    true = accumulated(reference, centre_mm)
+    estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
+    carrier = next(iter(estimates.values())).length_mm
     rows: list[ModeError] = []
     for part in monotone_parts(true.length_mm):
-        carrier = next(iter(estimates.values())).length_mm
         reference_mm = _change(carrier, part, 1) + _change(true.length_mm - carrier, part, end_frames)
-        rows += [
-            _mode_error(part, mode, found, true, reference_mm, end_frames)
-            for mode, found in estimates.items()
-        ]
+        for mode, found in estimates.items():
+            errors = [_change(a - b, part, end_frames) for a, b in zip(found, true, strict=True)]
+            rows.append(_mode_error(part, mode, reference_mm, errors))
     return rows
 
 
@@ -219,54 +226,19 @@ def _turning_frames(length: FloatArray) -> list[int]:
     return turns
 
 
-def _accumulated_together(
-    poses: Mapping[str, RigidTransform],
-    reference: RigidTransform,
-    centre_mm: npt.ArrayLike,
-    covered: npt.ArrayLike | None,
-) -> tuple[dict[str, Accumulated], Accumulated]:
-    if not poses:
-        raise InvalidInputError("poses: expected at least one mode, got none")
-    frames = len(next(iter(poses.values())))
-    used = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
-    if used.shape != (frames,):
-        raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
-    if len(reference) == frames:
-        reference = reference[used]
-    for mode, each in poses.items():
-        if len(each) != frames:
-            raise MismatchError(f"mode {mode}: expected {frames} poses, got {len(each)}")
-    if len(reference) != int(used.sum()):
-        raise MismatchError(f"reference: expected {int(used.sum())} poses, got {len(reference)}")
-    return {m: accumulated(p[used], centre_mm) for m, p in poses.items()}, accumulated(reference, centre_mm)
-
-
-def _mode_error(
-    part: Part, mode: str, found: Accumulated, true: Accumulated, reference_mm: float, end_frames: int
-) -> ModeError:
-    direction = -1.0 if reference_mm < 0 else 1.0
-    error_mm = direction * _change(found.length_mm - true.length_mm, part, end_frames)
-    tilt, yaw, roll = (
-        float(np.rad2deg(_change(getattr(found, name) - getattr(true, name), part, end_frames)))
-        for name in ("tilt_rad", "yaw_rad", "roll_rad")
-    )
-    return ModeError(
-        part=part.name,
-        mode=mode,
-        frames=part.last - part.first + 1,
-        reference_mm=abs(reference_mm),
-        estimate_mm=abs(reference_mm) + error_mm,
-        length_error_mm=error_mm,
-        length_error_percent=100.0 * error_mm / abs(reference_mm) if reference_mm else float("nan"),
-        tilt_error_deg=tilt,
-        yaw_error_deg=yaw,
-        roll_error_deg=roll,
-    )
+def _mode_error(part: Part, mode: str, reference_mm: float, errors: Sequence[float]) -> ModeError:
+    """Row of a part from its signed length and the errors of length (mm), tilt, yaw and roll (rad)."""
+    length_mm = abs(reference_mm)
+    error_mm = -errors[0] if reference_mm < 0 else errors[0]
+    percent = 100.0 * error_mm / length_mm if length_mm else float("nan")
+    frames = part.last - part.first + 1
+    turns_deg = np.rad2deg(errors[1:]).tolist()
+    return ModeError(part.name, mode, frames, length_mm, length_mm + error_mm, error_mm, percent, *turns_deg)
 
 
 def _change(values: FloatArray, part: Part, end_frames: int) -> float:
     """Change of `values` from the first to the last frame of a part, each read off a robust line."""
-    inside = values[part.frames]
+    inside = values[part.first : part.last + 1]
     width = max(1, min(end_frames, inside.size // 2))
     return _line_end(inside[-width:]) - _line_end(inside[:width][::-1])
 

@@ -133,8 +133,7 @@ def sweep_curves(
 
 
 def _accumulated(poses: RigidTransform, centre_mm: npt.ArrayLike) -> FloatArray:
-    motion = accumulated(poses, centre_mm)
-    return _in_degrees(np.stack([motion.length_mm, motion.tilt_rad, motion.yaw_rad, motion.roll_rad]))
+    return _in_degrees(np.stack(accumulated(poses, centre_mm)))
 
 
 def _in_degrees(values: FloatArray) -> FloatArray:

@@ -35,23 +35,6 @@ class MeanInterval:
     high: float | None
 
 
-@dataclass(frozen=True)
-class PairedComparison:
-    """One mode against another on the same sweeps.
-
-    Attributes
-    ----------
-    difference : MeanInterval
-        Of the first mode's values less the second's.
-    wilcoxon_p : float or None
-        Two-sided signed-rank test; None where `difference` has no interval. With n sweeps it cannot be below
-        2 / 2**n, so that five sweeps never reach 0.05.
-    """
-
-    difference: MeanInterval
-    wilcoxon_p: float | None
-
-
 def mean_interval(values: npt.ArrayLike) -> MeanInterval:
     """Mean of one value per sweep, with its 95 % percentile bootstrap interval [1]_; seeded, so it repeats.
 
@@ -83,8 +66,16 @@ def mean_interval(values: npt.ArrayLike) -> MeanInterval:
     return MeanInterval(held.size, mean, float(interval.low), float(interval.high))
 
 
-def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> PairedComparison:
+def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[MeanInterval, float | None]:
     """Compare two modes by their differences, sweep by sweep; sweeps that lack either are left out.
+
+    Returns
+    -------
+    difference : MeanInterval
+        Of the first mode's values less the second's.
+    wilcoxon_p : float or None
+        Two-sided signed-rank test; None where `difference` has no interval. With n sweeps it cannot be below
+        2 / 2**n, so that five sweeps never reach 0.05.
 
     Raises
     ------
@@ -99,10 +90,10 @@ def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> PairedComp
     differences = _present(one - other)
     found = mean_interval(differences)
     if not _scatters(differences):
-        return PairedComparison(found, None)
+        return found, None
     from scipy import stats
 
-    return PairedComparison(found, float(stats.wilcoxon(differences).pvalue))
+    return found, float(stats.wilcoxon(differences).pvalue)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

@@ -9,40 +9,30 @@ skips what they hold; of a worker that is killed only the unfinished job is lost
 from __future__ import annotations
 
 import shutil
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.scoring.references import require_reference
+from speckle3d.study import sweepjob
 from speckle3d.study.folder import named, only_run
 from speckle3d.study.job import SUBSET
 from speckle3d.study.results import Study, SweepOutcome, write_study
-from speckle3d.study.schedulers import InProcess, Scheduler, remaining_s
-from speckle3d.study.sweepjob import (
-    BlockJob,
-    BlockOutcome,
-    SweepJob,
-    block_files,
-    finished,
-    lost,
-    lost_block,
-    plan_blocks,
-    plan_sweep,
-    run_block,
-    run_sweep,
-)
+from speckle3d.study.schedulers import InProcess, Scheduler
+from speckle3d.study.sweepjob import BlockOutcome, SweepJob
 
 MATCHING_SHARE = 0.5
 """Share of a sweep's time that matching its blocks takes: half with frames of 127 x 3818 samples, less with
 small ones."""
 
-Task = SweepJob | BlockJob
-TaskOutcome = SweepOutcome | BlockOutcome
 KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
 
 
@@ -57,32 +47,28 @@ class StudyProgress:
     done_frames: float = 0.0
     remaining_s: float | None = None
     blocks: int = 0
-    _timed: list[tuple[float, float]] = field(default_factory=list)
-    _matched: dict[str, float] = field(default_factory=dict)
+    _rates: list[float] = field(default_factory=list)
+    _matched: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
-    def add(self, outcome: SweepOutcome, frames: int, workers: int) -> None:
-        """Count a finished sweep; skipped and failed ones do not count for the time left."""
-        self.done += 1
-        self.done_frames += frames - self._matched.pop(outcome.name, 0.0)
-        self.failed += outcome.status == "failed"
-        if outcome.status == "done" and not outcome.skipped:
-            self._timed.append((frames, outcome.seconds))
-        self._look_ahead(workers)
-
-    def add_block(self, outcome: BlockOutcome, workers: int) -> None:
-        """Count a block of a sweep that is not finished, one of `blocks` that are left."""
-        self.blocks -= 1
-        work = MATCHING_SHARE * outcome.frames
-        self._matched[outcome.name] = self._matched.get(outcome.name, 0.0) + work
-        self.done_frames += work
-        if not outcome.reason and not outcome.skipped:
-            self._timed.append((work, outcome.seconds))
-        self._look_ahead(workers)
-
-    def _look_ahead(self, workers: int) -> None:
-        running = min(workers, self.sweeps - self.done + self.blocks)
-        left = self.frames - self.done_frames
-        self.remaining_s = remaining_s(self._timed, left, running) if self.done < self.sweeps else 0.0
+    def add(self, outcome: SweepOutcome | BlockOutcome, workers: int) -> None:
+        """Count a finished sweep or block; skipped and failed ones do not count for the time left."""
+        work = float(outcome.frames)
+        if isinstance(outcome, BlockOutcome):
+            work *= MATCHING_SHARE
+            self.blocks -= 1
+            self._matched[outcome.name] += work
+            self.done_frames += work
+        else:
+            self.done += 1
+            self.failed += outcome.status == "failed"
+            self.done_frames += work - self._matched.pop(outcome.name, 0.0)
+        if work > 0 and not (outcome.reason or outcome.skipped):
+            self._rates.append(outcome.seconds / work)
+        if self.done == self.sweeps:
+            self.remaining_s = 0.0
+        elif self._rates:
+            running = max(1, min(workers, self.sweeps - self.done + self.blocks))
+            self.remaining_s = float(np.median(self._rates)) * (self.frames - self.done_frames) / running
 
 
 def compare_sweeps(
@@ -121,12 +107,16 @@ def compare_sweeps(
     if not paths:
         raise InvalidInputError("expected at least one sweep, got none")
     chosen = None if modes is None else tuple(dict.fromkeys(modes))
-    _require_known(chosen, reference)
+    # What is wrong for one sweep is wrong for all: refused before any work is done.
+    for mode in chosen or ():
+        if mode not in KNOWN_MODES:
+            raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
+    require_reference(reference)
     if curves is not None:
-        read_curves(curves)  # wrong for one sweep is wrong for all
+        read_curves(curves)
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
     plan = [
-        plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
+        sweepjob.plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
         for name, path in named(paths)
     ]
     jobs = [each for each in plan if isinstance(each, SweepJob)]
@@ -153,36 +143,23 @@ def _run(
     by_name = {job.name: job for job in jobs}
     tasks, after = _tasks(jobs)
     so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
-    if progress:
-        progress(so_far)
-    for _, outcome in where.run(run_task, tasks, lost_task, after):
-        if isinstance(outcome, BlockOutcome):
-            so_far.add_block(outcome, where.workers)
-        else:
-            outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
-            so_far.add(outcome, by_name[outcome.name].frames, where.workers)
-        if progress:
-            progress(so_far)
+    tell = progress or (lambda at: None)
+    tell(so_far)
+    for _, outcome in where.run(sweepjob.run_task, tasks, sweepjob.lost_task, after):
+        if isinstance(outcome, SweepOutcome):
+            outcome = outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
+        so_far.add(outcome, where.workers)
+        tell(so_far)
     _clear(jobs)
     return outcomes
 
 
-def run_task(task: Task) -> TaskOutcome:
-    """Do a sweep's or a block's job."""
-    return run_block(task) if isinstance(task, BlockJob) else run_sweep(task)
-
-
-def lost_task(task: Task, reason: str) -> TaskOutcome:
-    """Outcome of a job that was lost with its workers."""
-    return lost_block(task, reason) if isinstance(task, BlockJob) else lost(task, reason)
-
-
-def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[Task], dict[int, range]]:
+def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[sweepjob.Task], dict[int, range]]:
     """All jobs, and which come after which: a long sweep's job comes after those of its blocks."""
-    tasks: list[Task] = []
+    tasks: list[sweepjob.Task] = []
     after: dict[int, range] = {}
     for job in jobs:
-        blocks = plan_blocks(job)
+        blocks = sweepjob.plan_blocks(job)
         after[len(tasks) + len(blocks)] = range(len(tasks), len(tasks) + len(blocks))
         tasks += [*blocks, job]
     return tasks, after
@@ -190,17 +167,11 @@ def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[Task], dict[int, range]]:
 
 def _require_here(outcome: SweepOutcome, job: SweepJob) -> SweepOutcome:
     """Fail a sweep whose results a worker wrote to a disk that this process does not see."""
-    if outcome.status == "done" and finished(job) is None:
-        return lost(job, f"{job.folder}: expected a folder that workers and the study share, got none here")
+    if outcome.status == "done" and sweepjob.finished(job) is None:
+        return sweepjob.lost(
+            job, f"{job.folder}: expected a folder that workers and the study share, got none here"
+        )
     return outcome
-
-
-def _require_known(modes: tuple[str, ...] | None, reference: str | None) -> None:
-    """Refuse, before any work is done, what would be wrong for every sweep."""
-    for mode in modes or ():
-        if mode not in KNOWN_MODES:
-            raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
-    require_reference(reference)
 
 
 def _clear(jobs: Sequence[SweepJob]) -> None:
@@ -208,7 +179,7 @@ def _clear(jobs: Sequence[SweepJob]) -> None:
     for job in jobs:
         for part in job.folder.parent.glob(f".part-*-{job.folder.name}"):
             shutil.rmtree(part, ignore_errors=True)
-        blocks = block_files(job).folder
+        blocks = sweepjob.block_files(job).folder
         for part in blocks.glob(".part-*"):
             part.unlink(missing_ok=True)
         with suppress(OSError):

@@ -19,7 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import REFERENCES, SweepCurves
 
@@ -207,8 +208,7 @@ def draw_panel(axes: Axes, panel: Panel, named_below: bool = True) -> None:
 
 
 def figure_reslice(
-    images_db: Mapping[str, npt.NDArray[np.floating]],
-    extents_mm: Mapping[str, tuple[float, float, float, float]],
+    cuts_db: Mapping[str, tuple[npt.NDArray[np.floating], ReslicePlane]],
     dynamic_range_db: float = 50.0,
     title: str = "",
     axis_labels: tuple[str, str] = ("elevational / mm", "depth / mm"),
@@ -217,33 +217,32 @@ def figure_reslice(
 
     Parameters
     ----------
-    images_db : mapping of str to ndarray, shape (rows, columns)
-        Reslice by mode, dB; NaN where no frame reached, drawn in blue-grey.
-    extents_mm : mapping of str to (left, right, bottom, top)
-        Edges of each image, as in matplotlib's `imshow`; bottom > top where depth grows downwards.
+    cuts_db : mapping of str to (ndarray, ReslicePlane)
+        By mode, the reslice in dB, NaN where no frame reached (drawn in blue-grey), and its plane.
     dynamic_range_db : float
         Below the brightest value of all images.
+
+    Raises
+    ------
+    InvalidInputError
+        If no frame reached any reslice.
     """
-    if not images_db:
-        raise InvalidInputError("images_db: expected at least one reslice, got none")
-    if set(images_db) != set(extents_mm):
-        raise MismatchError(
-            f"extents_mm: expected the modes {sorted(images_db)}, got those of {sorted(extents_mm)}"
-        )
-    widths = [abs(extents_mm[mode][1] - extents_mm[mode][0]) for mode in images_db]
-    height = max(abs(extents_mm[mode][3] - extents_mm[mode][2]) for mode in images_db)
-    figure = new_figure(*_reslice_size(widths, height))
-    panels = figure.subplots(
-        1, len(images_db), squeeze=False, sharey=True, width_ratios=[max(w, 0.2 * height) for w in widths]
-    )[0]
-    brightest = _brightest(images_db)
-    for panel, (mode, image) in zip(panels, images_db.items(), strict=True):
-        show_grey(panel, image, extents_mm[mode], (brightest - dynamic_range_db, brightest))
-        panel.set_title(
-            wrapped(label_of(mode), figure.get_figwidth() / len(images_db)),
-            fontsize="medium",
-            color=colour_of(mode, list(images_db)),
-        )
+    finite: FloatArray = np.concatenate([image[np.isfinite(image)] for image, _ in cuts_db.values()])
+    if not finite.size:
+        raise InvalidInputError(f"reslices of {', '.join(cuts_db)}: expected a finite value in one, got none")
+    # The 99.9th percentile: a single specular echo must not darken the tissue.
+    brightest = float(np.percentile(finite, 99.9))
+    # Ten inches wide at most and eight high.
+    height = max(plane.height_mm for _, plane in cuts_db.values())
+    widths = [max(plane.width_mm, 0.2 * height) for _, plane in cuts_db.values()]
+    scale = min(9.0 / sum(widths), 6.5 / height)
+    figure = new_figure(max(scale * sum(widths) + 1.2, 4.0), scale * height + 1.3)
+    panels = figure.subplots(1, len(cuts_db), squeeze=False, sharey=True, width_ratios=widths)[0]
+    for panel, (mode, (image, plane)) in zip(panels, cuts_db.items(), strict=True):
+        extent = (0.0, plane.width_mm, plane.height_mm, 0.0)
+        show_grey(panel, image, extent, (brightest - dynamic_range_db, brightest))
+        name = wrapped(label_of(mode), figure.get_figwidth() / len(cuts_db))
+        panel.set_title(name, fontsize="medium", color=colour_of(mode, list(cuts_db)))
         panel.set_xlabel(axis_labels[0])
     panels[0].set_ylabel(axis_labels[1])
     figure.suptitle(title)
@@ -295,18 +294,3 @@ def label_axes(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _reslice_size(widths_mm: list[float], height_mm: float) -> tuple[float, float]:
-    """Size in inches that fits the panels, ten inches wide at most and eight high."""
-    total = sum(max(w, 0.2 * height_mm) for w in widths_mm)
-    scale = min(9.0 / total, 6.5 / height_mm)
-    return max(scale * total + 1.2, 4.0), scale * height_mm + 1.3
-
-
-def _brightest(images: Mapping[str, npt.NDArray[np.floating]]) -> float:
-    finite: FloatArray = np.concatenate([image[np.isfinite(image)] for image in images.values()])
-    if not finite.size:
-        raise InvalidInputError("images_db: expected a finite value in some reslice, got none")
-    # The 99.9th percentile: a single specular echo must not darken the tissue.
-    return float(np.percentile(finite, 99.9))

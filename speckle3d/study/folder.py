@@ -1,21 +1,38 @@
-"""A study's folder: what its sweeps are called in it, and the lock that lets one run at a time work in it."""
+"""A study's folder: names of its sweeps, the lock that lets one run at a time work in it, files of blocks."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
+import json
 import os
+import shutil
 import socket
+import zipfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from speckle3d.core.errors import FileError
-from speckle3d.io.hdf5 import make_folder, one_line
+from speckle3d.io.hdf5 import atomic_path, make_folder, one_line
+from speckle3d.matching.blocks import Block, MatchedBlock, MatchedFrame
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.quality import FrameFeatures
+from speckle3d.matching.table import MatchedPair
+from speckle3d.study.images import Strip
 
 LOCK = ".lock"
+
+_FEATURES = tuple(each.name for each in fields(FrameFeatures))
+_BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile)
+"""What NumPy raises on a damaged file, depending on where the damage is."""
 
 _HELD: ContextVar[tuple[Path, ...]] = ContextVar("held", default=())
 """Folders that the caller holds already: a study that simulates its sweeps holds its folder for both."""
@@ -41,7 +58,8 @@ def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
             depth[i] += 1
         names = _joined(words, depth)
     # Folders joined may still be alike: a-b/c and a/b-c.
-    unique = [n if names.count(n) == 1 else f"{n}-{_mark(p)}" for n, p in zip(names, files, strict=True)]
+    marks = [hashlib.sha256(str(path).encode()).hexdigest()[:6] for path in files]
+    unique = [n if names.count(n) == 1 else f"{n}-{mark}" for n, mark in zip(names, marks, strict=True)]
     return list(zip(unique, files, strict=True))
 
 
@@ -81,10 +99,6 @@ def _joined(words: Sequence[Sequence[str]], depth: Sequence[int]) -> list[str]:
     return ["-".join(each[-d:]) for each, d in zip(words, depth, strict=True)]
 
 
-def _mark(path: Path) -> str:
-    return hashlib.sha256(str(path).encode()).hexdigest()[:6]
-
-
 def _take(file: int, directory: Path) -> None:
     try:
         fcntl = importlib.import_module("fcntl")
@@ -101,3 +115,99 @@ def _take(file: int, directory: Path) -> None:
         return  # a file system without locks
     os.truncate(file, 0)
     os.pwrite(file, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+
+
+@dataclass
+class BlockFiles:
+    """Matched blocks of one sweep, which its own job reads, and removes when the sweep is done.
+
+    One ``.npz`` for each block: ``key``, ``frame`` (n,), ``strip`` (n, vector, sample), one array for each
+    field of `FrameFeatures`, and of e pairs, latest earlier frame first, ``first`` and ``second`` (e,),
+    ``correlation`` (e, patch), ``median`` (e,), ``motion`` (e, 3), ``covariance`` (e, 3, 3) and
+    ``has_covariance`` (e,). Numbers are kept to the last bit.
+
+    Attributes
+    ----------
+    folder : path
+        Made when the first block is written.
+    key : str
+        Of the sweep's job; files with another are not taken.
+    spent_s : float
+        By the jobs of the blocks read so far.
+    """
+
+    folder: Path
+    key: str
+    spent_s: float = 0.0
+
+    def path(self, block: Block) -> Path:
+        """Where a block is, or would be."""
+        return self.folder / f"{block.first:06d}-{block.stop:06d}.npz"
+
+    def has(self, block: Block) -> bool:
+        """Whether a block is there."""
+        try:
+            with np.load(self.path(block)) as file:
+                return str(file["key"]) == self.key
+        except _BROKEN:
+            return False
+
+    def write(self, block: Block, matched: MatchedBlock, strip: Strip, spent_s: float) -> None:
+        """Write a block, whole or not at all."""
+        make_folder(self.folder)
+        frames = matched.frames
+        pairs = [(first, each.frame, pair) for each in frames for first, pair in each.pairs.items()]
+        motions = [pair.motion for _, _, pair in pairs]
+        unknown = np.full((3, 3), np.nan)
+        held: dict[str, npt.ArrayLike] = {
+            "key": self.key,
+            "seconds": json.dumps(dict(matched.seconds)),
+            "spent_s": spent_s,
+            "strip": strip.kept(block.first, block.stop),
+            "frame": [each.frame for each in frames],
+            "first": [first for first, _, _ in pairs],
+            "second": [second for _, second, _ in pairs],
+            "correlation": [pair.correlation for _, _, pair in pairs],
+            "median": [pair.median for _, _, pair in pairs],
+            "motion": [(m.x_mm, m.y_mm, m.roll_rad) for m in motions],
+            "covariance": [unknown if m.covariance is None else m.covariance for m in motions],
+            "has_covariance": [m.covariance is not None for m in motions],
+        }
+        held |= {name: [getattr(each.features, name) for each in frames] for name in _FEATURES}
+        with atomic_path(self.path(block)) as part:
+            np.savez(part, allow_pickle=False, **held)
+
+    def read(self, block: Block, strip: Strip) -> MatchedBlock | None:
+        """Read a block and its strips; None if it is not there, or is not whole."""
+        try:
+            with np.load(self.path(block)) as file:
+                held = {name: file[name] for name in file.files}
+            if str(held["key"]) != self.key:
+                return None
+            matched = MatchedBlock(_matched_frames(held), json.loads(str(held["seconds"])))
+            images, spent_s = held["strip"], float(held["spent_s"])
+        except _BROKEN:
+            return None
+        strip.take(block.first, images)
+        self.spent_s += spent_s
+        return matched
+
+    def clear(self) -> None:
+        """Remove the blocks."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _matched_frames(held: Mapping[str, npt.NDArray[Any]]) -> list[MatchedFrame]:
+    numbers = held["frame"].tolist()
+    pairs: dict[int, dict[int, MatchedPair]] = {frame: {} for frame in numbers}
+    for row, (first, second) in enumerate(zip(held["first"].tolist(), held["second"].tolist(), strict=True)):
+        covariance = held["covariance"][row] if held["has_covariance"][row] else None
+        x_mm, y_mm, roll_rad = held["motion"][row].tolist()
+        motion = InPlaneMotion(x_mm, y_mm, roll_rad, covariance)
+        pairs[second][first] = MatchedPair(held["correlation"][row], float(held["median"][row]), motion)
+    frames = []
+    for row, frame in enumerate(numbers):
+        values = {name: held[name][row] for name in _FEATURES}
+        features = FrameFeatures(**{name: v.item() if v.ndim == 0 else v for name, v in values.items()})
+        frames.append(MatchedFrame(frame, features, pairs[frame]))
+    return frames

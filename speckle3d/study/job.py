@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -27,10 +28,10 @@ from speckle3d.motion.direction import sensed_orientation
 from speckle3d.pipeline import Progress, Tracked, correct, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
-from speckle3d.study.blockfiles import BlockFiles
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
+from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_plane
-from speckle3d.study.results import Summary, table_text, write_summary
+from speckle3d.study.results import Summary, rows_of, table_text, write_summary
 
 SUBSET = "image+subset"
 """Mode of the images alone with the patches that contradict the sensed orientation left out."""
@@ -128,11 +129,15 @@ def run_job(
         provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
-    summary = _summarise(sweep, tracked, corrections, poses, moved, compared, provenance)
-    files = [path, *write_summary(directory, [summary])]
+    name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
+    rows = _errors(sweep, poses, moved, compared)
+    details = _details(tracked, corrections, moved, provenance)
+    summary = Summary(sweep.name, name, len(sweep), share, rows, details)
+    files = [path, *write_summary(directory, summary)]
     files += [save_figure(figure_drift(moved, sweep.name), directory / "drift.png")]
     files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
-    return JobResult(directory, summary, table_text([summary]), tuple(files), time.perf_counter() - began)
+    table, seconds = table_text(rows_of([summary])), time.perf_counter() - began
+    return JobResult(directory, summary, table, tuple(files), seconds)
 
 
 def require_possible(
@@ -146,58 +151,31 @@ def require_possible(
         If it does not have it, naming the mode or the reference.
     """
     require_modes(sweep, [mode for mode in drift if mode != SUBSET])
-    if SUBSET in drift:
-        _require_subset(sweep, config)
+    if SUBSET in drift and sensed_orientation(sweep, config.sensors) is None:
+        raise InsufficientDataError(
+            f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
+            "sensors.consistent_subset, got none"
+        )
     return find_reference(sweep, reference)
 
 
 def available_modes(sweep: Sweep, config: Config) -> list[str]:
     """Modes beside `image` for which the sweep has sensors, calibrated to the image."""
-    found = [SUBSET] if sensed_orientation(sweep, config.sensors) is not None else []
-    for mode in ("orientation", "pose"):
-        try:
-            require_modes(sweep, [mode])
-        except InsufficientDataError:
-            continue
-        found.append(mode)
+    found = []
+    for mode in (SUBSET, "orientation", "pose"):
+        with suppress(InsufficientDataError):
+            require_possible(sweep, [mode], None, config)
+            found.append(mode)
     return found
 
 
-def _require_subset(sweep: Sweep, config: Config) -> None:
-    if sensed_orientation(sweep, config.sensors) is None:
-        raise InsufficientDataError(
-            f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
-            "sensors.consistent_subset, got none"
-        )
-
-
-def _summarise(
-    sweep: Sweep,
-    tracked: Tracked,
-    corrections: dict[str, DriftCorrection],
-    poses: dict[str, RigidTransform],
-    moved: SweepCurves,
-    reference: Reference | None,
-    provenance: Provenance,
-) -> Summary:
+def _errors(
+    sweep: Sweep, poses: dict[str, RigidTransform], moved: SweepCurves, reference: Reference | None
+) -> list[ModeError]:
     if reference is None:
-        rows = [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
-    else:
-        rows = compare_modes(
-            poses,
-            reference.world_from_image,
-            sweep.grid.centre_mm,
-            reference.covered,
-            end_frames=1 if reference.name == "truth" else END_FRAMES,
-        )
-    return Summary(
-        sweep.name,
-        reference.name if reference else "none",
-        len(sweep),
-        float(reference.covered.mean()) if reference else 0.0,
-        rows,
-        _details(tracked, corrections, moved, provenance),
-    )
+        return [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
+    true, ends = reference.world_from_image, 1 if reference.name == "truth" else END_FRAMES
+    return compare_modes(poses, true, sweep.grid.centre_mm, reference.covered, ends)
 
 
 def _details(
@@ -206,9 +184,7 @@ def _details(
     names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
     return {
         "provenance": provenance,
-        "estimates": {
-            mode: dict(zip(names, c[:, -1].tolist(), strict=True)) for mode, c in moved.modes.items()
-        },
+        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
         "pairs": tracked.pairs,
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
@@ -254,11 +230,9 @@ def _draw_reslices(
     if reference is not None and reference.covered.all():
         shown[reference.name] = reference.world_from_image
     left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
-    images, extents = {}, {}
+    cuts = {}
     for mode, world_from_image in shown.items():
         of_strip = world_from_image * left
         plane = middle_plane(of_strip, strip.grid)
-        images[mode] = cut_frames(strip, strip.grid, of_strip, plane)
-        extents[mode] = (0.0, plane.width_mm, plane.height_mm, 0.0)
-    figure = figure_reslice(images, extents, title=f"{name}: along the sweep, at the middle vector")
-    return save_figure(figure, path)
+        cuts[mode] = cut_frames(strip, strip.grid, of_strip, plane), plane
+    return save_figure(figure_reslice(cuts, title=f"{name}: along the sweep, at the middle vector"), path)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
 
@@ -36,19 +36,26 @@ class Quantity:
     signed_parts: bool = False
     """Whether it is a signed error of every part of a sweep, not one number per sweep."""
 
-    def shown(self, value: float | None, signed: bool = False) -> str:
+    def shown(self, value: float, signed: bool = False) -> str:
         """Write a value; a dash for none."""
-        if value is None or not np.isfinite(value):
+        if not np.isfinite(value):
             return "-"
         return (self.form.replace(":", ":+") if signed else self.form).format(value)
+
+    def with_interval(self, row: Row, name: str, signed: bool = False) -> str:
+        """Write the value of that name in a record, and its interval if it has one."""
+        text = self.shown(row[name], signed)
+        if row.get("low") is not None:
+            text += f" [{self.shown(row['low'], signed)}, {self.shown(row['high'], signed)}]"
+        return text
 
 
 QUANTITIES = (
     Quantity("length_error_percent", "length error %", "{:.1f}", True),
-    Quantity("length_error_mm", "length error mm", "{:.2f}", True),
-    Quantity("tilt_error_deg", "tilt error deg", "{:.2f}", True),
-    Quantity("yaw_error_deg", "yaw error deg", "{:.2f}", True),
-    Quantity("roll_error_deg", "roll error deg", "{:.2f}", True),
+    Quantity("length_error_mm", "length error mm", signed_parts=True),
+    Quantity("tilt_error_deg", "tilt error deg", signed_parts=True),
+    Quantity("yaw_error_deg", "yaw error deg", signed_parts=True),
+    Quantity("roll_error_deg", "roll error deg", signed_parts=True),
     Quantity("FDR", "FDR", "{:.1%}"),
     Quantity("ADR", "ADR", "{:.1%}"),
     Quantity("MD_mm", "MD mm"),
@@ -89,9 +96,7 @@ def over_sweeps(
     for quantity in QUANTITIES:
         values = _by_mode(quantity, rows, drift)
         for mode, each in values.items():
-            found = mean_interval(each)
-            named = {"quantity": quantity.key, "mode": mode, "sweeps": found.sweeps}
-            intervals.append(named | {"mean": found.mean, "low": found.low, "high": found.high})
+            intervals.append({"quantity": quantity.key, "mode": mode, **asdict(mean_interval(each))})
         paired += _pairs(quantity, values)
     return intervals, paired
 
@@ -132,10 +137,8 @@ def shared_means(rows: Sequence[Row], drift: Sequence[Row] = ()) -> list[dict[st
 
 def are_uneven(intervals: Sequence[Row]) -> bool:
     """Whether in some quantity the modes' means are of different sweeps."""
-    counts: dict[str, set[int]] = {}
-    for row in intervals:
-        counts.setdefault(row["quantity"], set()).add(row["sweeps"])
-    return any(len(each) > 1 for each in counts.values())
+    counts = {(row["quantity"], row["sweeps"]) for row in intervals}
+    return len(counts) > len({quantity for quantity, _ in counts})
 
 
 def overall_text(
@@ -155,31 +158,50 @@ def overall_text(
     """
     if not intervals:
         return ""
-    most = max(row["sweeps"] for row in intervals)
-    lines = _means_lines(f"mean of {most} sweep{'s' * (most != 1)}", intervals, most)
-    if any(row["sweeps"] != most for row in intervals):
+    lines = text_table(means_table("mean of {}", intervals)).splitlines()
+    if len({row["sweeps"] for row in intervals}) > 1:
         lines.append("(n): of n sweeps only")
-    lines += _told(intervals, paired) + _reference_lines(references or {}, intervals)
-    if not are_uneven(intervals):
-        return "\n".join(lines) + "\n"
-    lines.append("these means are not all of the same sweeps: side by side they do not compare modes")
-    if not shared:
-        return "\n".join([*lines, "no sweep has every mode: modes compare in pairs alone"]) + "\n"
-    most = max(row["sweeps"] for row in shared)
-    title = f"{most} sweep{'s' * (most != 1)} with every mode"
-    return "\n".join([*lines, "", *_means_lines(title, shared, most)]) + "\n"
+    lines += _told(intervals, paired)
+    words = reference_words(references or {})
+    lines += textwrap.wrap(words, 100, subsequent_indent="  ") if words else []
+    if fitted_to_reference({row["mode"] for row in intervals}, references or {}):
+        lines.append("pose was fitted to this tracker: its errors say how well it fits, not how right it is")
+    if are_uneven(intervals):
+        lines.append("these means are not all of the same sweeps: side by side they do not compare modes")
+        if shared:
+            lines += ["", *text_table(means_table("{} with every mode", shared)).splitlines()]
+        else:
+            lines.append("no sweep has every mode: modes compare in pairs alone")
+    return "\n".join(lines) + "\n"
 
 
-def _means_lines(title: str, records: Sequence[Row], most: int) -> list[str]:
-    """Aligned table, a line for each quantity and a column for each mode."""
+def means_table(title: str, records: Sequence[Row]) -> list[list[str]]:
+    """Cells of means and intervals: heads, then a line for each quantity with a column for each mode.
+
+    Parameters
+    ----------
+    title : str
+        Of the first column; ``{}`` stands for the number of sweeps.
+    records : sequence of mapping
+        From `over_sweeps` or `shared_means`. A mean of fewer sweeps than others has their number behind it.
+    """
+    most = max((row["sweeps"] for row in records), default=0)
     modes = list(dict.fromkeys(row["mode"] for row in records))
-    lines = [[title, *modes]]
+    lines = [[title.format(counted(most, "sweep")), *modes]]
     for quantity in QUANTITIES:
-        mine = [row for row in records if row["quantity"] == quantity.key]
-        cells = {row["mode"]: _cell(quantity, row, most) for row in mine}
+        cells = {
+            row["mode"]: quantity.with_interval(row, "mean") + f" ({row['sweeps']})" * (row["sweeps"] != most)
+            for row in records
+            if row["quantity"] == quantity.key
+        }
         if cells:
             lines.append([quantity.words, *(cells.get(mode, "-") for mode in modes)])
-    return text_table(lines).splitlines()
+    return lines
+
+
+def counted(count: int, what: str) -> str:
+    """Number and noun."""
+    return f"{count} {what}{'s' * (count != 1)}"
 
 
 def reference_words(references: Mapping[str, str]) -> str:
@@ -197,14 +219,6 @@ def reference_words(references: Mapping[str, str]) -> str:
 def fitted_to_reference(modes: Collection[str], references: Mapping[str, str]) -> bool:
     """Whether a mode was fitted to the very tracker that it is compared with."""
     return "pose" in modes and "tracker" in references.values()
-
-
-def _reference_lines(references: Mapping[str, str], intervals: Sequence[Row]) -> list[str]:
-    words = reference_words(references)
-    lines = textwrap.wrap(words, 100, subsequent_indent="  ") if words else []
-    if fitted_to_reference({row["mode"] for row in intervals}, references):
-        lines.append("pose was fitted to this tracker: its errors say how well it fits, not how right it is")
-    return lines
 
 
 def _by_mode(quantity: Quantity, rows: Sequence[Row], drift: Sequence[Row]) -> dict[str, FloatArray]:
@@ -238,11 +252,10 @@ def _pairs(quantity: Quantity, values: Mapping[str, FloatArray]) -> list[dict[st
     for one, other in combinations(values, 2):
         if not np.isfinite(values[one] - values[other]).any():
             continue
-        found = paired_comparison(values[one], values[other])
-        of = found.difference
-        row = {"quantity": quantity.key, "mode": one, "against": other, "sweeps": of.sweeps}
-        rows.append(row | {"difference": of.mean, "low": of.low, "high": of.high,
-                           "wilcoxon_p": found.wilcoxon_p})  # fmt: skip
+        difference, wilcoxon_p = paired_comparison(values[one], values[other])
+        row = {"quantity": quantity.key, "mode": one, "against": other, "sweeps": difference.sweeps}
+        row |= {"difference": difference.mean, "low": difference.low, "high": difference.high}
+        rows.append(row | {"wilcoxon_p": wilcoxon_p})
     for row, corrected in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):
         row["holm_p"], row["better"] = corrected, _better(row, corrected)
     return rows
@@ -255,21 +268,13 @@ def _better(row: Row, holm_p: float | None) -> str | None:
     return str(row["mode"] if high < 0 else row["against"])
 
 
-def _cell(quantity: Quantity, row: Row, most: int) -> str:
-    mean = quantity.shown(row["mean"])
-    if row.get("low") is not None:
-        mean += f" [{quantity.shown(row['low'])}, {quantity.shown(row['high'])}]"
-    return mean if row["sweeps"] == most else f"{mean} ({row['sweeps']})"
-
-
 def _told(intervals: Sequence[Row], paired: Sequence[Row]) -> list[str]:
     lines = []
     if any(row["low"] is not None for row in intervals):
         lines.append("[..]: 95 % interval over sweeps, by bootstrap")
     found: dict[str, list[str]] = {}
     for quantity in QUANTITIES:
-        words = _better_words([row for row in paired if row["quantity"] == quantity.key])
-        if words:
+        if words := _better_words([row for row in paired if row["quantity"] == quantity.key]):
             found.setdefault(words, []).append(quantity.words)
     for words, names in found.items():
         lines += textwrap.wrap(f"less {', '.join(names)}: {words}", 100, subsequent_indent="  ")

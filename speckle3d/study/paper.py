@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.core.tables import text_table
 from speckle3d.io.curves import write_curves
-from speckle3d.io.hdf5 import atomic_path, make_folder, one_line
+from speckle3d.io.hdf5 import make_folder, one_line
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
@@ -38,24 +38,21 @@ from speckle3d.scoring.statistics import MeanInterval, mean_interval
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.folder import only_run
-from speckle3d.study.results import Study, json_text
+from speckle3d.study.results import Study, json_text, write_texts
 from speckle3d.study.schedulers import InProcess, Scheduler
 
 _TISSUE = SimulationSettings(preset="tissue", vectors=48, length_mm=20.0)
 _REVERSAL = SimulationSettings(preset="reversal", vectors=48, length_mm=10.0)
-_PHANTOM = SimulationSettings(
-    preset="rotation", vectors=48, length_mm=30.0, turn_deg=8.0, reverse=True, seed=3011
-)
+_TURNING = SimulationSettings(preset="rotation", vectors=48, turn_deg=8.0)
 SWEEPS: Mapping[str, SimulationSettings] = {
     **{f"beef-{k}": _TISSUE.model_copy(update={"seed": 3000 + k}) for k in range(1, 6)},
     **{f"beef-{k}": _REVERSAL.model_copy(update={"seed": 3000 + k}) for k in range(6, 11)},
-    "phantom": _PHANTOM,
+    "phantom": _TURNING.model_copy(update={"seed": 3011, "length_mm": 30.0, "reverse": True}),
 }
 """By data set. The published sweeps of beef are 1.5 to 4 mm long; these are 10 and 20 mm, in which the
 tracker's jitter of 0.15 mm is less than one per cent."""
 
 _STEPPED = SimulationSettings(preset="stepped", vectors=48, steps=27, step_mm=0.06, blocks=6)
-_TURNING = SimulationSettings(preset="rotation", vectors=48, turn_deg=8.0)
 CURVE_SWEEPS: Mapping[str, SimulationSettings] = {
     **{f"stepped-{k}": _STEPPED.model_copy(update={"seed": k}) for k in (11, 12, 13)},
     **{f"turning-{k}": _TURNING.model_copy(update={"seed": k}) for k in (14, 15)},
@@ -67,41 +64,29 @@ CURVE_SWEEPS: Mapping[str, SimulationSettings] = {
 MODES = ("image", "pose", "orientation")
 """In the order of the paper's tables 3 and 4: image-based, six DOF correction, orientation correction."""
 
-PUBLISHED: Mapping[tuple[str, str], tuple[tuple[float, float, float], tuple[float, float, float]]] = (
-    MappingProxyType(
-        {
-            ("beef-1", "f"): ((13.1, 2.5, 12.5), (1.30, -0.06, -0.01)),
-            ("beef-2", "f"): ((30.5, -2.9, 31.6), (1.50, -0.07, -0.09)),
-            ("beef-3", "f"): ((26.3, 0.2, 26.5), (0.46, 0.03, 0.01)),
-            ("beef-4", "f"): ((-19.9, 1.9, -18.3), (1.35, 0.01, 0.00)),
-            ("beef-5", "f"): ((-6.8, 3.8, -8.0), (1.25, -0.09, -0.03)),
-            ("beef-6", "f"): ((14.6, 2.9, 12.7), (0.71, -0.03, -0.01)),
-            ("beef-6", "r"): ((15.6, 4.61, 16.0), (0.61, -0.01, -0.02)),
-            ("beef-7", "f"): ((8.01, 0.6, 4.9), (0.14, 0.05, 0.09)),
-            ("beef-7", "r"): ((29.0, -2.0, 26.7), (0.87, 0.11, 0.10)),
-            ("beef-8", "f"): ((2.7, 2.2, 2.0), (0.67, 0.01, -0.02)),
-            ("beef-8", "r"): ((-7.6, -1.0, -6.5), (0.53, -0.00, 0.01)),
-            ("beef-9", "f"): ((23.9, -1.0, 25.5), (1.14, 0.07, 0.05)),
-            ("beef-9", "r"): ((-21.7, 0.7, -23.4), (-0.05, 0.07, 0.07)),
-            ("beef-10", "f"): ((3.0, 1.4, -1.6), (1.50, -0.03, -0.02)),
-            ("beef-10", "r"): ((40.9, -0.1, 25.6), (2.21, 0.02, 0.03)),
-            ("phantom", "f"): ((6.5, -1.1, 4.2), (-8.02, 0.03, -0.11)),
-            ("phantom", "r"): ((6.1, -0.5, 4.7), (-0.43, -0.03, 0.00)),
-        }
-    )
-)
+PUBLISHED: Mapping[tuple[str, str], tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    ("beef-1", "f"): ((13.1, 2.5, 12.5), (1.30, -0.06, -0.01)),
+    ("beef-2", "f"): ((30.5, -2.9, 31.6), (1.50, -0.07, -0.09)),
+    ("beef-3", "f"): ((26.3, 0.2, 26.5), (0.46, 0.03, 0.01)),
+    ("beef-4", "f"): ((-19.9, 1.9, -18.3), (1.35, 0.01, 0.00)),
+    ("beef-5", "f"): ((-6.8, 3.8, -8.0), (1.25, -0.09, -0.03)),
+    ("beef-6", "f"): ((14.6, 2.9, 12.7), (0.71, -0.03, -0.01)),
+    ("beef-6", "r"): ((15.6, 4.61, 16.0), (0.61, -0.01, -0.02)),
+    ("beef-7", "f"): ((8.01, 0.6, 4.9), (0.14, 0.05, 0.09)),
+    ("beef-7", "r"): ((29.0, -2.0, 26.7), (0.87, 0.11, 0.10)),
+    ("beef-8", "f"): ((2.7, 2.2, 2.0), (0.67, 0.01, -0.02)),
+    ("beef-8", "r"): ((-7.6, -1.0, -6.5), (0.53, -0.00, 0.01)),
+    ("beef-9", "f"): ((23.9, -1.0, 25.5), (1.14, 0.07, 0.05)),
+    ("beef-9", "r"): ((-21.7, 0.7, -23.4), (-0.05, 0.07, 0.07)),
+    ("beef-10", "f"): ((3.0, 1.4, -1.6), (1.50, -0.03, -0.02)),
+    ("beef-10", "r"): ((40.9, -0.1, 25.6), (2.21, 0.02, 0.03)),
+    ("phantom", "f"): ((6.5, -1.1, 4.2), (-8.02, 0.03, -0.11)),
+    ("phantom", "r"): ((6.1, -0.5, 4.7), (-0.43, -0.03, 0.00)),
+}
 """By data set and part (f forward, r reverse): errors of length in per cent and of tilt in degrees, each for
 the modes of `MODES`."""
 
 Rows = Mapping[str, Mapping[str, Sequence[ModeError]]]
-
-
-@dataclass(frozen=True)
-class PaperStudy:
-    """The study as `compare_sweeps` left it, and the table beside the paper's."""
-
-    study: Study
-    table: str
 
 
 @dataclass(frozen=True)
@@ -119,7 +104,7 @@ def paper_study(
     scheduler: Scheduler | None = None,
     progress: Callable[[StudyProgress], None] | None = None,
     simulated: Callable[[int, int], None] | None = None,
-) -> PaperStudy:
+) -> tuple[Study, str]:
     """Simulate the eleven sweeps, compare the modes, and write it all into `directory`.
 
     Written, beside what `compare_sweeps` writes: ``inputs/``, kept for the next time, ``paper.txt`` and
@@ -132,6 +117,13 @@ def paper_study(
     simulated : callable, optional
         Called with the number of sweeps simulated and their total.
 
+    Returns
+    -------
+    study : Study
+        As `compare_sweeps` left it.
+    table : str
+        Beside the paper's.
+
     Raises
     ------
     InvalidInputError
@@ -139,46 +131,49 @@ def paper_study(
     """
     where = scheduler or InProcess()
     with only_run(directory):
-        return _study(directory, curves, where, progress, simulated)
+        inputs = _inputs(directory, SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS})
+        _simulate(list(inputs.values()), where, simulated or (lambda done, total: None))
+        if curves is None:
+            curves = _measured([inputs[name].path for name in CURVE_SWEEPS])
+        paths = [inputs[name].path for name in SWEEPS]
+        study = compare_sweeps(paths, directory, None, "tracker", curves, scheduler=where, progress=progress)
+        ours = {each.sweep: each.rows for each in study.summaries}
+        rows: Rows = {"tracker": ours, "truth": _against_truth(study, directory)}
+        table = text_beside(rows)
+        held = [
+            {"reference": name, "sweep": sweep, **asdict(row)}
+            for name, found in rows.items()
+            for sweep, some in found.items()
+            for row in some
+        ]
+        numbers = json_text({"means": beside(rows), "rows": held})
+        write_texts(directory, {"paper.txt": table, "paper.json": numbers})
+        return study, table
 
 
-@dataclass(frozen=True)
-class Beside:
-    """One mode's mean absolute errors over all parts: as published, and ours against each reference.
-
-    Attributes
-    ----------
-    published_percent, published_deg : float
-    length_percent, tilt_deg : mapping of str to MeanInterval
-        By reference. Parts, not sweeps, are the units, as there are 17 in the tables.
-    """
-
-    mode: str
-    published_percent: float
-    published_deg: float
-    length_percent: Mapping[str, MeanInterval]
-    tilt_deg: Mapping[str, MeanInterval]
-
-
-def beside(rows: Rows) -> list[Beside]:
+def beside(rows: Rows) -> list[dict[str, Any]]:
     """Means of absolute errors over all parts, by mode.
 
     Parameters
     ----------
     rows : mapping of str to mapping of str to sequence of ModeError
         By reference, then by data set.
+
+    Returns
+    -------
+    list of dict
+        ``mode``; ``published_percent`` of length and ``published_deg`` of tilt; ``length_percent`` and
+        ``tilt_deg``, ours by reference, as `MeanInterval`. Parts, not sweeps, are the units, as there are 17
+        in the tables.
     """
-    length, tilt = (np.abs([each[k] for each in PUBLISHED.values()]).mean(axis=0) for k in (0, 1))
-    return [
-        Beside(
-            mode,
-            float(length[k]),
-            float(tilt[k]),
-            {name: mean_interval(np.abs(_errors(found, mode)[:, 0])) for name, found in rows.items()},
-            {name: mean_interval(np.abs(_errors(found, mode)[:, 1])) for name, found in rows.items()},
-        )
-        for k, mode in enumerate(MODES)
-    ]
+    published = np.abs(list(PUBLISHED.values())).mean(axis=0).T.tolist()
+    found: list[dict[str, Any]] = []
+    for mode, (percent, deg) in zip(MODES, published, strict=True):
+        ours = {name: np.abs(_errors(some, mode)).T for name, some in rows.items()}
+        length, tilt = ({name: mean_interval(errors[k]) for name, errors in ours.items()} for k in (0, 1))
+        means = {"published_percent": percent, "published_deg": deg}
+        found.append({"mode": mode, **means, "length_percent": length, "tilt_deg": tilt})
+    return found
 
 
 def text_beside(rows: Rows) -> str:
@@ -198,55 +193,15 @@ def text_beside(rows: Rows) -> str:
         lines.append([f"{name} {part}", *cells])
     means = [["mean absolute error of all parts", "", "length %", "tilt deg"]]
     for each in beside(rows):
-        published = [f"{each.published_percent:.1f}", f"{each.published_deg:.3f}"]
-        means.append([each.mode, "published", *published])
-        means += [
-            ["", name, _interval(each.length_percent[name], 2), _interval(each.tilt_deg[name], 3)]
-            for name in rows
-        ]
+        published = [f"{each['published_percent']:.1f}", f"{each['published_deg']:.3f}"]
+        means.append([each["mode"], "published", *published])
+        length, tilt = each["length_percent"], each["tilt_deg"]
+        means += [["", name, _interval(length[name], 2), _interval(tilt[name], 3)] for name in rows]
     return (
         f"Errors as published (Housden 2008, tables 3 and 4) | in simulation, against the {first}.\n"
         "The published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"
         f"{text_table(lines)}\n{text_table(means, (0, 1))}[..]: 95 % of bootstrap samples\n"
     )
-
-
-def json_beside(rows: Rows) -> str:
-    """The means of `beside` and every row, as JSON."""
-    held = [
-        {"reference": name, "sweep": sweep, **asdict(row)}
-        for name, found in rows.items()
-        for sweep, some in found.items()
-        for row in some
-    ]
-    return json_text({"means": beside(rows), "rows": held})
-
-
-def _study(
-    directory: Path,
-    curves: Path | None,
-    where: Scheduler,
-    progress: Callable[[StudyProgress], None] | None,
-    simulated: Callable[[int, int], None] | None,
-) -> PaperStudy:
-    wanted = SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS}
-    inputs = _inputs(directory, wanted)
-    _simulate(inputs, where, simulated)
-    if curves is None:
-        curves = _measured([inputs[name].path for name in CURVE_SWEEPS])
-    paths = [inputs[name].path for name in SWEEPS]
-    study = compare_sweeps(
-        paths, directory, reference="tracker", curves=curves, scheduler=where, progress=progress
-    )
-    rows: Rows = {
-        "tracker": {each.sweep: each.rows for each in study.summaries},
-        "truth": _against_truth(study, directory),
-    }
-    table = text_beside(rows)
-    for name, text in (("paper.txt", table), ("paper.json", json_beside(rows))):
-        with atomic_path(directory / name) as part:
-            part.write_text(text, encoding="utf-8")
-    return PaperStudy(study, table)
 
 
 def _inputs(directory: Path, wanted: Mapping[str, SimulationSettings]) -> dict[str, _Input]:
@@ -258,19 +213,15 @@ def _inputs(directory: Path, wanted: Mapping[str, SimulationSettings]) -> dict[s
     return {name: _Input(folder / f"{name}.h5", each, name in SWEEPS) for name, each in wanted.items()}
 
 
-def _simulate(
-    inputs: Mapping[str, _Input], where: Scheduler, progress: Callable[[int, int], None] | None
-) -> None:
-    missing = [each for each in inputs.values() if not each.path.is_file()]
+def _simulate(inputs: Sequence[_Input], where: Scheduler, simulated: Callable[[int, int], None]) -> None:
+    missing = [each for each in inputs if not each.path.is_file()]
     done = len(inputs) - len(missing)
-    if progress is not None:
-        progress(done, len(inputs))
+    simulated(done, len(inputs))
     for _, failure in where.run(_write_input, missing, _failed):
         if failure:
             raise InvalidInputError(failure)
         done += 1
-        if progress is not None:
-            progress(done, len(inputs))
+        simulated(done, len(inputs))
 
 
 def _write_input(job: _Input) -> str:
@@ -311,11 +262,9 @@ def _against_truth(study: Study, directory: Path) -> dict[str, list[ModeError]]:
     for outcome in study.outcomes:
         if outcome.status == "done":
             sweep = load_sweep(outcome.path)
-            poses = read_reconstruction(
-                directory / outcome.folder / "reconstruction.h5", with_pairs=False
-            ).poses
+            held = read_reconstruction(directory / outcome.folder / "reconstruction.h5", with_pairs=False)
             assert sweep.truth is not None
-            found[outcome.name] = compare_modes(poses, sweep.truth, sweep.grid.centre_mm, end_frames=1)
+            found[outcome.name] = compare_modes(held.poses, sweep.truth, sweep.grid.centre_mm, end_frames=1)
     return found
 
 

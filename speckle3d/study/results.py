@@ -106,7 +106,7 @@ class Study:
     copies: Mapping[str, str] = field(default_factory=dict)
 
 
-def write_summary(directory: Path, summaries: Sequence[Summary]) -> list[Path]:
+def write_summary(directory: Path, summary: Summary) -> list[Path]:
     """Write ``summary.json``, ``table.txt`` and ``table.csv``; each appears whole or not at all.
 
     Raises
@@ -114,12 +114,9 @@ def write_summary(directory: Path, summaries: Sequence[Summary]) -> list[Path]:
     FileError
         If the directory cannot be written.
     """
-    texts = {
-        "summary.json": json_text({"sweeps": summaries}),
-        "table.txt": table_text(summaries),
-        "table.csv": csv_text(summaries),
-    }
-    return _write_texts(directory, texts)
+    rows = rows_of([summary])
+    texts = {"summary.json": json_text({"sweeps": [summary]}), "table.txt": table_text(rows)}
+    return write_texts(directory, texts | {"table.csv": csv_text(rows)})
 
 
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
@@ -138,35 +135,47 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
             summaries.append(_read_summary(folder, outcome.name))
             found = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
             drift += [{"sweep": outcome.name} | row for row in found]
-    rows = _rows(summaries)
-    copies = copies_among(outcomes)
+    rows, copies = rows_of(summaries), copies_among(outcomes)
     single = [[row for row in some if row["sweep"] not in copies] for some in (rows, drift)]
     intervals, paired = over_sweeps(*single)
     shared = shared_means(*single)
     references = {each.sweep: each.reference for each in summaries if each.sweep not in copies}
     overall = overall_text(intervals, paired, shared, references)
-    failed = [f"{each.name}  failed: {each.reason}" for each in outcomes if each.status == "failed"]
-    table = table_text(summaries) + "".join(f"{line}\n" for line in [*failed, *copy_lines(copies)])
+    failed = [each for each in outcomes if each.status == "failed"]
+    remarks = [f"{each.name}  failed: {each.reason}" for each in failed] + copy_lines(copies)
+    table = table_text(rows) + "".join(f"{line}\n" for line in remarks)
     table += f"\n{overall}" if overall else ""
     contents = {
         "format": FORMAT,
         "version": VERSION,
         "settings_toml": settings_toml,
         "modes": list(dict.fromkeys(row["mode"] for row in rows)),
-        "sweeps": [_entry(outcome, copies) for outcome in outcomes],
+        "sweeps": [
+            {name: value for name, value in asdict(each).items() if name != "skipped"}
+            | {"copy_of": copies.get(each.name, "")}
+            for each in outcomes
+        ],
         "rows": rows,
         "drift": drift,
         "intervals": intervals,
         "shared": shared,
         "paired": paired,
     }
-    files = {
-        "study.json": json_text(contents),
-        "table.txt": table,
-        "table.csv": csv_text(summaries, outcomes, copies),
-    }
-    _write_texts(directory, files)
+    paths = {each.name: each.path for each in outcomes}
+    lines = [row | {"path": paths[row["sweep"]], "copy_of": copies.get(row["sweep"], "")} for row in rows]
+    lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in failed]
+    texts = {"study.json": json_text(contents), "table.txt": table}
+    write_texts(directory, texts | {"table.csv": csv_text(lines, "path", "copy_of", "reason")})
     return Study(directory, outcomes, summaries, drift, table, copies)
+
+
+def rows_of(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
+    """One record per sweep, part and mode."""
+    return [
+        {"sweep": each.sweep, "reference": each.reference, **asdict(row), "remark": remark_on(each, row)}
+        for each in summaries
+        for row in each.rows
+    ]
 
 
 def remark_on(summary: Summary, row: ModeError) -> str:
@@ -183,43 +192,18 @@ def remark_on(summary: Summary, row: ModeError) -> str:
     return "; ".join(each for each in words if each)
 
 
-def table_text(summaries: Sequence[Summary]) -> str:
-    """Aligned table for reading; angles and lengths are estimate minus reference."""
+def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Aligned table of `rows_of` for reading; angles and lengths are estimate minus reference."""
     lines = [[heading for _, heading, _ in _COLUMNS]]
-    lines += [[_cell(row[key], form) for key, _, form in _COLUMNS] for row in _rows(summaries)]
+    lines += [[_cell(row[key], form) for key, _, form in _COLUMNS] for row in rows]
     if not any(line[-1] for line in lines[1:]):
         lines = [line[:-1] for line in lines]
     return text_table(lines, _TO_THE_LEFT)
 
 
-def csv_text(
-    summaries: Sequence[Summary],
-    outcomes: Sequence[SweepOutcome] | None = None,
-    copies: Mapping[str, str] | None = None,
-) -> str:
-    """One line per sweep, part and mode, with full precision, under the names of `ModeError`.
-
-    Parameters
-    ----------
-    outcomes : sequence of SweepOutcome, optional
-        Of a study: each line then also names its file, and each sweep that failed has a line with its reason.
-    copies : mapping of str to str, optional
-        As in `Study`.
-    """
-    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark"]
-    rows = _rows(summaries)
-    if outcomes is not None:
-        columns += ["path", "copy_of", "reason"]
-        paths = {each.name: str(each.path) for each in outcomes}
-        rows = [
-            row | {"path": paths[row["sweep"]], "copy_of": (copies or {}).get(row["sweep"], "")}
-            for row in rows
-        ]
-        rows += [
-            {"sweep": each.name, "path": str(each.path), "reason": each.reason}
-            for each in outcomes
-            if each.status == "failed"
-        ]
+def csv_text(rows: Sequence[Mapping[str, Any]], *more: str) -> str:
+    """`rows_of` with full precision, under the names of `ModeError`, and `more` columns behind."""
+    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark", *more]
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
@@ -256,15 +240,6 @@ def copy_lines(copies: Mapping[str, str]) -> list[str]:
     return [f"{name} is a copy of {first}: counted once" for name, first in copies.items()]
 
 
-def _rows(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
-    """One record per sweep, part and mode."""
-    return [
-        {"sweep": each.sweep, "reference": each.reference, **asdict(row), "remark": remark_on(each, row)}
-        for each in summaries
-        for row in each.rows
-    ]
-
-
 def _doubt_of_unit(tracker_mm: float, images_mm: float) -> str:
     if not (abs(images_mm) >= _TRAVEL_MM and math.isfinite(tracker_mm)):
         return ""
@@ -273,22 +248,14 @@ def _doubt_of_unit(tracker_mm: float, images_mm: float) -> str:
     return "" if low <= share <= high else f"tracker travels {share:.2g} of what the images do: its unit?"
 
 
-def _entry(outcome: SweepOutcome, copies: Mapping[str, str]) -> dict[str, Any]:
-    shown = asdict(outcome) | {"path": str(outcome.path), "copy_of": copies.get(outcome.name, "")}
-    return {name: value for name, value in shown.items() if name != "skipped"}
-
-
 def _read_summary(folder: Path, name: str) -> Summary:
     """Read a sweep's rows back; a number that was not finite is NaN again."""
     held: dict[str, Any]
     (held,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
     names = [f.name for f in fields(ModeError)]
-    rows: list[dict[str, Any]] = [
-        {name: float("nan") if row[name] is None else row[name] for name in names} for row in held["rows"]
-    ]
-    return Summary(
-        name, held["reference"], held["frames"], held["coverage"], [ModeError(**row) for row in rows]
-    )
+    rows: list[list[Any]] = [[math.nan if row[n] is None else row[n] for n in names] for row in held["rows"]]
+    summary = held["reference"], held["frames"], held["coverage"]
+    return Summary(name, *summary, [ModeError(*values) for values in rows])
 
 
 def _cell(value: Any, form: str) -> str:
@@ -302,7 +269,8 @@ def _listed(value: Any) -> Any:
     raise ValueError(f"got {type(value)}")
 
 
-def _write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Write texts under their names; each appears whole or not at all."""
     make_folder(directory)
     for name, text in texts.items():
         with atomic_path(directory / name) as part:

@@ -16,9 +16,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
-
-import numpy as np
+from typing import Any, TypeVar
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.hdf5 import one_line
@@ -39,26 +37,11 @@ _DESERTED = "the cluster has had no worker for a minute"
 _KILLED = "every worker that tried it died: killed, crashed or out of memory"
 
 
-class Scheduler(Protocol):
-    """Runs jobs somewhere and hands over each result as it comes, in any order."""
-
-    def run(
-        self,
-        function: Callable[[Job], Result],
-        jobs: Sequence[Job],
-        lost: Callable[[Job, str], Result],
-        after: After | None = None,
-    ) -> Iterator[tuple[int, Result]]:
-        """Yield the number of each job and its result."""
-
-    @property
-    def workers(self) -> int:
-        """How many jobs run at a time."""
-
-
-@dataclass(frozen=True)
 class InProcess:
     """Runs one job after another in this process."""
+
+    workers = 1
+    """How many jobs run at a time."""
 
     def run(
         self,
@@ -70,11 +53,6 @@ class InProcess:
         """Yield the number of each job and its result, in order."""
         for number, job in enumerate(jobs):
             yield number, function(job)
-
-    @property
-    def workers(self) -> int:
-        """One."""
-        return 1
 
 
 @dataclass(frozen=True)
@@ -167,6 +145,9 @@ class OnCluster:
         return max(1, int(sum(self.client.nthreads().values())))
 
 
+Scheduler = InProcess | OnCluster
+
+
 @contextmanager
 def scheduler_for(address: str | None, workers: int | None) -> Iterator[Scheduler]:
     """Open where to run: the cluster at `address`, that many processes here, or this process.
@@ -185,19 +166,27 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
     if address is None and workers in (None, 1):
         yield InProcess()
         return
-    if address is not None:
-        with _connected(address) as client:
-            yield OnCluster(client)
-        return
-    with local_cluster(workers or 1) as client:
+    with local_cluster(workers or 1) if address is None else _connected(address) as client:
         yield OnCluster(client)
 
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Any]:
     """Client of a cluster of single-threaded worker processes on this machine; both end with the block."""
+    # A worker has one thread: more threads in the kernels would only compete with the other workers.
+    env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     with _without_interrupts():
-        cluster = _start_local(workers)
+        cluster = _dask().LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            # Without a dashboard it still opens its port, the same for every cluster; 0 is a free one.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            memory_limit=0,
+            silence_logs=50,
+            env=env | {"MPLBACKEND": os.environ.get("MPLBACKEND", "agg")},
+        )
     with cluster, _dask().Client(cluster) as client:
         yield client
 
@@ -217,40 +206,6 @@ def _without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
-
-
-def _start_local(workers: int) -> Any:
-    # A worker has one thread: more threads in the kernels would only compete with the other workers.
-    env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    return _dask().LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        # Without a dashboard it still opens its port, by default the same for every cluster; 0 is a free one.
-        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-        memory_limit=0,
-        silence_logs=50,
-        env=env | {"MPLBACKEND": os.environ.get("MPLBACKEND", "agg")},
-    )
-
-
-def remaining_s(finished: Sequence[tuple[float, float]], left_frames: float, workers: int) -> float | None:
-    """Time that is left, from the median time per frame of what is finished; None before anything is.
-
-    Parameters
-    ----------
-    finished : sequence of (frames, seconds)
-        Of each finished job, on its worker.
-    left_frames : int
-        In what is not finished.
-    workers : int
-        How many jobs run at a time.
-    """
-    rates = [seconds / frames for frames, seconds in finished if frames > 0]
-    if not rates:
-        return None
-    return float(np.median(rates)) * left_frames / max(1, workers)
 
 
 @contextmanager
@@ -278,10 +233,8 @@ def _failure(future: Any) -> str | None:
         return None
     if future.status == "cancelled":
         return "cancelled by the cluster"
-    error = future.exception()
-    if type(error).__name__ == "KilledWorker":
-        return _KILLED
-    return f"{type(error).__name__}: {one_line(error)}"
+    error, kind = future.exception(), type(future.exception()).__name__
+    return _KILLED if kind == "KilledWorker" else f"{kind}: {one_line(error)}"
 
 
 def _dask() -> Any:

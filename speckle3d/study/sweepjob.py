@@ -1,7 +1,7 @@
 """Jobs of a study: one for each sweep, in a folder of its own, and one for each block of a long sweep.
 
 A job is sent to a worker and never raises: whatever goes wrong becomes the reason in its outcome. The job of
-a long sweep takes what the jobs of its blocks left on disk (`speckle3d.study.blockfiles`), and matches those
+a long sweep takes what the jobs of its blocks left on disk (`speckle3d.study.folder`), and matches those
 blocks itself that are missing.
 """
 
@@ -30,7 +30,7 @@ from speckle3d.matching.blocks import Block, blocks_of
 from speckle3d.pipeline import match_ahead
 from speckle3d.scoring.displacements import drift_rows
 from speckle3d.scoring.references import find_reference
-from speckle3d.study.blockfiles import BlockFiles
+from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip
 from speckle3d.study.job import available_modes, require_possible, run_job
 from speckle3d.study.results import SweepOutcome, json_text
@@ -88,6 +88,19 @@ class BlockOutcome:
     reason: str = ""
     seconds: float = 0.0
     skipped: bool = False
+
+
+Task = SweepJob | BlockJob
+
+
+def run_task(task: Task) -> SweepOutcome | BlockOutcome:
+    """Do a sweep's or a block's job."""
+    return run_block(task) if isinstance(task, BlockJob) else run_sweep(task)
+
+
+def lost_task(task: Task, reason: str) -> SweepOutcome | BlockOutcome:
+    """Outcome of a job that was lost with its workers."""
+    return lost_block(task, reason) if isinstance(task, BlockJob) else lost(task, reason)
 
 
 def plan_sweep(
@@ -183,18 +196,8 @@ def _reconstruct(job: SweepJob, part: Path, files: BlockFiles) -> None:
     _require_same(job)
     settings, sweep = config_from_toml(job.settings_toml), load_sweep(job.path)
     mounted, _ = apply_calibrations(sweep, job.calibrations)
-    run_job(
-        sweep,
-        job.path,
-        read_curves(job.curves),
-        part,
-        _modes(job, mounted, settings),
-        job.reference,
-        settings,
-        None,
-        job.calibrations,
-        files,
-    )
+    curves, modes = read_curves(job.curves), _modes(job, mounted, settings)
+    run_job(sweep, job.path, curves, part, modes, job.reference, settings, None, job.calibrations, files)
     reference = find_reference(mounted, job.reference)
     rows = []
     if reference is not None:
@@ -229,11 +232,9 @@ def finished(job: SweepJob) -> SweepOutcome | None:
     """Outcome of a job whose folder is there already, whole; None otherwise."""
     try:
         held = json.loads((job.folder / DONE).read_text(encoding="utf-8"))
-        if held["key"] == job.key:
-            return _done(job, float(held["seconds"]), skipped=True)
+        return _done(job, float(held["seconds"]), skipped=True) if held["key"] == job.key else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return None
 
 
 def _move(part: Path, job: SweepJob) -> None:

@@ -31,12 +31,8 @@ def test_an_export_takes_the_place_of_text_alone(run, refused, bench, reconstruc
     link.symlink_to(held)
     other.write_text("not to be lost")
     before = held.read_bytes()
-    for out, message in (
-        (held, "reconstruction.h5"),
-        (link, "link.tum"),
-        (other, "notes.txt"),
-    ):
-        assert message in refused("trajectory", "export", held, "-o", out)
+    for out in (held, link, other):
+        assert out.name in refused("trajectory", "export", held, "-o", out)
     assert held.read_bytes() == before
     assert other.read_text() == "not to be lost"
     for _ in range(2):

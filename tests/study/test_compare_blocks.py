@@ -232,13 +232,13 @@ def test_a_file_that_changed_under_its_blocks_is_refused(path, tmp_path):
 
 def test_time_left_counts_blocks_as_part_of_their_sweep(tmp_path):
     at = StudyProgress(sweeps=2, frames=1100, blocks=2)
-    at.add_block(BlockOutcome("long", 500, seconds=25.0), 2)
+    at.add(BlockOutcome("long", 500, seconds=25.0), 2)
     # 25 s for 250 frames' worth of work: 850 are left, on both workers.
     assert MATCHING_SHARE == 0.5
     assert at.remaining_s == pytest.approx(0.1 * 850 / 2)
-    at.add_block(BlockOutcome("long", 500, skipped=True), 2)
+    at.add(BlockOutcome("long", 500, skipped=True), 2)
     assert at.remaining_s == pytest.approx(0.1 * 600 / 2)
-    at.add(SweepOutcome("long", tmp_path, "done", seconds=100.0), 1000, 2)
+    at.add(SweepOutcome("long", tmp_path, "done", seconds=100.0, frames=1000), 2)
     assert (at.remaining_s, at.done_frames) == pytest.approx((0.1 * 100, 1000))
-    at.add(SweepOutcome("short", tmp_path, "done", seconds=10.0), 100, 2)
+    at.add(SweepOutcome("short", tmp_path, "done", seconds=10.0, frames=100), 2)
     assert (at.remaining_s, at.done_frames) == pytest.approx((0.0, 1100))

@@ -8,7 +8,15 @@ import pytest
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.results import Summary, csv_text, json_text, remark_on, table_text, write_summary
+from speckle3d.study.results import (
+    Summary,
+    csv_text,
+    json_text,
+    remark_on,
+    rows_of,
+    table_text,
+    write_summary,
+)
 
 
 @dataclass(frozen=True)
@@ -40,24 +48,21 @@ def test_json_holds_every_number_and_null_where_there_is_none():
 
 
 def test_csv_reads_back_at_full_precision_even_with_commas_in_names():
-    lines = list(csv.DictReader(io.StringIO(csv_text(summaries()))))
+    lines = list(csv.DictReader(io.StringIO(csv_text(rows_of(summaries())))))
     assert [line["mode"] for line in lines] == ["image", "orientation"]
     assert lines[0]["sweep"] == "beef, 1"
     assert float(lines[0]["tilt_error_deg"]) == -1.254
 
 
-def test_table_is_aligned_and_signed():
-    lines = table_text(summaries()).splitlines()
+def test_table_is_aligned_and_signed_says_the_reference_and_a_name_may_end_in_nan():
+    banan = Summary("banan", "truth", 100, 1.0, [row(tilt_error_deg=float("nan"))])
+    lines = table_text(rows_of([*summaries(), banan])).splitlines()
     assert lines[0].split()[:3] == ["sweep", "part", "mode"]
     assert len({len(line) for line in lines[1:]}) == 1
     assert "+15.0" in lines[2]
     assert "-1.25" in lines[2]
-
-
-def test_table_says_the_reference_and_a_name_may_end_in_nan():
-    lines = table_text([Summary("banan", "truth", 100, 1.0, [row(tilt_error_deg=float("nan"))])]).splitlines()
-    assert lines[2].split()[:5] == ["banan", "f", "image", "truth", "20.00"]
-    assert lines[2].split()[-3] == "-"
+    assert lines[-1].split()[:5] == ["banan", "f", "image", "truth", "20.00"]
+    assert lines[-1].split()[-3] == "-"
 
 
 UNIT = "tracker travels 0.1 of what the images do: its unit?"
@@ -78,8 +83,8 @@ def test_a_row_says_what_its_numbers_do_not(reference, mode, travel_mm, words):
     rows = [row(), row(mode, estimate_mm=travel_mm)]
     summary = Summary("s", reference, 100, 1.0, rows)
     assert remark_on(summary, rows[1]) == words
-    assert (words in table_text([summary]).splitlines()[3]) is True
-    (line,) = [x for x in csv.DictReader(io.StringIO(csv_text([summary]))) if x["mode"] == mode]
+    assert (words in table_text(rows_of([summary])).splitlines()[3]) is True
+    (line,) = [x for x in csv.DictReader(io.StringIO(csv_text(rows_of([summary])))) if x["mode"] == mode]
     assert line["remark"] == words
 
 
@@ -92,7 +97,7 @@ def test_without_a_pose_mode_the_tracker_is_held_against_the_images():
 
 
 def test_three_files_appear_and_nothing_else(tmp_path):
-    written = write_summary(tmp_path / "new", summaries())
+    written = write_summary(tmp_path / "new", *summaries())
     assert {p.name for p in written} == {"summary.json", "table.txt", "table.csv"}
     assert {p.name for p in (tmp_path / "new").iterdir()} == {p.name for p in written}
     assert json.loads(written[0].read_text())["sweeps"][0]["sweep"] == "beef, 1"
@@ -101,7 +106,7 @@ def test_three_files_appear_and_nothing_else(tmp_path):
 def test_a_directory_that_cannot_be_made_is_one_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="file"):
-        write_summary(tmp_path / "file", summaries())
+        write_summary(tmp_path / "file", *summaries())
 
 
 def test_what_json_cannot_hold_is_named():

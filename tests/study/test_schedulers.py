@@ -8,13 +8,7 @@ from cluster_jobs import double, lost, noted, suicide
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.study import schedulers
-from speckle3d.study.schedulers import (
-    InProcess,
-    OnCluster,
-    local_cluster,
-    remaining_s,
-    scheduler_for,
-)
+from speckle3d.study.schedulers import InProcess, OnCluster, local_cluster, scheduler_for
 
 # Dask's processes leave sockets to the garbage collector when one is killed.
 pytestmark = pytest.mark.filterwarnings(
@@ -141,9 +135,3 @@ def test_contradicting_wishes_are_refused(address, workers):
 def test_one_worker_is_this_process():
     with scheduler_for(None, 1) as here:
         assert isinstance(here, InProcess)
-
-
-def test_time_left_is_by_frames_and_not_by_one_slow_sweep():
-    # Rates 0.1, 0.1 and 5 s a frame: the median is 0.1; 200 frames on two workers.
-    assert remaining_s([(100, 10.0), (50, 5.0), (10, 50.0)], 200, 2) == pytest.approx(10.0)
-    assert remaining_s([], 200, 2) is None
