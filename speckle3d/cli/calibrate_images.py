@@ -212,7 +212,7 @@ def _finish(
     as_json: bool,
 ) -> None:
     """Write the calibration with its report."""
-    from calibration.images.results import calibration_from_images, figure_of, notes_of
+    from calibration.images.report import calibration_from_images, figure_of, notes_of
 
     told = notes_of(found, enough)
     if delay is not None:
