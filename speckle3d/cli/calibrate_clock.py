@@ -129,7 +129,7 @@ def _by_line(
             f"{len(recording.frame_time_s)}: record a plane's echo, for longer; of tissue use --by images"
         )
     with naming(str(images)):
-        signal = line_signal(seen.marks_px, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
+        signal = line_signal(seen.pixels, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
         times = recording.frame_time_s[seen.frame]
         found = delay_from_lines(signal, times, recording.readings, recording.time_offset_s, search_s)
     return found, len(seen.frame)

@@ -28,9 +28,9 @@ from speckle3d.cli.common import (
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
-    from calibration.chain import ImagePoints
+    from calibration.chain import ImagePoints, Seen
     from calibration.detection.lines import LineSettings
-    from calibration.job import JobSettings, Outcome, Recording, Seen
+    from calibration.job import JobSettings, Outcome, Recording
     from speckle3d.core.arrays import FloatArray
 
 TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
@@ -195,7 +195,7 @@ def calibrate_wires(
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
-    from calibration.job import crossing_job, wires_job
+    from calibration.job import wires_job
     from speckle3d.core.wires import three_wires
     from speckle3d.io.plus_config import WireConfig, read_wire_phantom
 
@@ -209,12 +209,9 @@ def calibrate_wires(
             pixel_mm = (config.pixel_mm, config.pixel_mm)
     recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
     seen = _seen_wires(recording, phantom, config, points, region, images)
+    geometry = config.phantom if config else three_wires() if phantom == "three" else None
     with naming(str(images)):
-        if phantom == "cross":
-            outcome = crossing_job(recording, seen, job, not fixed_pixels)
-        else:
-            geometry = three_wires() if config is None else config.phantom
-            outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, registration.value)
+        outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, registration.value)
     notes = _nwire_notes(outcome, outcome.solution.points)
     if validation is not None:
         other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
@@ -273,17 +270,18 @@ def find_lines(
     recording: Recording, region: str | None, images: Path, settings: LineSettings | None = None
 ) -> Seen:
     """Find the plane's line in every image, showing progress."""
-    from calibration.job import Seen
+    from calibration.detection.lines import detect_lines
 
     corners = _region(region)
     with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
-        return Seen.lines(recording, settings, corners, progress)
+        return detect_lines(recording.images, recording.pixel_mm, settings, corners, progress)
 
 
 def _seen_wires(
     recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
 ) -> Seen:
-    from calibration.job import Seen
+    from calibration.chain import Seen
+    from calibration.job import find_crossings, find_nwires
     from speckle3d.io.points import read_points
 
     names = ("x", "y", "z") if phantom == "three" else () if config is None else config.phantom.names
@@ -300,9 +298,9 @@ def _seen_wires(
     corners = _region(region)
     with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
         if config is None:
-            return Seen.crossings(recording, corners, progress)
+            return find_crossings(recording, corners, progress)
         clip = config.clip.corners_px if corners is None and config.clip is not None else corners
-        return Seen.nwires(recording, config.phantom, clip, progress)
+        return find_nwires(recording, config.phantom, clip, progress)
 
 
 def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
@@ -351,7 +349,7 @@ def _finish(
         found = outcome.offset
         told.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
     if not seen.are_lines:
-        write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.marks_px, seen.wire), wire_names)
+        write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.pixels, seen.wire), wire_names)
     write_with_report(
         outcome.calibration,
         [images],

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
-from calibration.chain import ImagePoints
+from calibration.chain import ImagePoints, Seen
 from calibration.detection.dots import Dots, dots_in_frames
-from calibration.detection.labelling import LabelledDots
 from calibration.nwires import (
     label_and_start,
     middle_wires,
@@ -18,7 +17,7 @@ from calibration.nwires import (
     start_from_nwires,
     trimmed_mean_mm,
 )
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.metaimage import ImportSettings, read_metaimage, read_poses
 from speckle3d.io.plus_config import read_wire_phantom
 
@@ -30,9 +29,9 @@ def points_of(shown, noise_mm=0.0, seed=0):
     frames, wires = shown.pixels.shape[:2]
     rng = np.random.default_rng(seed)
     pixels = shown.pixels + rng.normal(size=shown.pixels.shape) * noise_mm / PIXEL_MM
-    return LabelledDots(
-        np.repeat(np.arange(frames), wires), pixels.reshape(-1, 2), np.tile(np.arange(wires), frames)
-    ).points(shown.world_from_sensor)
+    frame = np.repeat(np.arange(frames), wires)
+    seen = Seen(frame, pixels.reshape(-1, 2), np.tile(np.arange(wires), frames))
+    return seen.points(shown.world_from_sensor[frame])
 
 
 def apart(chain, shown):
@@ -160,6 +159,8 @@ def test_a_sequence_without_wires_says_why():
     few = Dots(np.array([0, 0, 2]), np.ones((3, 2)), np.ones(3), {1: "no dot"})
     with pytest.raises(InsufficientDataError, match="all wires"):
         label_and_start(few, shown.phantom, shown.world_from_sensor, PIXEL_MM)
+    with pytest.raises(MismatchError, match=r"frame 2.*2 poses"):
+        label_and_start(few, shown.phantom, shown.world_from_sensor[:2], PIXEL_MM)
 
 
 def poses_of(folder, kind):
@@ -168,8 +169,8 @@ def poses_of(folder, kind):
 
 def published(folder, kind):
     frames, pixels, errors, matrix = plus_results(folder, kind)
-    labelled = LabelledDots(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
-    return labelled.points(poses_of(folder, kind)), errors, matrix
+    labelled = Seen(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
+    return labelled.points(poses_of(folder, kind)[labelled.frame]), errors, matrix
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from wire_scenes import ENDS_MM, PIXEL_MM, candidates, cut, n_phantom, scene
 
 from calibration.chain import Chain
 from calibration.detection.dots import Dots
-from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
+from calibration.detection.labelling import LabelSettings, label_by_calibration, label_dots
 from calibration.starts import free_fits, rigid_fits
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 
 SYMMETRIC_MM = np.array(
     [
@@ -122,16 +122,6 @@ def test_no_dots_are_no_wires():
     ):
         assert len(labelled) == 0
         assert labelled.dropped == {0: "no dot"}
-
-
-def test_points_carry_the_poses_of_their_frames():
-    poses = RigidTransform.from_translation(np.arange(12.0).reshape(4, 3))
-    labelled = LabelledDots(np.array([1, 3]), np.ones((2, 2)), np.array([0, 1]))
-    points = labelled.points(poses)
-    np.testing.assert_array_equal(points.world_from_sensor.translation, [[3, 4, 5], [9, 10, 11]])
-    np.testing.assert_array_equal(points.wire, [0, 1])
-    with pytest.raises(MismatchError, match=r"frame 3.*3 poses"):
-        labelled.points(poses[:3])
 
 
 @pytest.mark.parametrize(
