@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -29,24 +28,17 @@ if TYPE_CHECKING:
     from speckle3d.core.calibration import Calibration
 
 
-class By(StrEnum):
-    """Which motion in the images tells the delay."""
-
-    line = "line"
-    images = "images"
-
-
 @calibrate.command("clock")
 def calibrate_clock(
     images: Images,
     poses: Poses = None,
     pixel_mm: PixelMm = None,
     by: Annotated[
-        By,
+        Literal["line", "images"],
         typer.Option(
             help="line: a plane's echo follows the sensor; images: a sweep forward and back over tissue."
         ),
-    ] = By.line,
+    ] = "line",
     sensor: Annotated[str, typer.Option(help="line: tracker or orientation.")] = "tracker",
     region: Region = None,
     search_s: Annotated[float, typer.Option(min=0.02, help="Delays to either side of the file's own.")] = 0.5,
@@ -68,7 +60,7 @@ def calibrate_clock(
     if out is not None:
         require_free(out, images, poses, calibration)
     known = _known(by, sensor, calibration, out)
-    if by is By.images:
+    if by == "images":
         found, frames = _by_images(images, poses, pixel_mm, known, search_s)
         told = f"images of the two ways correlate by {found.followed:.2f}"
     else:
@@ -90,20 +82,20 @@ def calibrate_clock(
     emit(told)
 
 
-def _known(by: By, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
+def _known(by: str, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
     """Read the calibration, if one is given, after checking that the options fit each other and it."""
     from speckle3d.io.calibrations import read_calibration
 
     if out is not None and calibration is None:
         raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
-    if by is By.line and calibration is not None and out is None:
+    if by == "line" and calibration is not None and out is None:
         raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     known = None if calibration is None else read_calibration(calibration)
     if known is not None and known.sensor != sensor:
         raise MismatchError(
             f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
         )
-    if by is By.images and sensor != "tracker":
+    if by == "images" and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
     return known
 
