@@ -18,9 +18,8 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation
-from calibration.images.fit import Estimate
 from calibration.images.search import incremented
-from calibration.images.similarity import Comparison
+from calibration.images.similarity import Comparison, Estimate
 from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration, Improvement
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array, FloatArray
@@ -52,7 +51,7 @@ def calibration_from_images(
 ) -> Calibration:
     """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
     counts = [len(each.frame_time_s) for each in sweeps]
-    first, second = result.frames_used
+    first, second = result.sweeps.frames_used
     pose = result.sensor_from_image
     return Calibration(
         method="images",
@@ -66,7 +65,7 @@ def calibration_from_images(
         rms_unit="",
         condition_number=result.condition_number,
         frames=FramesUsed(
-            sum(counts), first + tuple(counts[0] + k for k in second), _uncovered(result, counts)
+            sum(counts), (*first.tolist(), *(counts[0] + second).tolist()), _uncovered(result, counts)
         ),
         time_offset_s=sweeps[0].time_offset_s,
         verdict=_verdict(result, angulation),
@@ -77,7 +76,7 @@ def notes_of(result: ImageCalibration, angulation: Angulation) -> list[str]:
     """Lines for the report that show whether the answer is right."""
     centre = np.sqrt(np.diag(result.covariance_of(result.sweeps.centre_mm)))
     used, held = result.similarity, result.held_out
-    kept = sum(map(len, result.frames_held_out))
+    kept = sum(map(len, result.sweeps.frames_held_out))
     return [
         f"correlation of images with the other sweep: {_told(used)}",
         f"of {kept} frames kept out of it for this check: {_told(held)}",
@@ -111,7 +110,7 @@ def figure_of(
     FigureCanvasAgg(figure)
     panels = figure.subplots(4, 3, height_ratios=[1.3, 1.3, 1.0, 1.0])
     for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
-        held = result.frames_held_out[k] or result.frames_used[k]
+        held = result.sweeps.frames_held_out[k]
         _draw_images(panels[k], result, one, other, int(held[len(held) // 2]))
     comparison = result.sweeps.whole(SIGMA_MM, IMAGES, result.sensor_from_image)
     about = Estimate(result.sensor_from_image, result.scales)
@@ -152,8 +151,7 @@ def similarities(
     steps = np.stack(np.meshgrid(*[offset] * len(names), indexing="ij"), axis=-1) @ units
 
     def at(step: FloatArray) -> float:
-        moved = incremented(about, step)
-        return comparison.at(moved.sensor_from_image, moved.scales).mean
+        return comparison.at(incremented(about, step)).mean
 
     with ThreadPoolExecutor(threads) as pool:
         return np.reshape(list(pool.map(at, steps.reshape(-1, 6))), steps.shape[:-1])
@@ -235,7 +233,7 @@ def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
     """Reasons of frames that were neither used nor held out, by number."""
     reasons: dict[int, str] = {}
     for k, before in enumerate((0, counts[0])):
-        known = {*result.frames_used[k], *result.frames_held_out[k]}
+        known = {*result.sweeps.frames_used[k], *result.sweeps.frames_held_out[k]}
         reasons |= {before + n: "no reading of the sensor" for n in range(counts[k]) if n not in known}
     return reasons
 

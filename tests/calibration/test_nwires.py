@@ -219,7 +219,7 @@ def test_dots_found_here_calibrate_real_images_for_others(realdata, fcal):
         # Measured 0.8 px in the middle, 6.7 px at most; the next wire is 100 px away.
         assert np.median(away) < 1.0
         assert away.max() < 10.0
-    points: ImagePoints = labelled["Validation"].points(poses)
+    points: ImagePoints = labelled["Validation"].points(poses[labelled["Validation"].frame])
     place = fcal.phantom.world_from_phantom
     errors = nwire_errors_mm(points, fcal.phantom, pixel_matrix(starts["Calibration"]), place)
     # PLUS, with its own points, has 0.540 mm; a tenth more for other dots in other frames (measured 0.575).

@@ -7,9 +7,8 @@ from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS
-from calibration.images.fit import Estimate
 from calibration.images.report import similarities
-from calibration.images.similarity import prepare
+from calibration.images.similarity import Estimate, prepare
 from calibration.images.solver import ImageSettings, calibrate_from_sweeps, calibrate_images
 from calibration.images.stacks import read_stack
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -66,8 +65,8 @@ def test_result_says_what_was_gained(found):
     assert found.held_out.after > 0.9
     assert found.converged
     assert found.evaluations > 1000
-    for used, held in zip(found.frames_used, found.frames_held_out, strict=True):
-        assert sorted(used + held) == list(range(36))
+    for used, held in zip(found.sweeps.frames_used, found.sweeps.frames_held_out, strict=True):
+        assert sorted([*used, *held]) == list(range(36))
         assert len(held) == 3
 
 
@@ -165,7 +164,7 @@ def test_frames_without_readings_are_left_out(scene):
     few = TimedPoses(first.readings.time_s[kept], first.readings.world_from_sensor[kept])
     start = displaced(truth, np.random.default_rng(7), 3.0, 3.0)
     result = calibrate_images(dataclasses.replace(first, readings=few), second, start, REFINE)
-    assert min(result.frames_used[0] + result.frames_held_out[0]) == 6
+    assert min(*result.sweeps.frames_used[0], *result.sweeps.frames_held_out[0]) == 6
     assert np.linalg.norm(centre_error_mm(result.sensor_from_image, truth, first.grid)) < 0.5
 
 
