@@ -179,11 +179,11 @@ def _label(
     wires = np.concatenate([layer.wires for layer in layers])
     loose = free_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
     chosen = chosen[np.argsort(loose)[:_REFINED]]
-    fits = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
-    best = float(fits.rms_mm.min())
+    _, _, rms_mm = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
+    best = float(rms_mm.min())
     if best > s.residual_mm:
         raise InsufficientDataError("no dots fit the wires")
-    like = np.flatnonzero(fits.rms_mm <= best + _LIKE_MM)
+    like = np.flatnonzero(rms_mm <= best + _LIKE_MM)
     # Rounded, so that where the same dots fit either way round, the usual one is chosen.
     strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
     usual = [-_unusual(dots_mm[chosen[i]]) for i in like]

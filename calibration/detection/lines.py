@@ -135,10 +135,8 @@ def detect_line(
         If an argument is not what it must be.
     """
     s = settings or LineSettings()
-    if image.ndim != 2:
-        raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
-    if not np.isrealobj(image):
-        raise InvalidInputError(f"image: expected real values, got {image.dtype}")
+    if image.ndim != 2 or not np.isrealobj(image):
+        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
     pixel = checked_pixel(pixel_mm)
     if region_px is None:
         dense = lay_columns(image.shape, DENSELY * s.columns, None)

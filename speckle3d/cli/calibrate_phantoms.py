@@ -321,9 +321,9 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
     found = outcome.calibration.time_offset_s
     with naming(str(path)):
         points, _ = paired(other, seen, other.time_offset_s if found is None else found)
-        checked = validate(outcome.solution, points)
+        residuals = validate(outcome.solution, points)
     frames = len(set(points.frame.tolist()))
-    rms, unit = readable(checked.rms, outcome.calibration.rms_unit)
+    rms, unit = readable(float((residuals**2).mean() ** 0.5), outcome.calibration.rms_unit)
     notes = [f"on {path.name}, not used: RMS residual {rms} {unit}, {frames} frames, none left out"]
     return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, points)]
 

@@ -48,20 +48,20 @@ def test_middle_dots_are_placed_in_the_phantom_whatever_the_pixels(seed, stretch
     points = points_of(shown)
     shuffled = np.random.default_rng(seed).permutation(len(points))
     squeezed = replace(points, pixels=points.pixels * [1.0, stretch])[shuffled]
-    middle = middle_wires(squeezed, shown.phantom)
-    assert len(middle.points) == 4 * 3
-    assert set(middle.points.wire) == {1, 4, 7}
-    seen = middle.points.pixels / [1.0, stretch] * PIXEL_MM
-    world = middle.points.world_from_sensor * shown.sensor_from_image
+    middle, phantom_mm = middle_wires(squeezed, shown.phantom)
+    assert len(middle) == 4 * 3
+    assert set(middle.wire) == {1, 4, 7}
+    seen = middle.pixels / [1.0, stretch] * PIXEL_MM
+    world = middle.world_from_sensor * shown.sensor_from_image
     truth = (shown.phantom.world_from_phantom.inv() * world).apply(np.column_stack([seen, np.zeros(12)]))
-    np.testing.assert_allclose(middle.phantom_mm, truth, atol=1e-8)
+    np.testing.assert_allclose(phantom_mm, truth, atol=1e-8)
 
 
 def test_an_n_that_lacks_a_dot_says_nothing():
     shown = scene(1, frames=3)
     points = points_of(shown)
-    middle = middle_wires(points[~((points.frame == 1) & (points.wire == 5))], shown.phantom)
-    assert sorted(zip(middle.points.frame, middle.points.wire, strict=True)) == [
+    middle, _ = middle_wires(points[~((points.frame == 1) & (points.wire == 5))], shown.phantom)
+    assert sorted(zip(middle.frame, middle.wire, strict=True)) == [
         (0, 1), (0, 4), (0, 7), (1, 1), (1, 7), (2, 1), (2, 4), (2, 7),
     ]  # fmt: skip
 

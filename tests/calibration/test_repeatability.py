@@ -40,6 +40,10 @@ def about(axis, degrees):
     return Rotation.from_rotvec(np.deg2rad(degrees) * np.eye(3)[axis])
 
 
+def rms(residuals):
+    return np.sqrt(np.mean(residuals**2))
+
+
 def test_two_that_differ_by_a_shift():
     found = repeatability([calibration(), calibration(shift_mm=(3.0, 0.0, 4.0))], SIZE_PX)
     assert found.trials == 2
@@ -130,11 +134,7 @@ def test_another_recording_of_a_plane_may_be_of_another_plane():
     other = scan_plane(np.random.default_rng(1), 200, line_noise_mm=0.2, floor=wall).lines
     found = validate(solution, other)
     # Noise of 0.2 mm along the beam, times its cosine with the wall's normal: 0.97 for such tilts and rolls.
-    assert found.rms == pytest.approx(0.2 * 0.96, rel=0.10)
-    np.testing.assert_array_equal(found.chain.pixel_mm, solution.chain.pixel_mm)
-    np.testing.assert_allclose(
-        found.chain.sensor_from_image.as_matrix(), solution.chain.sensor_from_image.as_matrix(), atol=1e-12
-    )
+    assert rms(found) == pytest.approx(0.2 * 0.96, rel=0.10)
 
 
 def test_a_wrong_calibration_fails_on_another_recording():
@@ -143,7 +143,7 @@ def test_a_wrong_calibration_fails_on_another_recording():
     tilted = solution.chain.sensor_from_image * RigidTransform.from_rotation(about(0, 6.0))
     wrong = replace(solution, chain=replace(solution.chain, sensor_from_image=tilted))
     other = scan_plane(np.random.default_rng(1), 200, line_noise_mm=0.2).lines
-    assert validate(wrong, other).rms > 2 * validate(solution, other).rms
+    assert rms(validate(wrong, other)) > 2 * rms(validate(solution, other))
 
 
 def test_no_frame_of_another_recording_is_left_out():
@@ -152,9 +152,9 @@ def test_no_frame_of_another_recording_is_left_out():
     pixels = lines.pixels.copy()
     pixels[:2, 1] += 20.0 / PIXEL_MM[1]
     spoilt = validate(solution, replace(lines, pixels=pixels))
-    assert len(spoilt.residuals) == len(lines)
+    assert len(spoilt) == len(lines)
     # 20 mm in two of 400 points.
-    assert spoilt.rms == pytest.approx(20 * np.sqrt(2 / 400), rel=0.15)
+    assert rms(spoilt) == pytest.approx(20 * np.sqrt(2 / 400), rel=0.15)
 
 
 def test_a_crossing_stays_where_it_was():
@@ -167,9 +167,9 @@ def test_a_crossing_stays_where_it_was():
 
     solution = calibrate_cross_wire(scan(0))
     # 0.3 mm in two of three components; the solution's own error comes in a tenth of that.
-    assert validate(solution, scan(1)).rms == pytest.approx(0.3 * np.sqrt(2 / 3), rel=0.2)
+    assert rms(validate(solution, scan(1))) == pytest.approx(0.3 * np.sqrt(2 / 3), rel=0.2)
     # Somebody moved the phantom by 3 mm, along one of three components: that is an error, and is shown.
-    assert validate(solution, scan(1, 3.0)).rms == pytest.approx(3.0 / np.sqrt(3), rel=0.1)
+    assert rms(validate(solution, scan(1, 3.0))) == pytest.approx(3.0 / np.sqrt(3), rel=0.1)
 
 
 def test_trial_one_of_the_report_repeats_to_itself():

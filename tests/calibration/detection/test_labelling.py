@@ -156,11 +156,11 @@ def test_an_image_that_cuts_wires_is_found_among_them(seed):
     wires = np.arange(9)[None]
     # The ridge on axes that are left open keeps a hundredth of a millimetre.
     assert free_fits(positions - positions.mean(axis=1, keepdims=True), wires, n_phantom())[1] < 0.03
-    fits = rigid_fits(positions, wires, n_phantom(), scale_tolerance=0.05)
+    pose, scale, rms_mm = rigid_fits(positions, wires, n_phantom(), scale_tolerance=0.05)
     # The prior on the pixel size, three hundredths off at most, pulls; that costs a fifth of what noise does.
-    assert fits.rms_mm[0] < 0.06
-    found = fits.phantom_from_image[0].apply(np.column_stack([positions[0] * fits.scale[0], np.zeros(9)]))
+    assert rms_mm[0] < 0.06
+    found = pose[0].apply(np.column_stack([positions[0] * scale[0], np.zeros(9)]))
     rows, offsets = n_phantom().equations(wires[0])
     assert np.linalg.norm(np.einsum("kri,ki->kr", rows, found) - offsets, axis=1).max() < 0.15
-    wrong = rigid_fits(positions, wires[:, ::-1], n_phantom(), scale_tolerance=0.05)
-    assert wrong.rms_mm[0] > 0.5
+    _, _, wrong_mm = rigid_fits(positions, wires[:, ::-1], n_phantom(), scale_tolerance=0.05)
+    assert wrong_mm[0] > 0.5
