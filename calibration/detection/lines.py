@@ -24,7 +24,7 @@ from calibration.detection.region import (
     without_blank_sides,
     without_standing,
 )
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.core.sweep import Frames
@@ -216,7 +216,11 @@ class _Candidate:
 
 def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
     samples = np.asarray(image[columns.column], np.float32)
-    _require_content(samples[columns.inside])
+    held = samples[columns.inside]
+    if not np.isfinite(held).all():
+        raise NoLineError("no line: the image holds values that are not finite")
+    if held.size == 0 or np.ptp(held) == 0:
+        raise NoLineError("no line: the image is of one level all over")
     tolerance = s.tolerance_mm / float(pixel_mm[1])
     profiles = take_profiles(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
     if s.threshold is None:
@@ -257,13 +261,6 @@ def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -
     depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
     upper = [line for line in lines if depths.get(id(line), np.inf) <= min(depths.values()) + tolerance]
     return max(upper, key=lambda line: line.agreed)
-
-
-def _require_content(held: Float32Array) -> None:
-    if not np.isfinite(held).all():
-        raise NoLineError("no line: the image holds values that are not finite")
-    if held.size == 0 or np.ptp(held) == 0:
-        raise NoLineError("no line: the image is of one level all over")
 
 
 def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -93,9 +94,7 @@ def calibrate_plane(
         recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma)
         return recording, find_lines(recording, region, path, lines), job
 
-    def solve(recording: Recording, seen: Seen, job: JobSettings) -> Outcome:
-        return plane_job(recording, seen, job, not fixed_pixels, stages, widths)
-
+    solve = partial(plane_job, fit_pixels=not fixed_pixels, stages=stages, beam_mm=widths)
     _calibrate(scan, solve, images, poses, validation, out, as_json)
 
 
@@ -137,9 +136,7 @@ def calibrate_orientation(
         recording, job = _prepared(path, readings, pixel_mm, sensor, time_offset, outlier_sigma)
         return recording, find_lines(recording, region, path, lines), job
 
-    def solve(recording: Recording, seen: Seen, job: JobSettings) -> Outcome:
-        return orientation_job(recording, seen, job, level, viewed_from)
-
+    solve = partial(orientation_job, level=level, viewed_from=viewed_from)
     _calibrate(scan, solve, images, poses, validation, out, as_json)
 
 
@@ -187,9 +184,8 @@ def calibrate_wires(
         picked = validation_points if path is validation else points
         return recording, _seen_wires(recording, phantom, config, picked, region, path), job
 
-    def solve(recording: Recording, seen: Seen, job: JobSettings) -> Outcome:
-        return wires_job(recording, seen, job, geometry, not fixed_pixels, registration)
-
+    fit_pixels = not fixed_pixels
+    solve = partial(wires_job, phantom=geometry, fit_pixels=fit_pixels, registration=registration)
     names = () if config is None else config.phantom.names
     _calibrate(scan, solve, images, poses, validation, out, as_json, names)
 
