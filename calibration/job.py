@@ -70,8 +70,7 @@ class JobSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     estimate_offset: bool = Field(
-        False,
-        description="Find the clock offset that explains the images best, near the recording's own.",
+        False, description="Find the clock offset that explains the images best, near the recording's own."
     )
     offset_given: bool = Field(
         False,

@@ -31,12 +31,7 @@ from calibration.chain import (
     residuals_and_jacobian,
 )
 from calibration.identifiability import judge, require_adequate
-from calibration.starts import (
-    angle_starts,
-    distance_start,
-    hemisphere,
-    in_plane_mirror,
-)
+from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (

@@ -286,9 +286,7 @@ class CrossingSweeps:
         spacing = [frame_spacing(stack, sensor_from_image) for stack in self.used]
         a, b = (
             self._blurred(way, sigma_mm, least_weight).thinned(
-                sensor_from_image,
-                max(0.75 * sigma_mm, spacing[way]),
-                max(0.7 * sigma_mm, 0.5 * spacing[way]),
+                sensor_from_image, max(0.75 * sigma_mm, spacing[way]), max(0.7 * sigma_mm, 0.5 * spacing[way])
             )
             for way in (0, 1)
         )

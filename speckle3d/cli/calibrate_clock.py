@@ -10,17 +10,7 @@ import typer
 
 from speckle3d.cli.calibrate_phantoms import find_lines
 from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import (
-    Images,
-    Json,
-    PixelMm,
-    Poses,
-    Region,
-    calibrate,
-    emit,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import Images, Json, PixelMm, Poses, Region, calibrate, emit, note, progress_bar
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:

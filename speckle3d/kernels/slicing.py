@@ -228,12 +228,7 @@ def compare_patches(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
 def _images_near(
-    sample: PlacedImages,
-    source: PlacedImages,
-    patches: PatchGrid,
-    p: int,
-    max_gap_mm: float,
-    near: IntArray,
+    sample: PlacedImages, source: PlacedImages, patches: PatchGrid, p: int, max_gap_mm: float, near: IntArray
 ) -> int:
     """Fill `near` with the numbers of images that pass near patch `p`; return how many."""
     pixels = sample.pixels

@@ -124,10 +124,7 @@ def test_no_dots_are_no_wires():
 
 @pytest.mark.parametrize(
     ("ends", "patterns", "message"),
-    [
-        (ENDS_MM[:3], ((0, 1, 2),), "two N.*1"),
-        (ENDS_MM[:, :, [1, 0, 2]], (), "two N.*0"),
-    ],
+    [(ENDS_MM[:3], ((0, 1, 2),), "two N.*1"), (ENDS_MM[:, :, [1, 0, 2]], (), "two N.*0")],
 )
 def test_phantoms_whose_wires_cannot_be_told_apart_are_refused(ends, patterns, message):
     dots = Dots(np.zeros(1, dtype=int), np.ones((1, 2)), np.ones(1))
@@ -154,8 +151,8 @@ def test_an_image_that_cuts_wires_is_found_among_them(seed):
     # The ridge on axes that are left open keeps a hundredth of a millimetre.
     assert free_fits(positions - positions.mean(axis=1, keepdims=True), wires, n_phantom())[1] < 0.03
     pose, scale, rms_mm = rigid_fits(positions, wires, n_phantom(), scale_tolerance=0.05)
-    # The prior on the pixel size, three hundredths off at most, pulls: 0.01 mm in the middle of 600 images and
-    # 0.15 mm at most, the worst dot 0.29 mm.
+    # The prior on the pixel size, three hundredths off at most, pulls: in the middle of 600 images 0.01 mm,
+    # 0.15 mm at most, and 0.29 mm in the worst dot.
     assert rms_mm[0] < 0.2
     found = pose[0].apply(np.column_stack([positions[0] * scale[0], np.zeros(9)]))
     rows, offsets = n_phantom().equations(wires[0])

@@ -76,10 +76,7 @@ def test_sensitivities_are_those_of_small_errors():
 
 @pytest.mark.parametrize(
     ("first", "second"),
-    [
-        (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 0.0)),
-        (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 90.0)),
-    ],
+    [(fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 0.0)), (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 90.0))],
     ids=["parallel", "crossing but not tilted"],
 )
 def test_sweeps_that_cannot_tell_are_refused_with_the_reason(first, second):
