@@ -12,7 +12,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, Protocol
 
@@ -103,6 +103,46 @@ class ImagePoints:
         """Two points of a line in each frame: m frames and poses, `points_px` of shape (m, 2, 2)."""
         twice = np.repeat(np.arange(len(frame)), 2)
         return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], world_from_sensor[twice])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was found in the images of a sequence.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (m,)
+        Of each line, or of each dot; ascending.
+    pixels : ndarray, shape (m, 2, 2) for lines, (m, 2) for dots
+        Column and row, fractional, of two points on each line, or of each dot.
+    wire : ndarray of int, shape (m,), optional
+        Number of the wire that each dot shows.
+    dropped : dict of int to str
+        Why other frames show nothing.
+    """
+
+    frame: IntArray
+    pixels: FloatArray
+    wire: IntArray | None = None
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, chosen: BoolArray | IntArray) -> Seen:
+        wire = None if self.wire is None else self.wire[chosen]
+        return Seen(self.frame[chosen], self.pixels[chosen], wire, self.dropped)
+
+    @property
+    def are_lines(self) -> bool:
+        """Whether lines were found, not dots."""
+        return self.pixels.ndim == 3
+
+    def points(self, world_from_sensor: RigidTransform) -> ImagePoints:
+        """Join with the sensor's pose at each line or dot."""
+        if self.are_lines:
+            return ImagePoints.of_lines(self.frame, self.pixels, world_from_sensor)
+        return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire)
 
 
 def as_directions(lines: ImagePoints) -> ImagePoints:

@@ -117,14 +117,26 @@ def judge(solution: ChainSolution) -> Adequacy:
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
     if share < 1 and share * error <= limit:
-        return Adequacy(error, condition, (), True, _misfit(solution))
-    if not angular and _image_mm(solution).min() < SMALLEST_IMAGE_MM:
+        misfit = (
+            f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
+            "the images and the sensor readings belong together, and are the phantom, its wires and their "
+            "numbers the ones named?"
+        )
+        return Adequacy(error, condition, (), True, misfit)
+    right_down_mm = solution.points_used.pixels.max(axis=0) * solution.chain.pixel_mm
+    if not angular and right_down_mm.min() < SMALLEST_IMAGE_MM:
         return Adequacy(error, condition, (_UP_AND_DOWN.advice,), True, f"{_SHRUNK}: {_UP_AND_DOWN.advice}")
     refused = bool(error > limit or not condition <= MAX_CONDITION)
     missing = tuple(_missing(solution, information, weak)) if error > weak else ()
     where = "" if angular else " at the image's corners"
     state = f"standard error {_size(error, angular)}{where}, condition number {condition:.3g}"
-    advice = "; and ".join(missing) if missing else _more(solution.phantom.seen_as == "dot" and error <= weak)
+    if missing:
+        advice = "; and ".join(missing)
+    elif solution.phantom.seen_as == "dot" and error <= weak:
+        # No motion would help.
+        advice = "what stays unknown is where the phantom is: show more of it, all its wires"
+    else:
+        advice = "record more frames over a wider range"
     if refused:
         verdict = f"the motion does not determine the calibration ({state}): {advice}"
     elif error > weak:
@@ -134,28 +146,8 @@ def judge(solution: ChainSolution) -> Adequacy:
     return Adequacy(error, condition, missing, refused, verdict)
 
 
-def _image_mm(solution: ChainSolution) -> FloatArray:
-    """How far right and down in the image the phantom was seen."""
-    return np.asarray(solution.points_used.pixels.max(axis=0) * solution.chain.pixel_mm)
-
-
-def _misfit(solution: ChainSolution) -> str:
-    return (
-        "the phantom does not explain the images (they miss it by "
-        f"{_size(solution.rms, solution.angular)}): do the images and the sensor "
-        "readings belong together, and are the phantom, its wires and their numbers the ones named?"
-    )
-
-
 def _size(error: float, angular: bool) -> str:
     return f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm"
-
-
-def _more(only_phantom_unknown: bool) -> str:
-    """Advice where no motion would help."""
-    if only_phantom_unknown:
-        return "what stays unknown is where the phantom is: show more of it, all its wires"
-    return "record more frames over a wider range"
 
 
 def _on_phantom(solution: ChainSolution, points: ImagePoints) -> ImagePoints:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,21 +11,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
-from calibration.chain import (
-    ChainSolution,
-    ImagePoints,
-    as_directions,
-)
+from calibration.chain import ChainSolution, ImagePoints, Seen, as_directions
 from calibration.clock.offset import ClockOffset, covered, estimate_offset
 from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
-from calibration.detection.lines import LineSettings, detect_lines
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
 from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
 from calibration.report import Shot, as_calibration
 from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -75,8 +70,7 @@ class JobSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     estimate_offset: bool = Field(
-        False,
-        description="Find the clock offset that explains the images best, near the recording's own.",
+        False, description="Find the clock offset that explains the images best, near the recording's own."
     )
     offset_given: bool = Field(
         False,
@@ -98,75 +92,31 @@ class Outcome:
     offset: ClockOffset | None = None
 
 
-@dataclass(frozen=True)
-class Seen:
-    """What was found in the images.
+def find_crossings(
+    recording: Recording, region_px: npt.ArrayLike | None = None, progress: Progress | None = None
+) -> Seen:
+    """Find in every image the bright dot that a crossing of wires, or a bead, makes."""
+    return single_dots(dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress))
 
-    Attributes
-    ----------
-    frame : ndarray of int, shape (m,)
-        Of each line, or of each dot.
-    marks_px : ndarray, shape (m, 2, 2) for lines, (m, 2) for dots
-    wire : ndarray of int, shape (m,), optional
-    dropped : dict of int to str
-        Why other frames show nothing.
+
+def find_nwires(
+    recording: Recording,
+    phantom: WirePhantom,
+    region_px: npt.ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> Seen:
+    """Find the dots of an N-wire phantom and the wires they show.
+
+    Where every frame has a sensor reading, a calibration from the frames that show all wires then finds
+    those of the other frames.
     """
-
-    frame: IntArray
-    marks_px: FloatArray
-    wire: IntArray | None = None
-    dropped: dict[int, str] = field(default_factory=dict)
-
-    @property
-    def are_lines(self) -> bool:
-        """Whether marks are lines."""
-        return self.marks_px.ndim == 3
-
-    @classmethod
-    def lines(
-        cls,
-        recording: Recording,
-        settings: LineSettings | None = None,
-        region_px: npt.ArrayLike | None = None,
-        progress: Progress | None = None,
-    ) -> Seen:
-        """Find the plane's line in every image."""
-        found = detect_lines(recording.images, recording.pixel_mm, settings, region_px, progress)
-        return cls(found.frame, found.points_px, None, found.dropped)
-
-    @classmethod
-    def crossings(
-        cls,
-        recording: Recording,
-        region_px: npt.ArrayLike | None = None,
-        progress: Progress | None = None,
-    ) -> Seen:
-        """Find in every image the bright dot that a crossing of wires, or a bead, makes."""
-        dots = single_dots(dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress))
-        return cls(dots.frame, dots.pixels, None, dots.dropped)
-
-    @classmethod
-    def nwires(
-        cls,
-        recording: Recording,
-        phantom: WirePhantom,
-        region_px: npt.ArrayLike | None = None,
-        progress: Progress | None = None,
-    ) -> Seen:
-        """Find the dots of an N-wire phantom and the wires they show.
-
-        Where every frame has a sensor reading, a calibration from the frames that show all wires then finds
-        those of the other frames.
-        """
-        dots = dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress)
-        times, offset_s = recording.frame_time_s, recording.time_offset_s
-        everywhere = covered(recording.readings, times, offset_s).all()
-        if isinstance(recording.readings, TimedPoses) and everywhere:
-            poses = recording.readings.at(times - offset_s)
-            labelled = label_and_start(dots, phantom, poses, recording.pixel_mm)[0]
-        else:
-            labelled = label_dots(dots, phantom, recording.pixel_mm)
-        return cls(labelled.frame, labelled.pixels, labelled.wire, labelled.dropped)
+    dots = dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress)
+    times, offset_s = recording.frame_time_s, recording.time_offset_s
+    everywhere = covered(recording.readings, times, offset_s).all()
+    if isinstance(recording.readings, TimedPoses) and everywhere:
+        poses = recording.readings.at(times - offset_s)
+        return label_and_start(dots, phantom, poses, recording.pixel_mm)[0]
+    return label_dots(dots, phantom, recording.pixel_mm)
 
 
 def plane_job(
@@ -209,46 +159,36 @@ def orientation_job(
     return _finished(recording, seen, job, calibrate, "orientation")
 
 
-def crossing_job(recording: Recording, seen: Seen, job: JobSettings, fit_pixels: bool = True) -> Outcome:
-    """Calibrate a 6-DOF sensor with two crossing wires or a bead."""
-    _require_poses(recording)
-
-    def calibrate(points: ImagePoints) -> ChainSolution:
-        return calibrate_cross_wire(points, recording.pixel_mm, fit_pixels, job.outlier_sigma)
-
-    return _finished(recording, seen, job, calibrate, "cross-wire")
-
-
 def wires_job(
     recording: Recording,
     seen: Seen,
     job: JobSettings,
-    phantom: WirePhantom,
+    phantom: WirePhantom | None,
     fit_pixels: bool = True,
     registration: Registration = "turned",
 ) -> Outcome:
-    """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes."""
+    """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes; without a phantom, two that cross."""
     _require_poses(recording)
+    known = recording.pixel_mm, fit_pixels
 
     def calibrate(points: ImagePoints) -> ChainSolution:
-        return calibrate_wires(
-            points, phantom, recording.pixel_mm, fit_pixels, registration, job.outlier_sigma
-        )
+        if phantom is None:
+            return calibrate_cross_wire(points, *known, job.outlier_sigma)
+        return calibrate_wires(points, phantom, *known, registration, job.outlier_sigma)
 
-    return _finished(recording, seen, job, calibrate, "n-wire" if phantom.n_shapes else "three-wire")
+    method = "cross-wire" if phantom is None else "n-wire" if phantom.n_shapes else "three-wire"
+    return _finished(recording, seen, job, calibrate, method)
 
 
-def paired(
-    recording: Recording, seen: Seen, offset_s: float, slack_s: float = 0.0
-) -> tuple[ImagePoints, Seen]:
+def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoints, dict[int, str]]:
     """Join what was seen with the readings at the same time, by a clock that is off by `offset_s`.
 
     Returns
     -------
     points : ImagePoints
-        Of the frames with a reading at any offset within `slack_s`.
-    seen : Seen
-        With the reason for those without.
+        Of the frames with a reading.
+    dropped : dict of int to str
+        Why other frames have none: `Seen.dropped`, and those without a reading.
 
     Raises
     ------
@@ -256,7 +196,7 @@ def paired(
         If few frames have one.
     """
     times = recording.frame_time_s[seen.frame]
-    there = covered(recording.readings, times, offset_s, slack_s)
+    there = covered(recording.readings, times, offset_s)
     if there.sum() < max(1.0, _FEWEST_COVERED * len(times)):
         first, last = recording.readings.time_s[[0, -1]] + offset_s
         raise InsufficientDataError(
@@ -265,19 +205,10 @@ def paired(
             f"{recording.frame_time_s[0]:.3f} to {recording.frame_time_s[-1]:.3f} s"
         )
     missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~there])), "no sensor reading at its time")
-    poses = _poses(recording, times[there] - offset_s)
-    marks = seen.marks_px[there] + np.array([0.0, recording.first_row])
-    if seen.are_lines:
-        points = ImagePoints.of_lines(seen.frame[there], marks, poses)
-    else:
-        wire = None if seen.wire is None else seen.wire[there]
-        points = ImagePoints(marks, seen.frame[there], poses, wire)
-    return points, Seen(seen.frame, seen.marks_px, seen.wire, {**seen.dropped, **missing})
-
-
-def _poses(recording: Recording, times_s: FloatArray) -> RigidTransform:
-    read: RigidTransform | Rotation = recording.readings.at(times_s)
-    return RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+    read: RigidTransform | Rotation = recording.readings.at(times[there] - offset_s)
+    poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+    below_origin = replace(seen, pixels=seen.pixels + np.array([0.0, recording.first_row]))
+    return below_origin[there].points(poses), {**seen.dropped, **missing}
 
 
 def _finished(
@@ -292,47 +223,45 @@ def _finished(
         raise InsufficientDataError(f"expected the phantom in the images, got it in none: {reasons[0]}")
     offset = None
     if job.estimate_offset:
-
-        def at(offset_s: float) -> ChainSolution:
-            return calibrate(_everywhere_paired(recording, seen, offset_s))
-
-        offset = estimate_offset(at, recording.time_offset_s, SEARCH_S)
+        timed = _covered_throughout(recording, seen)
+        offset = estimate_offset(
+            lambda offset_s: calibrate(paired(recording, timed, offset_s)[0]),
+            recording.time_offset_s,
+            SEARCH_S,
+        )
     used_offset = recording.time_offset_s if offset is None else offset.seconds
-    points, told = paired(recording, seen, used_offset)
+    points, dropped = paired(recording, seen, used_offset)
     solution = calibrate(points)
-    frames = FramesUsed(recording.images.shape[0], (), told.dropped)
+    frames = FramesUsed(recording.images.shape[0], (), dropped)
     known = offset is not None or job.offset_given or recording.time_offset_s != 0.0
-    stored = used_offset if known else None
-    calibration = as_calibration(solution, method, frames, stored)
+    calibration = as_calibration(solution, method, frames, used_offset if known else None)
     return Outcome(solution, calibration, _shots(recording, seen, calibration), offset=offset)
 
 
-def _everywhere_paired(recording: Recording, seen: Seen, offset_s: float) -> ImagePoints:
-    """Points of the frames that have a reading at every offset tried: all are judged by the same frames."""
+def _covered_throughout(recording: Recording, seen: Seen) -> Seen:
+    """Those frames that have a reading at every offset tried: all offsets are judged by the same frames."""
     there = covered(recording.readings, recording.frame_time_s[seen.frame], recording.time_offset_s, SEARCH_S)
     if not there.any():
         raise InsufficientDataError(
             f"expected readings from {SEARCH_S:g} s before to {SEARCH_S:g} s after some frames, to tell the "
             "clock, got none"
         )
-    wire = None if seen.wire is None else seen.wire[there]
-    return paired(recording, Seen(seen.frame[there], seen.marks_px[there], wire), offset_s)[0]
+    return seen[there]
 
 
 def _shots(recording: Recording, seen: Seen, calibration: Calibration) -> tuple[Shot, ...]:
     """A used frame from the middle, one from the end, and the first that was dropped."""
     used, dropped = calibration.frames.used, calibration.frames.dropped
     chosen = [used[len(used) // 2], used[-1], *sorted(dropped)[:1]]
-    return tuple(_shot(recording, seen, number, dropped.get(number, "")) for number in dict.fromkeys(chosen))
-
-
-def _shot(recording: Recording, seen: Seen, number: int, note: str) -> Shot:
-    return Shot(
-        number,
-        recording.images[number],
-        seen.marks_px[seen.frame == number].reshape(-1, 2),
-        seen.are_lines,
-        note,
+    return tuple(
+        Shot(
+            number,
+            recording.images[number],
+            seen.pixels[seen.frame == number].reshape(-1, 2),
+            seen.are_lines,
+            dropped.get(number, ""),
+        )
+        for number in dict.fromkeys(chosen)
     )
 
 

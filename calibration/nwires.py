@@ -12,19 +12,19 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Chain, ImagePoints
+from calibration.chain import Chain, ImagePoints, Seen
 from calibration.detection.dots import Dots
-from calibration.detection.labelling import LabelledDots, LabelSettings, label_by_calibration, label_dots
+from calibration.detection.labelling import LabelSettings, label_by_calibration, label_dots
 from calibration.starts import rigid_fits, wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import cauchy_weights
 from speckle3d.core.wires import WirePhantom
@@ -44,22 +44,6 @@ _LEAST_TURN = 0.02
 noise of a degree over turns of a radian."""
 
 
-@dataclass(frozen=True)
-class MiddleWires:
-    """Where images cut the middle wires of N.
-
-    Attributes
-    ----------
-    points : ImagePoints, length n
-        The middle dots.
-    phantom_mm : ndarray, shape (n, 3)
-        In the phantom's frame, from the distances of the outer dots.
-    """
-
-    points: ImagePoints
-    phantom_mm: FloatArray
-
-
 def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[float, float]:
     """Mean and standard deviation of the least `share` of the errors, mm, as PLUS reports them.
 
@@ -74,13 +58,20 @@ def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[
     return float(kept.mean()), float(kept.std())
 
 
-def middle_wires(points: ImagePoints, phantom: WirePhantom) -> MiddleWires:
+def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints, FloatArray]:
     """Find where images cut the middle wires, from all N whose three dots are there.
 
     Parameters
     ----------
     points : ImagePoints
         With the wire of each.
+
+    Returns
+    -------
+    middle : ImagePoints, length n
+        The middle dots.
+    phantom_mm : ndarray, shape (n, 3)
+        Where they are in the phantom's frame, from the distances of the outer dots.
 
     Raises
     ------
@@ -97,7 +88,7 @@ def middle_wires(points: ImagePoints, phantom: WirePhantom) -> MiddleWires:
         places.append(crossings[0] + share[:, None] * (crossings[1] - crossings[0]))
     index = np.concatenate([np.zeros(0, dtype=np.int64), *middles])
     order = np.argsort(points.frame[index], kind="stable")
-    return MiddleWires(points[index[order]], np.concatenate([np.zeros((0, 3)), *places])[order])
+    return points[index[order]], np.concatenate([np.zeros((0, 3)), *places])[order]
 
 
 def nwire_errors_mm(
@@ -125,9 +116,9 @@ def nwire_errors_mm(
     InvalidInputError
         If the points have no wires.
     """
-    middle = middle_wires(points, phantom)
-    seen = middle.points.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
-    expected = (middle.points.world_from_sensor.inv() * world_from_phantom).apply(middle.phantom_mm)
+    middle, phantom_mm = middle_wires(points, phantom)
+    seen = middle.pixels @ sensor_from_pixels[:3, :2].T + sensor_from_pixels[:3, 3]
+    expected = (middle.world_from_sensor.inv() * world_from_phantom).apply(phantom_mm)
     return np.asarray(np.linalg.norm(seen - expected, axis=1))
 
 
@@ -164,14 +155,14 @@ def start_from_nwires(
     pose = phantom.world_from_phantom
     if pose is None:
         pose = _phantom_pose(points, phantom, pixel_mm)
-    middle = middle_wires(points, phantom)
-    if len(middle.points) < _FEWEST_POINTS:
+    middle, phantom_mm = middle_wires(points, phantom)
+    if len(middle) < _FEWEST_POINTS:
         raise InsufficientDataError(
-            f"expected at least {_FEWEST_POINTS} middle dots of N to start from, got {len(middle.points)}"
+            f"expected at least {_FEWEST_POINTS} middle dots of N to start from, got {len(middle)}"
         )
-    equations = np.broadcast_to(np.eye(3), (len(middle.points), 3, 3)), middle.phantom_mm
+    equations = np.broadcast_to(np.eye(3), (len(middle), 3, 3)), phantom_mm
     weights = partial(cauchy_weights, limit=_FAR)
-    return wire_start(middle.points, equations, pose.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
+    return wire_start(middle, equations, pose.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
 
 
 def label_and_start(
@@ -180,7 +171,7 @@ def label_and_start(
     world_from_sensor: RigidTransform,
     pixel_mm: npt.ArrayLike,
     settings: LabelSettings | None = None,
-) -> tuple[LabelledDots, Chain]:
+) -> tuple[Seen, Chain]:
     """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
 
     Parameters
@@ -195,14 +186,16 @@ def label_and_start(
     InsufficientDataError, InvalidInputError
         See `label_dots` and `start_from_nwires`.
     """
+    if len(dots.frame) and dots.frame[-1] >= len(world_from_sensor):
+        raise MismatchError(f"expected a pose for frame {dots.frame[-1]}, got {len(world_from_sensor)} poses")
     alone = label_dots(dots, phantom, pixel_mm, settings)
     if len(alone) == 0:
         reasons = sorted(set(alone.dropped.values())) or ["no frames"]
         raise InsufficientDataError(f"expected frames that show all wires, got none: {reasons[0]}")
-    start = start_from_nwires(alone.points(world_from_sensor), phantom, pixel_mm)
+    start = start_from_nwires(alone.points(world_from_sensor[alone.frame]), phantom, pixel_mm)
     found = label_by_calibration(dots, phantom, start, world_from_sensor, settings)
     registered = replace(phantom, world_from_phantom=start.target_from_world.inv())
-    return found, start_from_nwires(found.points(world_from_sensor), registered)
+    return found, start_from_nwires(found.points(world_from_sensor[found.frame]), registered)
 
 
 def _wires(points: ImagePoints, phantom: WirePhantom) -> IntArray:
@@ -241,8 +234,10 @@ def _phantom_pose(
     if len(index) < 3:
         raise InsufficientDataError(f"expected all wires in at least 3 frames, got {len(index)}")
     seen = points.pixels[index] * np.asarray(pixel_mm, dtype=float)
-    fits = rigid_fits(seen, np.tile(np.array(wires), (len(index), 1)), phantom, scale_tolerance=0.05)
-    return _shared_pose(fits.phantom_from_image, points.world_from_sensor[index[:, 0]])
+    phantom_from_image, _, _ = rigid_fits(
+        seen, np.tile(np.array(wires), (len(index), 1)), phantom, scale_tolerance=0.05
+    )
+    return _shared_pose(phantom_from_image, points.world_from_sensor[index[:, 0]])
 
 
 def _shared_pose(phantom_from_image: RigidTransform, world_from_sensor: RigidTransform) -> RigidTransform:

@@ -31,14 +31,7 @@ from calibration.chain import (
     residuals_and_jacobian,
 )
 from calibration.identifiability import judge, require_adequate
-from calibration.starts import (
-    Angles,
-    angle_starts,
-    distance_start,
-    hemisphere,
-    in_plane_mirror,
-    rotation_to_z,
-)
+from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (
@@ -329,9 +322,7 @@ def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
     """The first two stages: angles from some directions, then distances. The caller refines all together."""
     directions = as_directions(lines.of_some_frames(SOME_FRAMES))
     chain = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
-    normal = chain.target_from_world.rotation.as_matrix()[2]
-    seen = float(chain.pixel_mm[0] / chain.pixel_mm[1])
-    return _with_distances(lines, Angles(chain.sensor_from_image.rotation, normal, seen), pixel_mm)
+    return _with_distances(lines, chain, pixel_mm)
 
 
 def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
@@ -351,9 +342,10 @@ def _ratio(pixel_mm: FloatArray | None) -> float:
     return 1.0 if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
 
 
-def _with_distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> Chain:
+def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> Chain:
     """Second stage, for the image and its in-plane mirror, which distances tell apart."""
-    mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
+    turned = RigidTransform.from_rotation(in_plane_mirror(angles.sensor_from_image.rotation))
+    mirror = replace(angles, sensor_from_image=turned)
     found = [distance_start(lines, either, pixel_mm) for either in (angles, mirror)]
     return min(found, key=lambda pair: pair[1])[0]
 
@@ -368,14 +360,11 @@ def settled_angles(
     lines : ImagePoints
         With directions for pixels (`as_directions`).
     """
-    size = np.array([ratio, 1.0])
-    phantom = LineDirections(size, level)
+    phantom = LineDirections(np.array([ratio, 1.0]), level)
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
     best, least = None, np.inf
     for start in angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals):
-        upright = Rotation.identity() if level else rotation_to_z(start.normal)
-        chain = Chain(size, *(RigidTransform.from_rotation(r) for r in (start.sensor_from_image, upright)))
-        chain = _first_guess(lines, phantom, chain, free)
+        chain = _first_guess(lines, phantom, start, free)
         sigma = _sigma(_residuals(lines, phantom, chain))
         agreed = abs(sigma - least) < _SAME * least
         if sigma < least:

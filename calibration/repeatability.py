@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.chain import Chain, ChainSolution, ImagePoints, as_directions, residuals_and_jacobian
+from calibration.chain import ChainSolution, ImagePoints, as_directions, residuals_and_jacobian
 from calibration.plane import solve_chain
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration
@@ -97,26 +97,7 @@ def _centre_and_corners(calibration: Calibration, size_px: tuple[int, int]) -> F
     return np.asarray((flat @ calibration.pixel_matrix().T)[:, :3])
 
 
-@dataclass(frozen=True)
-class Validation:
-    """How well a calibration explains a recording that it was not made from.
-
-    Attributes
-    ----------
-    residuals : ndarray, shape (n, r)
-        Of all points, none left out, mm (sines of angles for directions).
-    """
-
-    chain: Chain
-    residuals: FloatArray
-
-    @property
-    def rms(self) -> float:
-        """Root mean square residual."""
-        return float(np.sqrt(np.mean(self.residuals**2)))
-
-
-def validate(solution: ChainSolution, points: ImagePoints) -> Validation:
+def validate(solution: ChainSolution, points: ImagePoints) -> FloatArray:
     """Hold a calibration and see how well it explains another recording.
 
     The plane's position is estimated anew, for it may be another plane, unless it is level; wires are held
@@ -127,6 +108,11 @@ def validate(solution: ChainSolution, points: ImagePoints) -> Validation:
     points : ImagePoints
         Dots, or two points of each line.
 
+    Returns
+    -------
+    ndarray, shape (n, r)
+        Residuals of all points, none left out, mm (sines of angles for directions).
+
     Raises
     ------
     InsufficientDataError
@@ -135,6 +121,5 @@ def validate(solution: ChainSolution, points: ImagePoints) -> Validation:
     chain, phantom = solution.chain, solution.phantom
     points = as_directions(points) if solution.angular else points
     if phantom.seen_as != "dot" and phantom.determined:
-        found = solve_chain(points, phantom, chain, probe=(), outlier_sigma=np.inf)
-        return Validation(found.chain, found.residuals)
-    return Validation(chain, residuals_and_jacobian(chain.parameters(), points, phantom)[0])
+        return solve_chain(points, phantom, chain, probe=(), outlier_sigma=np.inf).residuals
+    return residuals_and_jacobian(chain.parameters(), points, phantom)[0]

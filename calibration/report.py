@@ -204,6 +204,8 @@ def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequ
     _draw_residuals(panels[1, 0], solution)
     _draw_against_tilt(panels[1, 1], solution)
     _draw_motion(panels[1, 2], solution)
+    for axes in panels[1]:
+        axes.grid(alpha=0.3)
     figure.suptitle(calibration.verdict, fontsize=10)
     return figure
 
@@ -237,7 +239,7 @@ def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     if used.any():
         reach = 8.0 * float(np.abs(values[used]).std() + 1e-12)
         axes.set_ylim(-reach, reach)
-    _label(axes, "frame", f"residual / {unit}")
+    axes.set(xlabel="frame", ylabel=f"residual / {unit}")
 
 
 def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
@@ -246,14 +248,14 @@ def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)
     used = solution.used
     axes.plot(turns[used, 0], values[used], ".", color=USED, ms=3)
-    _label(axes, "tilt / deg", f"residual / {unit}")
+    axes.set(xlabel="tilt / deg", ylabel=f"residual / {unit}")
 
 
 def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
-    _label(axes, "tilt / deg", "roll / deg")
+    axes.set(xlabel="tilt / deg", ylabel="roll / deg")
 
 
 def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:
@@ -267,9 +269,3 @@ def _turns_deg(solution: ChainSolution) -> FloatArray:
     """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
     turns = solution.chain.target_from_image(solution.points).rotation
     return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(alpha=0.3)

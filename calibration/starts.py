@@ -13,7 +13,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -42,21 +41,6 @@ _DOT_MM = 0.3
 """How far a dot is from its wire, typically: what the pixel size's uncertainty is weighed against."""
 
 
-@dataclass(frozen=True)
-class Angles:
-    """A start for the angles.
-
-    Attributes
-    ----------
-    ratio : float
-        Column pitch over row spacing.
-    """
-
-    sensor_from_image: Rotation
-    normal: FloatArray
-    ratio: float
-
-
 def hemisphere() -> FloatArray:
     """Unit vectors spread evenly over the hemisphere z >= 0, the pole first, shape (30, 3)."""
     k = np.arange(_NORMALS)
@@ -83,8 +67,8 @@ def rotations_all_over() -> Rotation:
 
 def angle_starts(
     directions_px: FloatArray, world_from_sensor: Rotation, ratio: float, normals: FloatArray, keep: int = 4
-) -> list[Angles]:
-    """Try mountings of the sensor and normals of the plane all over, and keep the best.
+) -> list[Chain]:
+    """Try mountings of the sensor and normals of the plane all over, and keep the best; no distances.
 
     Parameters
     ----------
@@ -93,6 +77,7 @@ def angle_starts(
     world_from_sensor : Rotation, length m
     ratio : float
         Column pitch over row spacing.
+        The chains have it as their pixel size, with a row spacing of one.
     normals : ndarray, shape (k, 3)
     """
     length = directions_px * [ratio, 1.0]
@@ -107,7 +92,11 @@ def angle_starts(
     costs = np.abs(sines).mean(axis=2)
     best = np.argsort(costs, axis=None)[:keep]
     return [
-        Angles(tried[int(j)], normals[k], ratio)
+        Chain(
+            np.array([ratio, 1.0]),
+            RigidTransform.from_rotation(tried[int(j)]),
+            RigidTransform.from_rotation(rotation_to_z(normals[k])),
+        )
         for j, k in zip(*np.unravel_index(best, costs.shape), strict=True)
     ]
 
@@ -122,13 +111,13 @@ def rotation_to_z(normal: FloatArray) -> Rotation:
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0]
 
 
-def distance_start(points: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> tuple[Chain, float]:
+def distance_start(points: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> tuple[Chain, float]:
     """Find the distances that belong to given angles, by linear least squares.
 
     Parameters
     ----------
     pixel_mm : ndarray, shape (2,), optional
-        Column pitch and row spacing; estimated without it, from the ratio in `angles`.
+        Column pitch and row spacing; estimated without it, from the ratio of those in `angles`.
 
     Returns
     -------
@@ -136,23 +125,24 @@ def distance_start(points: ImagePoints, angles: Angles, pixel_mm: FloatArray | N
     cost : float
         Median absolute height of the points above the plane, mm.
     """
-    up = angles.normal @ points.turns
-    square = np.array([angles.ratio, 1.0]) if pixel_mm is None else pixel_mm
-    image = (points.pixels * square) @ angles.sensor_from_image.as_matrix()[:, :2].T
+    turned = angles.sensor_from_image.rotation
+    normal = angles.target_from_world.rotation.as_matrix()[2]
+    up = normal @ points.turns
+    square = angles.pixel_mm / angles.pixel_mm[1] if pixel_mm is None else pixel_mm
+    image = (points.pixels * square) @ turned.as_matrix()[:, :2].T
     height = np.einsum("ni,ni->n", up, image)
     one = np.ones((len(points), 1))
     unknown = np.concatenate([up, one] if pixel_mm is not None else [up, one, height[:, None]], axis=1)
-    wanted = -points.shifts_mm @ angles.normal - (height if pixel_mm is not None else 0.0)
+    wanted = -points.shifts_mm @ normal - (height if pixel_mm is not None else 0.0)
     fit = robust_linear(unknown, wanted, NEARLY_ABSOLUTE, _REWEIGHTINGS)
     found = fit.parameters
     size = square * (1.0 if pixel_mm is not None else found[4])
-    turned = angles.sensor_from_image
     if size[1] < 0:
         turned, size = in_plane_mirror(turned), -size
     chain = Chain(
         size,
         RigidTransform.from_components(found[:3], turned),
-        RigidTransform.from_components([0.0, 0.0, found[3]], rotation_to_z(angles.normal)),
+        RigidTransform.from_components([0.0, 0.0, found[3]], rotation_to_z(normal)),
     )
     return chain, float(np.median(np.abs(fit.residuals)))
 
@@ -219,25 +209,6 @@ def wire_start(
     return Chain(size, probe, shift * known), fit
 
 
-@dataclass(frozen=True)
-class ImageFits:
-    """Poses of images in a phantom's frame.
-
-    Attributes
-    ----------
-    phantom_from_image : RigidTransform, length b
-        Of images whose pixel size is as found.
-    scale : ndarray, shape (b, 2)
-        Found pixel size over the one given.
-    rms_mm : ndarray, shape (b,)
-        Of the components of the dots' distances from their wires.
-    """
-
-    phantom_from_image: RigidTransform
-    scale: FloatArray
-    rms_mm: FloatArray
-
-
 def free_fits(
     positions_mm: FloatArray, wires: IntArray, phantom: WirePhantom
 ) -> tuple[FloatArray, FloatArray]:
@@ -268,13 +239,22 @@ def free_fits(
 
 def rigid_fits(
     positions_mm: FloatArray, wires: IntArray, phantom: WirePhantom, scale_tolerance: float
-) -> ImageFits:
+) -> tuple[RigidTransform, FloatArray, FloatArray]:
     """Fit poses of images whose pixel size is known to `scale_tolerance`, as a standard deviation.
 
     Parameters
     ----------
     positions_mm, wires
         See `free_fits`; positions count from the image's origin.
+
+    Returns
+    -------
+    phantom_from_image : RigidTransform, length b
+        Of images whose pixel size is as found.
+    scale : ndarray, shape (b, 2)
+        Found pixel size over the one given.
+    rms_mm : ndarray, shape (b,)
+        Of the components of the dots' distances from their wires.
     """
     centre = positions_mm.mean(axis=1)
     seen = positions_mm - centre[:, None]
@@ -296,7 +276,7 @@ def rigid_fits(
     scale = np.exp(log_scale)
     corner = origin - np.einsum("bij,bj->bi", turn[:, :, :2], centre * scale)
     pose = RigidTransform.from_components(corner, Rotation.from_matrix(turn))
-    return ImageFits(pose, scale, np.sqrt(np.mean(residual**2, axis=1)))
+    return pose, scale, np.sqrt(np.mean(residual**2, axis=1))
 
 
 def _affine_equations(places: FloatArray, rows: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, Phantom, SeenAs
+from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, SeenAs
 from calibration.identifiability import require_adequate
 from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
 from calibration.starts import rotations_all_over, wire_start
@@ -88,8 +88,9 @@ def calibrate_cross_wire(
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
     _require_frames(points)
+    probe, held = probe_parameters(fit_pixels, pixel_mm)
     start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
-    return _finished(points, CrossWire(), start, pixel_mm, fit_pixels, outlier_sigma)
+    return require_adequate(solve_chain(points, CrossWire(), _sized(start, held), probe, outlier_sigma))
 
 
 def calibrate_wires(
@@ -124,6 +125,7 @@ def calibrate_wires(
             f"registration: expected one of {', '.join(_ESTIMATED)}, got {registration!r}"
         )
     _require_frames(points)
+    probe, held = probe_parameters(fit_pixels, pixel_mm)
     centred = _about_middle(geometry)
     place = centred.world_from_phantom
     if place is not None:
@@ -131,8 +133,8 @@ def calibrate_wires(
         start, _ = wire_start(points, phantom.vanishing(points), place.inv())
     else:
         phantom = Wires(centred)
-        start = _anywhere(points.of_some_frames(SOME_FRAMES), phantom, pixel_mm, fit_pixels)
-    return _finished(points, phantom, start, pixel_mm, fit_pixels, outlier_sigma)
+        start = _anywhere(points.of_some_frames(SOME_FRAMES), phantom, held, probe)
+    return require_adequate(solve_chain(points, phantom, _sized(start, held), probe, outlier_sigma))
 
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
@@ -145,26 +147,13 @@ def _about_middle(geometry: WirePhantom) -> WirePhantom:
     return replace(geometry, points_mm=geometry.points_mm - middle, ends_mm=shifted, world_from_phantom=moved)
 
 
-def _anywhere(few: ImagePoints, phantom: Wires, pixel_mm: FloatArray | None, fit_pixels: bool) -> Chain:
+def _anywhere(few: ImagePoints, phantom: Wires, held: FloatArray | None, probe: tuple[str, ...]) -> Chain:
     """Best start among orientations of the phantom spread over all rotations."""
-    probe, held = probe_parameters(fit_pixels, pixel_mm)
     equations = phantom.vanishing(few)
     tried = [wire_start(few, equations, turn) for turn in rotations_all_over()]
     best = sorted(tried, key=lambda one: float(np.median(np.abs(one[1].residuals))))[:_STARTS]
     settled = [solve_chain(few, phantom, _sized(chain, held), probe, np.inf) for chain, _ in best]
     return min(settled, key=lambda solution: solution.sigma).chain
-
-
-def _finished(
-    points: ImagePoints,
-    phantom: Phantom,
-    start: Chain,
-    pixel_mm: FloatArray | None,
-    fit_pixels: bool,
-    outlier_sigma: float,
-) -> ChainSolution:
-    probe, held = probe_parameters(fit_pixels, pixel_mm)
-    return require_adequate(solve_chain(points, phantom, _sized(start, held), probe, outlier_sigma))
 
 
 def _sized(start: Chain, pixel_mm: FloatArray | None) -> Chain:

@@ -17,9 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy import ndimage
 from skimage.feature import peak_local_max
 
+from calibration.chain import Seen
 from calibration.detection.region import checked_pixel, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError, MismatchError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import Frames
@@ -78,17 +79,6 @@ class Dots:
     pixels: FloatArray
     score: FloatArray
     dropped: dict[int, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        n = len(self.frame)
-        if self.pixels.shape != (n, 2) or self.score.shape != (n,):
-            raise MismatchError(f"dots: expected {n} of each, got pixels of shape {self.pixels.shape}")
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def __getitem__(self, chosen: BoolArray | IntArray) -> Dots:
-        return Dots(self.frame[chosen], self.pixels[chosen], self.score[chosen], self.dropped)
 
 
 def dots_in_image(
@@ -167,7 +157,7 @@ def dots_in_frames(
     )
 
 
-def single_dots(dots: Dots, clear: float = 1.5) -> Dots:
+def single_dots(dots: Dots, clear: float = 1.5) -> Seen:
     """Keep the strongest dot of each frame, where images show one wire or one crossing of wires.
 
     Parameters
@@ -180,8 +170,8 @@ def single_dots(dots: Dots, clear: float = 1.5) -> Dots:
     after = np.where(follows, np.append(dots.score[1:], 0.0)[first], 0.0)
     kept = dots.score[first] >= clear * after
     unclear = {int(i): "no dot clearly the strongest" for i in dots.frame[first[~kept]]}
-    one = dots[first[kept]]
-    return Dots(one.frame, one.pixels, one.score, {**dots.dropped, **unclear})
+    one = first[kept]
+    return Seen(dots.frame[one], dots.pixels[one], dropped={**dots.dropped, **unclear})
 
 
 def _dots(

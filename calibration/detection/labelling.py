@@ -13,18 +13,18 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from calibration.chain import Chain, ImagePoints
+from calibration.chain import Chain, Seen
 from calibration.detection.dots import Dots
 from calibration.starts import free_fits, rigid_fits
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
 
 _STEEPEST = 2.0
@@ -56,46 +56,9 @@ class LabelSettings(BaseModel):
     )
 
 
-@dataclass(frozen=True)
-class LabelledDots:
-    """Dots with the wires they show.
-
-    Attributes
-    ----------
-    frame : ndarray of int, shape (n,)
-        Ascending.
-    pixels : ndarray, shape (n, 2)
-    wire : ndarray of int, shape (n,)
-        Number of the wire in the phantom.
-    dropped : dict of int to str
-        Why other frames have none.
-    """
-
-    frame: IntArray
-    pixels: FloatArray
-    wire: IntArray
-    dropped: dict[int, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        n = len(self.frame)
-        if self.pixels.shape != (n, 2) or self.wire.shape != (n,):
-            raise MismatchError(f"dots: expected {n} of each, got pixels of shape {self.pixels.shape}")
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def points(self, world_from_sensor: RigidTransform) -> ImagePoints:
-        """The dots with the sensor's pose in their frames; one pose for each frame of the sequence."""
-        if len(self) and int(self.frame.max()) >= len(world_from_sensor):
-            raise MismatchError(
-                f"expected a pose for frame {int(self.frame.max())}, got {len(world_from_sensor)} poses"
-            )
-        return ImagePoints(self.pixels, self.frame, world_from_sensor[self.frame], self.wire)
-
-
 def label_dots(
     dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike, settings: LabelSettings | None = None
-) -> LabelledDots:
+) -> Seen:
     """Assign dots to the wires of an N-wire phantom, each frame by itself.
 
     Parameters
@@ -105,7 +68,7 @@ def label_dots(
 
     Returns
     -------
-    LabelledDots
+    Seen
         All wires of all N in each frame, or none. Where a phantom's symmetry leaves a choice, its first
         pattern is taken to be uppermost and its first wire on the side of the last column.
 
@@ -125,7 +88,7 @@ def label_dots(
             found[int(frame)] = dots.pixels[here][chosen]
         except InsufficientDataError as error:
             dropped[int(frame)] = str(error)
-    return LabelledDots(
+    return Seen(
         frame=np.repeat(np.array(list(found), dtype=np.int64), wires.size),
         pixels=np.concatenate([np.zeros((0, 2)), *found.values()]),
         wire=np.tile(wires, len(found)),
@@ -139,7 +102,7 @@ def label_by_calibration(
     chain: Chain,
     world_from_sensor: RigidTransform,
     settings: LabelSettings | None = None,
-) -> LabelledDots:
+) -> Seen:
     """Assign to each wire the dot nearest to where a calibration predicts it.
 
     Parameters
@@ -151,7 +114,7 @@ def label_by_calibration(
 
     Returns
     -------
-    LabelledDots
+    Seen
         The wires found in each frame.
     """
     s = settings or LabelSettings()
@@ -166,7 +129,7 @@ def label_by_calibration(
         if not pairs:
             dropped[int(frame)] = "no dot where the calibration expects a wire"
     frames, index, wires = np.array(kept, dtype=np.int64).reshape(-1, 3).T
-    return LabelledDots(frames, dots.pixels[index], wires, dropped)
+    return Seen(frames, dots.pixels[index], wires, dropped)
 
 
 @dataclass(frozen=True)
@@ -216,11 +179,11 @@ def _label(
     wires = np.concatenate([layer.wires for layer in layers])
     loose = free_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
     chosen = chosen[np.argsort(loose)[:_REFINED]]
-    fits = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
-    best = float(fits.rms_mm.min())
+    _, _, rms_mm = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
+    best = float(rms_mm.min())
     if best > s.residual_mm:
         raise InsufficientDataError("no dots fit the wires")
-    like = np.flatnonzero(fits.rms_mm <= best + _LIKE_MM)
+    like = np.flatnonzero(rms_mm <= best + _LIKE_MM)
     # Rounded, so that where the same dots fit either way round, the usual one is chosen.
     strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
     usual = [-_unusual(dots_mm[chosen[i]]) for i in like]

@@ -7,13 +7,14 @@ of these edges agree with. A frame in which too few agree is dropped, with the r
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from calibration.chain import Seen
 from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
 from calibration.detection.region import (
     DENSELY,
@@ -23,7 +24,7 @@ from calibration.detection.region import (
     without_blank_sides,
     without_standing,
 )
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.core.sweep import Frames
@@ -108,31 +109,6 @@ class EchoLine:
     inlier_px: FloatArray
 
 
-@dataclass(frozen=True)
-class EchoLines:
-    """The lines of a sequence.
-
-    Attributes
-    ----------
-    frame : ndarray of int, shape (m,)
-        Numbers of the frames with a line, ascending.
-    points_px : ndarray, shape (m, 2, 2)
-    point_sd_mm, direction_sd_rad : ndarray, shape (m,)
-        See `EchoLine`.
-    dropped : dict of int to str
-        Why each other frame has none.
-    """
-
-    frame: IntArray
-    points_px: FloatArray
-    point_sd_mm: FloatArray
-    direction_sd_rad: FloatArray
-    dropped: dict[int, str] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return int(self.frame.size)
-
-
 def detect_line(
     image: npt.NDArray[Any],
     pixel_mm: npt.ArrayLike,
@@ -159,10 +135,8 @@ def detect_line(
         If an argument is not what it must be.
     """
     s = settings or LineSettings()
-    if image.ndim != 2:
-        raise InvalidInputError(f"image: expected shape (column, row), got {image.shape}")
-    if not np.isrealobj(image):
-        raise InvalidInputError(f"image: expected real values, got {image.dtype}")
+    if image.ndim != 2 or not np.isrealobj(image):
+        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
     pixel = checked_pixel(pixel_mm)
     if region_px is None:
         dense = lay_columns(image.shape, DENSELY * s.columns, None)
@@ -178,7 +152,7 @@ def detect_lines(
     settings: LineSettings | None = None,
     region_px: npt.ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> EchoLines:
+) -> Seen:
     """Find the line of a plane's echo in every frame, read one at a time.
 
     Without a region, columns in which nothing ever changes are left out, and so is what stands still above
@@ -207,24 +181,18 @@ def detect_lines(
     if region_px is None and frames.shape[0] > 0:
         dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
         columns = without_standing(dense, frames, s.smoothing_mm / pixel[1]).thinned(s.columns)
-    found: dict[int, EchoLine] = {}
+    found: dict[int, FloatArray] = {}
     dropped: dict[int, str] = {}
     count = frames.shape[0]
     for index in range(count):
         try:
-            found[index] = _detect(frames[index], pixel, s, columns)
+            found[index] = _detect(frames[index], pixel, s, columns).points_px
         except NoLineError as error:
             dropped[index] = str(error)
         if progress:
             progress(index + 1, count)
-    lines = list(found.values())
-    return EchoLines(
-        frame=np.array(list(found), dtype=np.int64),
-        points_px=np.reshape([line.points_px for line in lines], (-1, 2, 2)),
-        point_sd_mm=np.array([line.point_sd_mm for line in lines]),
-        direction_sd_rad=np.array([line.direction_sd_rad for line in lines]),
-        dropped=dropped,
-    )
+    points = np.reshape(list(found.values()), (-1, 2, 2))
+    return Seen(np.array(list(found), dtype=np.int64), points, dropped=dropped)
 
 
 @dataclass(frozen=True)
@@ -248,7 +216,11 @@ class _Candidate:
 
 def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
     samples = np.asarray(image[columns.column], np.float32)
-    _require_content(samples[columns.inside])
+    held = samples[columns.inside]
+    if not np.isfinite(held).all():
+        raise NoLineError("no line: the image holds values that are not finite")
+    if held.size == 0 or np.ptp(held) == 0:
+        raise NoLineError("no line: the image is of one level all over")
     tolerance = s.tolerance_mm / float(pixel_mm[1])
     profiles = take_profiles(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
     if s.threshold is None:
@@ -289,13 +261,6 @@ def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -
     depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
     upper = [line for line in lines if depths.get(id(line), np.inf) <= min(depths.values()) + tolerance]
     return max(upper, key=lambda line: line.agreed)
-
-
-def _require_content(held: Float32Array) -> None:
-    if not np.isfinite(held).all():
-        raise NoLineError("no line: the image holds values that are not finite")
-    if held.size == 0 or np.ptp(held) == 0:
-        raise NoLineError("no line: the image is of one level all over")
 
 
 def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:

@@ -78,7 +78,11 @@ def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    mask = np.asarray(polygon2mask(shape, _checked_region(region_px)))
+    region = np.asarray(region_px, dtype=float)
+    if region.ndim != 2 or region.shape[0] < 3 or region.shape[1] != 2:
+        raise InvalidInputError(f"region_px: expected shape (k, 2) with k of 3 or more, got {region.shape}")
+    require_finite(region, "region_px")
+    mask = np.asarray(polygon2mask(shape, region))
     if not mask.any():
         raise InvalidInputError(
             f"region_px: expected a polygon that covers part of the {shape[0]} x {shape[1]} pixels, got none"
@@ -154,11 +158,3 @@ def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
     if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
         raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
     return pixel
-
-
-def _checked_region(region_px: npt.ArrayLike) -> FloatArray:
-    region = np.asarray(region_px, dtype=float)
-    if region.ndim != 2 or region.shape[0] < 3 or region.shape[1] != 2:
-        raise InvalidInputError(f"region_px: expected shape (k, 2) with k of 3 or more, got {region.shape}")
-    require_finite(region, "region_px")
-    return region

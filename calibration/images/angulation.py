@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
@@ -130,7 +130,8 @@ def angulation(
     blocks, overlap = _both_ways(one, other, corners_mm)
     if max(overlap) < _LEAST_OVERLAP:
         # A bad start puts sweeps of one place apart, but hardly changes the angles between them.
-        blocks, _ = _both_ways(one, _moved_onto(other, one, centre), corners_mm)
+        apart = one.apply(centre).mean(axis=0) - other.apply(centre).mean(axis=0)
+        blocks, _ = _both_ways(one, RigidTransform.from_translation(apart) * other, corners_mm)
     if not len(blocks):
         raise InsufficientDataError(
             "expected two sweeps of one place, got images that nowhere reach the planes of the other sweep's"
@@ -172,12 +173,6 @@ def _both_ways(
     return np.concatenate([first[seen], second[seen_back]]), shares
 
 
-def _moved_onto(other: RigidTransform, one: RigidTransform, centre_mm: FloatArray) -> RigidTransform:
-    """A sweep shifted so that the mean of its images' centres is that of another's."""
-    apart = one.apply(centre_mm).mean(axis=0) - other.apply(centre_mm).mean(axis=0)
-    return RigidTransform.from_translation(apart) * other
-
-
 def _disagreements(
     one: RigidTransform, other: RigidTransform, corners_mm: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
@@ -191,7 +186,9 @@ def _disagreements(
     for frame in chosen:
         world = one[frame].apply(points)
         seen = np.stack([other[k].inv().apply(world) for k in range(len(other))])
-        nearest, passes = _passing(seen[..., 2])
+        away = seen[..., 2]
+        nearest = np.abs(away).argmin(axis=0)
+        passes = (away.min(axis=0) <= 0.0) & (away.max(axis=0) >= 0.0)
         local = seen[nearest, np.arange(len(points))]
         there = other.as_matrix()[nearest][:, :3, :3]
         here = one[frame].rotation.as_matrix()
@@ -200,13 +197,6 @@ def _disagreements(
         blocks.append(block)
         inside.append(passes & (np.abs(local - centre)[:, :2] <= half[:2] + 1e-9).all(axis=1))
     return np.concatenate(blocks), np.concatenate(inside)
-
-
-def _passing(distance_mm: FloatArray) -> tuple[IntArray, BoolArray]:
-    """The frame of a sweep whose plane is nearest to each point, and whether the sweep passes the point."""
-    nearest = np.abs(distance_mm).argmin(axis=0)
-    passes = (distance_mm.min(axis=0) <= 0.0) & (distance_mm.max(axis=0) >= 0.0)
-    return nearest, np.asarray(passes)
 
 
 def _with_others_free(information: FloatArray) -> FloatArray:

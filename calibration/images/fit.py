@@ -17,10 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.angulation import PARAMETERS, point_motion
-from calibration.images.similarity import Comparison, Similarity
+from calibration.images.angulation import PARAMETERS
+from calibration.images.similarity import Comparison, Estimate, Similarity
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -62,27 +61,6 @@ squares of the errors in six simulated pairs of sweeps, whatever the start; a th
 beside the image plane too deep."""
 
 NAMES = (*PARAMETERS, "lateral pixel size", "axial pixel size")
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A calibration during the fit.
-
-    Attributes
-    ----------
-    scales : ndarray, shape (2,)
-        Factors on the pixel sizes, lateral and axial.
-    """
-
-    sensor_from_image: RigidTransform
-    scales: FloatArray
-
-    def stepped(self, step: FloatArray, pivot_mm: FloatArray) -> Estimate:
-        """Turn about a point of the image and displace it, in the image's own frame; then rescale."""
-        turn = Rotation.from_rotvec(step[:3])
-        shift = pivot_mm + step[3:6] - turn.apply(pivot_mm)
-        moved = self.sensor_from_image * RigidTransform.from_components(shift, turn)
-        return Estimate(moved, self.scales * (1.0 + step[6:8]))
 
 
 @dataclass(frozen=True)
@@ -138,7 +116,7 @@ def refine(
     chosen = np.array(free)
 
     def look(estimate: Estimate) -> Similarity:
-        return comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
+        return comparison.at(estimate, True, pool)
 
     estimate, here = start, look(start)
     weight = weights(here)
@@ -200,22 +178,8 @@ def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     return bool(base @ loss[1] < base @ loss[0])
 
 
-@dataclass(frozen=True)
-class Settled:
-    """An answer with the curvature of the similarity about it.
-
-    Attributes
-    ----------
-    curvature : ndarray, shape (f, f)
-        Of the weighted similarity, by the free parameters at the pivot; positive definite.
-    """
-
-    refined: Refined
-    curvature: FloatArray
-
-
-def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
-    """Take Newton steps from where Gauss-Newton stopped, all with the curvature there."""
+def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> tuple[Refined, FloatArray]:
+    """Take Newton steps from where Gauss-Newton stopped, all with the curvature there; return that, too."""
     bend = curvature(refined, pool)
     now, converged = refined, False
     for _ in range(_MOST_STEPS):
@@ -230,7 +194,7 @@ def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Settled:
             converged = size < 10.0 * SETTLED  # no better within rounding
             break
         now = moved
-    return Settled(replace(now, converged=converged), bend)
+    return replace(now, converged=converged), bend
 
 
 def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> FloatArray:
@@ -243,7 +207,7 @@ def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Float
             step = np.zeros(len(LEVERS_MM))
             step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
             there = refined.estimate.stepped(step, refined.pivot_mm)
-            seen = refined.comparison.at(there.sensor_from_image, there.scales, True, pool)
+            seen = refined.comparison.at(there, True, pool)
             weight = np.where(seen.valid, refined.weight, 0.0)
             slopes.append((base.T @ (weight @ seen.gradient))[chosen])
         found[:, column] = (slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM)
@@ -252,7 +216,7 @@ def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Float
 
 def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None) -> Refined:
     estimate = refined.estimate.stepped(step, refined.pivot_mm)
-    seen = refined.comparison.at(estimate.sensor_from_image, estimate.scales, True, pool)
+    seen = refined.comparison.at(estimate, True, pool)
     count = refined.evaluations + 1
     return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)
 
@@ -265,16 +229,9 @@ def _positive(found: FloatArray, normal: FloatArray) -> FloatArray:
     return np.asarray((back * np.maximum(part, LEAST_CURVATURE)) @ back.T)
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Covariance of turns, displacements and relative pixel sizes at the image's origin, shape (8, 8)."""
-
-    covariance: FloatArray
-    condition_number: float
-    weakest: str
-
-
-def covariance_at_origin(settled: Settled, unit: float) -> Spread:
+def covariance_at_origin(
+    refined: Refined, curvature: FloatArray, unit: float
+) -> tuple[FloatArray, float, str]:
     """Sandwich of the curvature and the slopes' scatter over blocks of tissue and stretches of images.
 
     Errors that differ between blocks of tissue (speckle, reflections) and between images (poses) are summed.
@@ -283,26 +240,35 @@ def covariance_at_origin(settled: Settled, unit: float) -> Spread:
 
     Parameters
     ----------
+    curvature : ndarray, shape (f, f)
+        Of the weighted similarity, by the free parameters at the pivot; positive definite.
     unit : float
         Size of the images relative to the usual.
+
+    Returns
+    -------
+    covariance : ndarray, shape (8, 8)
+        Of turns, displacements and relative pixel sizes at the image's origin.
+    condition_number : float
+    weakest : str
+        The parameter that makes up most of the least determined direction.
 
     References
     ----------
     .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 5th
        Berkeley Symposium on Mathematical Statistics and Probability, 1967.
     """
-    refined = settled.refined
     chosen = np.array(refined.free)
     base = about_pivot(refined.pivot_mm)[:, chosen]
     slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
-    norms = np.sqrt(np.diag(settled.curvature))
-    values, vectors = np.linalg.eigh(settled.curvature / np.outer(norms, norms))
+    norms = np.sqrt(np.diag(curvature))
+    values, vectors = np.linalg.eigh(curvature / np.outer(norms, norms))
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
     tissue = _scatter(slopes, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
     poses = _scatter(slopes, _numbered(np.column_stack(_stretches(refined))))
-    moved = base @ np.linalg.inv(settled.curvature)
+    moved = base @ np.linalg.inv(curvature)
     covariance = moved @ (tissue + 2.0 * poses) @ moved.T + _shared(refined.pivot_mm, unit)
-    return Spread(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]])
+    return covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]]
 
 
 def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
@@ -334,9 +300,3 @@ def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
     """Sweep, and stretch of `STRETCH` images in it, of each patch."""
     sweep, image = refined.comparison.images.T
     return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
-
-
-def point_covariance(covariance: FloatArray, point_mm: FloatArray) -> FloatArray:
-    """Covariance of a point of the image from that of its pose at the image's origin, shape (3, 3)."""
-    moved = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
-    return np.asarray(moved @ covariance @ moved.T)

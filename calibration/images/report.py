@@ -1,4 +1,4 @@
-"""Figures of a calibration from two crossing sweeps: images beside reslices, similarity about the answer.
+"""A calibration from two crossing sweeps in the form that is saved, with its notes, figure and verdict.
 
 References
 ----------
@@ -8,9 +8,8 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,12 +18,12 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation
-from calibration.images.fit import Estimate
 from calibration.images.search import incremented
-from calibration.images.similarity import CrossingSweeps
+from calibration.images.similarity import Comparison, Estimate
+from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration, Improvement
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.imaging.images import ChosenImages
 from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
@@ -33,142 +32,73 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _REACH_MM = 1.5
 
 IMAGES, SIGMA_MM = 10, 1.0
-"""Images of each sweep, and their blur, in the similarity curves."""
+"""Images of each sweep, and their blur, in the similarity curves and maps."""
+
+CURVES_TO, CURVE_POINTS, MAP_POINTS = 6.0, 25, 13
+"""Reach of the similarity curves and maps in mm and degrees, and how finely they are drawn."""
+
+WEAK_SCALE = 0.01
+"""Relative standard error of an estimated pixel size above which the scanner's own value is better."""
+
+MAPS = (("x", "y"), ("z", "tilt"), ("yaw", "roll"))
+_WORSE = 0.02
+"""Most that the correlation of held-out frames may fall below that at the start: twice what it varies between
+answers from different starts."""
 
 
-@dataclass(frozen=True)
-class SimilarityCurves:
-    """Mean correlation of images with cuts of the other sweep, one parameter moved at a time.
-
-    Attributes
-    ----------
-    offset : ndarray, shape (k,)
-        Degrees for the first three axes, mm for the others.
-    similarity : ndarray, shape (6, k)
-        By `PARAMETERS`; NaN where no image overlaps the other sweep by three tenths.
-    """
-
-    offset: FloatArray
-    similarity: FloatArray
-
-
-@dataclass(frozen=True)
-class SimilarityMap:
-    """Mean correlation with two parameters moved at once, shape (k, k), the first along the first axis."""
-
-    axes: tuple[str, str]
-    offset: FloatArray
-    similarity: FloatArray
-
-
-def similarity_curves(
-    crossing: CrossingSweeps,
-    sensor_from_image: RigidTransform,
-    span: float = 10.0,
-    points: int = 21,
-    scales: FloatArray | None = None,
-    threads: int = 2,
-) -> SimilarityCurves:
-    """Similarity from -`span` to `span` mm or degrees about a calibration, along each of `PARAMETERS`.
-
-    Parameters move the image at its origin, not about its centre.
-    """
-    offset = _offsets(span, points)
-    steps = (step * np.eye(6)[axis] for axis in range(6) for step in offset)
-    found = _similarities(crossing, _estimate(sensor_from_image, scales), steps, threads)
-    return SimilarityCurves(offset, found.reshape(6, points))
+def calibration_from_images(
+    result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
+) -> Calibration:
+    """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
+    counts = [len(each.frame_time_s) for each in sweeps]
+    first, second = result.sweeps.frames_used
+    pose = result.sensor_from_image
+    return Calibration(
+        method="images",
+        sensor="tracker",
+        rotation=pose.rotation,
+        translation_mm=np.asarray(pose.translation),
+        pixel_mm=result.pixel_mm,
+        covariance=result.covariance,
+        parameters=_parameters(result),
+        rms=1.0 - result.held_out.after,
+        rms_unit="",
+        condition_number=result.condition_number,
+        frames=FramesUsed(
+            sum(counts), (*first.tolist(), *(counts[0] + second).tolist()), _uncovered(result, counts)
+        ),
+        time_offset_s=sweeps[0].time_offset_s,
+        verdict=_verdict(result, angulation),
+    )
 
 
-def similarity_map(
-    crossing: CrossingSweeps,
-    sensor_from_image: RigidTransform,
-    axes: tuple[str, str],
-    span: float = 10.0,
-    points: int = 21,
-    scales: FloatArray | None = None,
-    threads: int = 2,
-) -> SimilarityMap:
-    """Similarity over two parameters, named as in `PARAMETERS`."""
-    for name in axes:
-        if name not in PARAMETERS:
-            raise InvalidInputError(f"axes: expected two of {', '.join(PARAMETERS)}, got {name!r}")
-    offset = _offsets(span, points)
-    one, other = (np.eye(6)[PARAMETERS.index(name)] for name in axes)
-    steps = (a * one + b * other for a in offset for b in offset)
-    found = _similarities(crossing, _estimate(sensor_from_image, scales), steps, threads)
-    return SimilarityMap(axes, offset, found.reshape(points, points))
+def notes_of(result: ImageCalibration, angulation: Angulation) -> list[str]:
+    """Lines for the report that show whether the answer is right."""
+    centre = np.sqrt(np.diag(result.covariance_of(result.sweeps.centre_mm)))
+    used, held = result.similarity, result.held_out
+    kept = sum(map(len, result.sweeps.frames_held_out))
+    return [
+        f"correlation of images with the other sweep: {_told(used)}",
+        f"of {kept} frames kept out of it for this check: {_told(held)}",
+        f"image centre known to {centre[0]:.2f}, {centre[1]:.2f} and {centre[2]:.2f} mm across, along the "
+        "beam and out of plane",
+        f"sweeps at {angulation.crossing_deg:.0f} degrees, fans of {angulation.fan_deg[0]:.0f} and "
+        f"{angulation.fan_deg[1]:.0f}; they share {100 * angulation.overlap[0]:.0f} % and "
+        f"{100 * angulation.overlap[1]:.0f} % of their images",
+        "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
+        f"{result.evaluations} comparisons by {result.method}",
+    ]
 
 
-def _similarities(
-    crossing: CrossingSweeps, about: Estimate, steps: Iterator[FloatArray], threads: int
-) -> FloatArray:
-    comparison = crossing.whole(SIGMA_MM, IMAGES, about.sensor_from_image)
-
-    def at(step: FloatArray) -> float:
-        moved = incremented(about, step)
-        return comparison.at(moved.sensor_from_image, moved.scales).mean
-
-    with ThreadPoolExecutor(threads) as pool:
-        return np.array(list(pool.map(at, steps)))
+def _told(gained: Improvement) -> str:
+    before = f"{gained.before:.3f}" if np.isfinite(gained.before) else "no overlap"
+    return f"{before} before, {gained.after:.3f} after"
 
 
-def _offsets(span: float, points: int) -> FloatArray:
-    if not (np.isfinite(span) and span > 0 and points >= 2):
-        raise InvalidInputError(
-            f"expected a span above zero and at least two points, got {span:g} and {points}"
-        )
-    return np.linspace(-span, span, points)
-
-
-def _estimate(sensor_from_image: RigidTransform, scales: FloatArray | None) -> Estimate:
-    return Estimate(sensor_from_image, np.ones(2) if scales is None else scales)
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """An image and what the other sweep shows in its place, at the start and at the answer.
-
-    Attributes
-    ----------
-    image, before, after : ndarray, shape (rows, columns)
-        NaN where nothing is shown.
-    width_mm, height_mm : float
-    title : str
-    """
-
-    image: Float32Array
-    before: Float32Array
-    after: Float32Array
-    width_mm: float
-    height_mm: float
-    title: str
-
-
-def pictures(
-    shown: TrackedImages, other: TrackedImages, frame: int, start: RigidTransform, found: RigidTransform
-) -> Pictures:
-    """Cut the plane of one image out of the other sweep, with either calibration."""
-    grid, frames = shown.grid, other.covered()
-    sensor = shown.world_from_sensor(np.array([frame]))[0]
-    cuts = []
-    for mounting in (start, found):
-        poses = other.world_from_sensor(frames) * mounting
-        plane = image_plane(sensor * mounting, grid, PIXEL_MM)
-        source = ChosenImages(other.images, frames)
-        cuts.append(reslice_frames(source, other.grid, poses, plane, _reach_mm(poses)))
-    own = resample_image(shown.images, frame, grid, PIXEL_MM)
-    height = grid.depth_mm - grid.first_sample_depth_mm
-    return Pictures(own, cuts[0], cuts[1], grid.width_mm, height, f"{shown.name}, frame {frame}")
-
-
-def figure_images(
-    shown: Sequence[Pictures],
-    angulation: Angulation,
-    curves: SimilarityCurves,
-    maps: Sequence[SimilarityMap],
-    title: str,
+def figure_of(
+    result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
 ) -> Figure:
-    """One page: images beside reslices before and after, similarity curves and maps, strength of the sweeps.
+    """One page: images beside reslices before and after, similarity about the answer, what errors would do.
 
     The maps are Figure 4 of [1]_.
 
@@ -176,28 +106,85 @@ def figure_images(
     ----------
     .. [1] Wein and Khamene, SPIE Medical Imaging 6920, 2008.
     """
-    figure = Figure(figsize=(12.0, 4.0 * len(shown) + 6.4), layout="constrained")
+    figure = Figure(figsize=(12.0, 14.4), layout="constrained")
     FigureCanvasAgg(figure)
-    rows = len(shown)
-    panels = figure.subplots(rows + 2, 3, squeeze=False, height_ratios=[1.3] * rows + [1.0, 1.0])
-    for row, each in zip(panels, shown, strict=False):
-        for axes, image, what in zip(
-            row,
-            (each.image, each.before, each.after),
-            (each.title, "the other sweep there, before", "the other sweep there, after"),
-            strict=True,
-        ):
-            _draw_image(axes, image, each, what)
-    for axes, first, unit in ((panels[rows, 0], 3, "mm"), (panels[rows, 1], 0, "degrees")):
-        for k, colour in zip(range(first, first + 3), _COLOURS, strict=True):
-            axes.plot(curves.offset, curves.similarity[k], color=colour, label=PARAMETERS[k])
-        _label(axes, f"off the answer / {unit}", "mean correlation")
+    panels = figure.subplots(4, 3, height_ratios=[1.3, 1.3, 1.0, 1.0])
+    for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
+        held = result.sweeps.frames_held_out[k]
+        _draw_images(panels[k], result, one, other, int(held[len(held) // 2]))
+    comparison = result.sweeps.whole(SIGMA_MM, IMAGES, result.sensor_from_image)
+    about = Estimate(result.sensor_from_image, result.scales)
+    offset = np.linspace(-CURVES_TO, CURVES_TO, CURVE_POINTS)
+    for axes, names in ((panels[2, 0], PARAMETERS[3:]), (panels[2, 1], PARAMETERS[:3])):
+        for name, colour in zip(names, _COLOURS, strict=True):
+            axes.plot(offset, similarities(comparison, about, (name,), offset), color=colour, label=name)
+        axes.set(xlabel=f"off the answer / {_unit_of(names[0])}", ylabel="mean correlation")
         axes.legend(fontsize=8)
-    _draw_strength(panels[rows, 2], angulation)
-    for axes, found in zip(panels[-1], maps, strict=False):
-        _draw_map(axes, found)
-    figure.suptitle(title, fontsize=10)
+    _draw_strength(panels[2, 2], angulation)
+    offset = np.linspace(-CURVES_TO, CURVES_TO, MAP_POINTS)
+    for axes, pair in zip(panels[3], MAPS, strict=True):
+        _draw_map(axes, pair, offset, similarities(comparison, about, pair, offset))
+    for axes in panels[2:].flat:
+        axes.grid(alpha=0.3)
+    figure.suptitle(_verdict(result, angulation), fontsize=10)
     return figure
+
+
+def similarities(
+    comparison: Comparison, about: Estimate, names: tuple[str, ...], offset: FloatArray, threads: int = 2
+) -> FloatArray:
+    """Mean correlation of images with cuts of the other sweep, with some of `PARAMETERS` moved at once.
+
+    Parameters
+    ----------
+    names : tuple of str, length d
+        They move the image at its origin, not about its centre.
+    offset : ndarray, shape (k,)
+        Degrees for turns, mm for displacements.
+
+    Returns
+    -------
+    ndarray, shape (k, ...) with d axes
+        NaN where no image overlaps the other sweep by three tenths.
+    """
+    units = np.eye(6)[[PARAMETERS.index(name) for name in names]]
+    steps = np.stack(np.meshgrid(*[offset] * len(names), indexing="ij"), axis=-1) @ units
+
+    def at(step: FloatArray) -> float:
+        return comparison.at(incremented(about, step)).mean
+
+    with ThreadPoolExecutor(threads) as pool:
+        return np.reshape(list(pool.map(at, steps.reshape(-1, 6))), steps.shape[:-1])
+
+
+def cut_of(
+    shown: TrackedImages, other: TrackedImages, frame: int, sensor_from_image: RigidTransform
+) -> Float32Array:
+    """Cut the plane of one image out of the other sweep; shape (rows, columns), NaN where nothing is."""
+    frames = other.covered()
+    poses = other.world_from_sensor(frames) * sensor_from_image
+    sensor = shown.world_from_sensor(np.array([frame]))[0]
+    plane = image_plane(sensor * sensor_from_image, shown.grid, PIXEL_MM)
+    return reslice_frames(ChosenImages(other.images, frames), other.grid, poses, plane, _reach_mm(poses))
+
+
+def _draw_images(
+    row: Sequence[Axes], result: ImageCalibration, shown: TrackedImages, other: TrackedImages, frame: int
+) -> None:
+    """An image, and what the other sweep shows in its place at the start and at the answer."""
+    own, grid = resample_image(shown.images, frame, shown.grid, PIXEL_MM), shown.grid
+    grey = own[np.isfinite(own)]
+    low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
+    extent = (0.0, grid.width_mm, grid.depth_mm - grid.first_sample_depth_mm, 0.0)
+    drawn = {f"{shown.name}, frame {frame}": own} | {
+        f"the other sweep there, {when}": cut_of(shown, other, frame, pose)
+        for when, pose in (("before", result.start), ("after", result.sensor_from_image))
+    }
+    for axes, (title, image) in zip(row, drawn.items(), strict=True):
+        axes.set_facecolor("#22303c")
+        axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="bilinear")
+        axes.set_title(title, fontsize=8)
+        axes.tick_params(labelsize=7)
 
 
 def _reach_mm(poses: RigidTransform) -> float:
@@ -206,26 +193,16 @@ def _reach_mm(poses: RigidTransform) -> float:
     return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
 
 
-def _draw_image(axes: Axes, image: Float32Array, of: Pictures, title: str) -> None:
-    grey = of.image[np.isfinite(of.image)]
-    low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
-    extent = (0.0, of.width_mm, of.height_mm, 0.0)
-    axes.set_facecolor("#22303c")
-    axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="bilinear")
-    axes.set_title(title, fontsize=8)
-    axes.tick_params(labelsize=7)
-
-
-def _draw_map(axes: Axes, found: SimilarityMap) -> None:
-    across, up = found.axes
-    drawn = axes.contourf(found.offset, found.offset, found.similarity.T, 16, cmap="viridis")
+def _draw_map(axes: Axes, names: tuple[str, str], offset: FloatArray, similarity: FloatArray) -> None:
+    drawn = axes.contourf(offset, offset, similarity.T, 16, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="mean correlation")
     axes.plot(0.0, 0.0, "+", color="white")
-    _label(axes, f"{across} / {_unit_of(across)}", f"{up} / {_unit_of(up)}")
+    across, up = (f"{name} / {_unit_of(name)}" for name in names)
+    axes.set(xlabel=across, ylabel=up)
 
 
-def _unit_of(axis: str) -> str:
-    return "mm" if axis in ("x", "y", "z") else "degrees"
+def _unit_of(name: str) -> str:
+    return "mm" if name in ("x", "y", "z") else "degrees"
 
 
 def _draw_strength(axes: Axes, angulation: Angulation) -> None:
@@ -234,11 +211,47 @@ def _draw_strength(axes: Axes, angulation: Angulation) -> None:
     axes.bar(place - 0.2, angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
     axes.bar(place + 0.2, angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")
     axes.set_xticks(place, [f"{name}\n/ {'°' if k < 3 else 'mm'}" for k, name in enumerate(PARAMETERS)])
-    _label(axes, "error", "disagreement / mm")
+    axes.set(xlabel="error", ylabel="disagreement / mm")
     axes.legend(fontsize=8)
 
 
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(alpha=0.3)
+def _parameters(result: ImageCalibration) -> tuple[Parameter, ...]:
+    """The image's origin in the sensor's frame, and the pixel sizes if they were estimated."""
+    turn = result.sensor_from_image.rotation.as_matrix()
+    errors = np.sqrt(np.diag(turn @ result.covariance[3:, 3:] @ turn.T))
+    rows = [
+        Parameter(name, float(value), float(error), "mm")
+        for name, value, error in zip("xyz", result.sensor_from_image.translation, errors, strict=True)
+    ]
+    if (result.scale_errors > 0).any():
+        pixels = zip(("s_x", "s_y"), result.pixel_mm, result.pixel_mm * result.scale_errors, strict=True)
+        rows += [Parameter(name, float(size), float(error), "mm/pixel") for name, size, error in pixels]
+    return tuple(rows)
+
+
+def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
+    """Reasons of frames that were neither used nor held out, by number."""
+    reasons: dict[int, str] = {}
+    for k, before in enumerate((0, counts[0])):
+        known = {*result.sweeps.frames_used[k], *result.sweeps.frames_held_out[k]}
+        reasons |= {before + n: "no reading of the sensor" for n in range(counts[k]) if n not in known}
+    return reasons
+
+
+def _verdict(result: ImageCalibration, angulation: Angulation) -> str:
+    if result.scale_errors.max() > WEAK_SCALE:
+        lateral, axial = 100.0 * result.scale_errors
+        return (
+            f"weak: the pixel sizes are known to {lateral:.0f} and {axial:.0f} %: do without estimating them"
+        )
+    if not result.converged:
+        return "did not converge: a better start or sweeps with more structure are needed"
+    gain = result.held_out.after - np.nan_to_num(result.held_out.before)
+    if gain < -_WORSE:
+        return "doubtful: frames that were not used are less alike than at the start"
+    if result.alike < SPECKLED_SIMILARITY:
+        return (
+            f"doubtful: the sweeps are little alike (correlation {result.alike:.2f}), which may displace the "
+            "answer by more than its errors say"
+        )
+    return angulation.verdict

@@ -20,8 +20,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
-from calibration.images.fit import Estimate, Refined, refine
-from calibration.images.similarity import Comparison, CrossingSweeps, Level, Progress
+from calibration.images.fit import Refined, refine
+from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -56,15 +56,6 @@ _SIMPLEX_EDGE = 10.0
 """Edges of the first simplex, mm and degrees: half of the displacements it is to recover from."""
 
 
-@dataclass(frozen=True)
-class Located:
-    """Where the search or the simplex ended, and after how many comparisons."""
-
-    estimate: Estimate
-    evaluations: int
-    converged: bool = True
-
-
 def search(
     crossing: CrossingSweeps,
     start: Estimate,
@@ -72,15 +63,22 @@ def search(
     capture_rad: float,
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
-) -> Located:
+) -> tuple[Estimate, int]:
     """Search a box of six parameters about the start, from coarse to fine.
+
+    Returns
+    -------
+    tuple of Estimate and int
+        The best place, and how many were compared.
 
     Raises
     ------
     InsufficientDataError
         If the sweeps show nothing in common anywhere.
     """
-    box = _Box(crossing, start, capture_mm, capture_rad, pool, progress or _silent)
+    box = _Box(
+        crossing, start, capture_mm, capture_rad, pool, progress or (lambda _stage, _done, _total: None)
+    )
     looks, followed = 0, []
     for glances in (_GLANCES, _MORE_GLANCES):
         looks += glances
@@ -102,7 +100,7 @@ def search(
     decided = box.refined(DECIDED, _distinct(best_first, crossing)[:_DECIDED], "deciding")
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
-    return Located(decided[0].estimate, looks)
+    return decided[0].estimate, looks
 
 
 def climb(
@@ -111,8 +109,14 @@ def climb(
     scales: bool,
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
-) -> Located:
-    """Maximise the mean correlation by Nelder-Mead over increments of the start; see `incremented`."""
+) -> tuple[Estimate, int, bool]:
+    """Maximise the mean correlation by Nelder-Mead over increments of the start (`incremented`).
+
+    Returns
+    -------
+    tuple of Estimate, int and bool
+        The answer, how many were compared, and whether the simplex converged.
+    """
     comparison = crossing.published(PUBLISHED_IMAGES)
     count = 0
 
@@ -121,8 +125,7 @@ def climb(
         count += 1
         if progress:
             progress("simplex", count, MAX_EVALUATIONS)
-        at = incremented(start, increment)
-        mean = comparison.at(at.sensor_from_image, at.scales, pool=pool).mean
+        mean = comparison.at(incremented(start, increment), pool=pool).mean
         return 1.0 - mean if np.isfinite(mean) else 2.0
 
     size = 8 if scales else 6
@@ -133,7 +136,7 @@ def climb(
         method="Nelder-Mead",
         options={"initial_simplex": corners, "xatol": 0.02, "fatol": 1e-5, "maxfev": MAX_EVALUATIONS},
     )
-    return Located(incremented(start, found.x), int(found.nfev), bool(found.success))
+    return incremented(start, found.x), int(found.nfev), bool(found.success)
 
 
 def incremented(start: Estimate, increment: FloatArray) -> Estimate:
@@ -209,7 +212,7 @@ class _Box:
 
 
 def _score(comparison: Comparison, place: Estimate) -> float:
-    return comparison.at(place.sensor_from_image, place.scales).score
+    return comparison.at(place).score
 
 
 def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:
@@ -226,7 +229,3 @@ def _apart(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
     step = other.sensor_from_image.inv() * one.sensor_from_image
     moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))
     return float(np.hypot(moved, 20.0 * step.rotation.magnitude()))
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    pass

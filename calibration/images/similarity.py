@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, TrackedImages, read_stack
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
@@ -38,24 +39,32 @@ FEWEST_PATCHES = 0.1
 
 
 @dataclass(frozen=True)
-class Similarity:
-    """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
+class Estimate:
+    """A calibration during the fit.
 
     Attributes
     ----------
-    alike : ndarray, shape (p,)
-        NaN where a patch has too little support.
-    energy : ndarray, shape (p, 2)
-        Standard deviation of the patch and of what was cut: grey levels.
-    normal, gradient : ndarray, shape (p, 8, 8) and (p, 8)
-        By the image's turns (rad) and displacements (mm), and the relative pixel sizes; empty without.
+    scales : ndarray, shape (2,)
+        Factors on the pixel sizes, lateral and axial.
     """
 
-    alike: FloatArray
-    energy: FloatArray
-    share: FloatArray
-    normal: FloatArray
-    gradient: FloatArray
+    sensor_from_image: RigidTransform
+    scales: FloatArray
+
+    def stepped(self, step: FloatArray, pivot_mm: FloatArray) -> Estimate:
+        """Turn about a point of the image and displace it, in the image's own frame; then rescale."""
+        turn = Rotation.from_rotvec(step[:3])
+        shift = pivot_mm + step[3:6] - turn.apply(pivot_mm)
+        moved = self.sensor_from_image * RigidTransform.from_components(shift, turn)
+        return Estimate(moved, self.scales * (1.0 + step[6:8]))
+
+
+class Similarity(PatchScores):
+    """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
+
+    `energy` is in grey levels; `normal` and `gradient` are by the image's turns (rad) and displacements (mm),
+    and the relative pixel sizes; they are empty if they were not asked for.
+    """
 
     @property
     def valid(self) -> BoolArray:
@@ -96,17 +105,11 @@ class Comparison:
     least_share: float = LEAST_SHARE
 
     def at(
-        self,
-        sensor_from_image: RigidTransform,
-        scales: FloatArray | None = None,
-        derivatives: bool = False,
-        pool: ThreadPoolExecutor | None = None,
+        self, estimate: Estimate, derivatives: bool = False, pool: ThreadPoolExecutor | None = None
     ) -> Similarity:
-        """Compare at a calibration; pixel sizes are multiplied by `scales`, shape (2,)."""
-        matrix = sensor_from_image.as_matrix()
-        factor = np.ones(2) if scales is None else scales
+        """Compare at a calibration."""
         run = pool.map if pool else map
-        parts = list(run(lambda way: self._one_way(way, matrix, factor, derivatives), (0, 1)))
+        parts = list(run(lambda way: self._one_way(way, estimate, derivatives), (0, 1)))
         return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     @property
@@ -128,10 +131,11 @@ class Comparison:
             rows.append(np.einsum("pij,pj->pi", poses, local)[:, :3])
         return np.concatenate(rows)
 
-    def _one_way(self, way: int, matrix: FloatArray, factor: FloatArray, derivatives: bool) -> PatchScores:
+    def _one_way(self, way: int, estimate: Estimate, derivatives: bool) -> PatchScores:
         sample, patches = self.stacks[way], self.patches[way]
         source = (self.sources or self.stacks)[1 - way]
-        count, pixels = len(patches.where), np.tile(factor, 2)
+        matrix = estimate.sensor_from_image.as_matrix()
+        count, pixels = len(patches.where), np.tile(estimate.scales, 2)
         size = count if derivatives else 0
         found = PatchScores(
             np.empty(count),
@@ -265,10 +269,7 @@ class CrossingSweeps:
         """Comparison of the held-out images with the other sweep's used ones, near a calibration."""
         sigma = sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image)
-        held = (
-            self._blurred(0, sigma, held_out=True),
-            self._blurred(1, sigma, held_out=True),
-        )
+        held = self._blurred(0, sigma, held_out=True), self._blurred(1, sigma, held_out=True)
         a, b = (whole_images(stack, np.arange(len(stack)), sigma) for stack in held)
         gap = self._gap(sigma, thin, sensor_from_image)
         return Comparison(held, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
@@ -285,9 +286,7 @@ class CrossingSweeps:
         spacing = [frame_spacing(stack, sensor_from_image) for stack in self.used]
         a, b = (
             self._blurred(way, sigma_mm, least_weight).thinned(
-                sensor_from_image,
-                max(0.75 * sigma_mm, spacing[way]),
-                max(0.7 * sigma_mm, 0.5 * spacing[way]),
+                sensor_from_image, max(0.75 * sigma_mm, spacing[way]), max(0.7 * sigma_mm, 0.5 * spacing[way])
             )
             for way in (0, 1)
         )
@@ -325,7 +324,7 @@ def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | No
     unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
     stacks, numbers = [], []
     for tracked in (first, second):
-        step = None if progress is None else _step_of(progress, f"reading {tracked.name}")
+        step = None if progress is None else partial(progress, f"reading {tracked.name}")
         stack, frames = read_stack(tracked, BASE_PIXEL_MM * unit, step)
         stacks.append(stack)
         numbers.append(frames)
@@ -364,10 +363,6 @@ def _inverted(matrices: FloatArray) -> FloatArray:
 def _set_aside(count: int) -> IntArray:
     wanted = min(_MOST_HELD_OUT, max(1, count // _HELD_OUT_EVERY))
     return np.unique((np.arange(1, 2 * wanted, 2) * count / (2.0 * wanted)).astype(np.int64))
-
-
-def _step_of(progress: Progress, stage: str) -> Callable[[int, int], None]:
-    return lambda done, total: progress(stage, done, total)
 
 
 def _require_one_scanner(first: TrackedImages, second: TrackedImages) -> None:

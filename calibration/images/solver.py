@@ -19,18 +19,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.fit import (
-    Estimate,
-    Refined,
-    Settled,
-    covariance_at_origin,
-    curvature,
-    point_covariance,
-    refine,
-    settle,
-)
+from calibration.images.angulation import point_motion
+from calibration.images.fit import covariance_at_origin, curvature, refine, settle
 from calibration.images.search import DECIDED, climb, search
-from calibration.images.similarity import Comparison, CrossingSweeps, Level, Progress, prepare
+from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress, prepare
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -115,12 +107,10 @@ class ImageCalibration:
         support; see `LEAST_SIMILARITY`.
     similarity, held_out : Improvement
         Of images that were compared, and of frames that were left out of everything.
-    frames_used, frames_held_out : tuple of ndarray of int
-        Frame numbers in either sweep.
     evaluations : int
         How many times the sweeps were compared.
     sweeps : CrossingSweeps
-        What was compared.
+        What was compared, with the numbers of the frames used and held out.
     """
 
     method: str
@@ -135,15 +125,14 @@ class ImageCalibration:
     alike: float
     similarity: Improvement
     held_out: Improvement
-    frames_used: tuple[tuple[int, ...], tuple[int, ...]]
-    frames_held_out: tuple[tuple[int, ...], tuple[int, ...]]
     evaluations: int
     converged: bool
     sweeps: CrossingSweeps = field(repr=False)
 
     def covariance_of(self, point_mm: FloatArray) -> FloatArray:
         """Covariance of where a point of the image lies, along the image's axes, shape (3, 3), mm^2."""
-        return point_covariance(self.covariance, point_mm)
+        moved = point_motion(np.asarray(point_mm, dtype=float)[None])[0]
+        return np.asarray(moved @ self.covariance @ moved.T)
 
 
 def calibrate_images(
@@ -182,70 +171,53 @@ def calibrate_from_sweeps(
     if not start.single:
         raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageSettings()
-    first = Estimate(start, np.ones(2))
+    first = found = Estimate(start, np.ones(2))
+    free, looks = tuple(range(8 if chosen.scales else 6)), 0
     with ThreadPoolExecutor(chosen.threads) as pool:
         if chosen.method == "nelder-mead":
-            climbed = climb(crossing, first, chosen.scales, pool, progress)
-            found, evaluations, converged = climbed.estimate, climbed.evaluations, climbed.converged
-            refined = _look(crossing, found, chosen, pool)
+            found, looks, converged = climb(crossing, first, chosen.scales, pool, progress)
+            # The simplex knows no derivatives; the covariance needs them.
+            comparison = crossing.level(FINE[-1], found.sensor_from_image)
+            refined = refine(comparison, found, free, max_steps=1, pool=pool)
             alike = _require_alike(crossing, found, pool)
-            settled = Settled(refined, curvature(refined, pool))
+            bend = curvature(refined, pool)
         else:
-            found, looks = _within_reach(crossing, first, chosen, pool, progress)
-            refined, steps = _refined(crossing, found, chosen, pool, progress)
-            alike = _require_alike(crossing, refined.estimate, pool)
-            settled = settle(refined, pool)
-            refined = settled.refined
-            found, evaluations, converged = refined.estimate, looks + steps, refined.converged
-    return _result(crossing, chosen, first, found, settled, alike, evaluations, converged)
-
-
-def _within_reach(
-    crossing: CrossingSweeps,
-    first: Estimate,
-    settings: ImageSettings,
-    pool: ThreadPoolExecutor,
-    progress: Progress | None,
-) -> tuple[Estimate, int]:
-    if settings.capture_mm == 0.0 and settings.capture_deg == 0.0:
-        return first, 0
-    reach = np.deg2rad(settings.capture_deg)
-    found = search(crossing, first, settings.capture_mm, float(reach), pool, progress)
-    return found.estimate, found.evaluations
-
-
-def _refined(
-    crossing: CrossingSweeps,
-    found: Estimate,
-    settings: ImageSettings,
-    pool: ThreadPoolExecutor,
-    progress: Progress | None,
-) -> tuple[Refined, int]:
-    evaluations = 0
-    for number, level in enumerate(FINE):
-        refined = refine(crossing.level(level, found.sensor_from_image), found, _free(settings), pool=pool)
-        found, evaluations = refined.estimate, evaluations + refined.evaluations
-        if progress:
-            progress("refining", number + 1, len(FINE))
-    return refined, evaluations
-
-
-def _look(
-    crossing: CrossingSweeps, found: Estimate, settings: ImageSettings, pool: ThreadPoolExecutor
-) -> Refined:
-    """Compute the derivatives at an answer that was found without them."""
-    comparison = crossing.level(FINE[-1], found.sensor_from_image)
-    return refine(comparison, found, _free(settings), max_steps=1, pool=pool)
-
-
-def _free(settings: ImageSettings) -> tuple[int, ...]:
-    return tuple(range(8 if settings.scales else 6))
+            if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
+                reach = float(np.deg2rad(chosen.capture_deg))
+                found, looks = search(crossing, first, chosen.capture_mm, reach, pool, progress)
+            for number, level in enumerate(FINE):
+                refined = refine(crossing.level(level, found.sensor_from_image), found, free, pool=pool)
+                found, looks = refined.estimate, looks + refined.evaluations
+                if progress:
+                    progress("refining", number + 1, len(FINE))
+            alike = _require_alike(crossing, found, pool)
+            refined, bend = settle(refined, pool)
+            found, converged = refined.estimate, refined.converged
+    covariance, condition_number, weakest = covariance_at_origin(refined, bend, crossing.unit)
+    near = found.sensor_from_image
+    return ImageCalibration(
+        method=chosen.method,
+        start=start,
+        sensor_from_image=near,
+        scales=found.scales,
+        scale_errors=np.sqrt(np.diag(covariance)[6:8]),
+        pixel_mm=crossing.pixel_mm * found.scales,
+        covariance=covariance[:6, :6],
+        condition_number=condition_number,
+        weakest=weakest,
+        alike=alike,
+        similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, 10, near), first, found),
+        held_out=_improvement(crossing.check(SHOWN_SIGMA_MM, near), first, found),
+        evaluations=looks,
+        converged=converged,
+        sweeps=crossing,
+    )
 
 
 def _require_alike(crossing: CrossingSweeps, found: Estimate, pool: ThreadPoolExecutor) -> float:
     """Score of the sweeps at an answer, with speckle blurred away; refuse one below `LEAST_SIMILARITY`."""
     seen = crossing.level(DECIDED, found.sensor_from_image)
-    score = seen.at(found.sensor_from_image, found.scales, pool=pool).score
+    score = seen.at(found, pool=pool).score
     if score < LEAST_SIMILARITY:
         got = "no overlap" if score < 0 else f"{score:.2f} at best"
         raise InsufficientDataError(
@@ -255,45 +227,5 @@ def _require_alike(crossing: CrossingSweeps, found: Estimate, pool: ThreadPoolEx
     return score
 
 
-def _result(
-    crossing: CrossingSweeps,
-    settings: ImageSettings,
-    first: Estimate,
-    found: Estimate,
-    settled: Settled,
-    alike: float,
-    evaluations: int,
-    converged: bool,
-) -> ImageCalibration:
-    spread = covariance_at_origin(settled, crossing.unit)
-    near = found.sensor_from_image
-    shown = crossing.whole(SHOWN_SIGMA_MM, 10, near), crossing.check(SHOWN_SIGMA_MM, near)
-    return ImageCalibration(
-        method=settings.method,
-        start=first.sensor_from_image,
-        sensor_from_image=near,
-        scales=found.scales,
-        scale_errors=np.sqrt(np.diag(spread.covariance)[6:8]),
-        pixel_mm=crossing.pixel_mm * found.scales,
-        covariance=spread.covariance[:6, :6],
-        condition_number=spread.condition_number,
-        weakest=spread.weakest,
-        alike=alike,
-        similarity=_improvement(shown[0], first, found),
-        held_out=_improvement(shown[1], first, found),
-        frames_used=_numbers(crossing.frames_used),
-        frames_held_out=_numbers(crossing.frames_held_out),
-        evaluations=evaluations,
-        converged=converged,
-        sweeps=crossing,
-    )
-
-
 def _improvement(comparison: Comparison, first: Estimate, found: Estimate) -> Improvement:
-    before, after = (comparison.at(one.sensor_from_image, one.scales).mean for one in (first, found))
-    return Improvement(before, after)
-
-
-def _numbers(frames: tuple[np.ndarray, np.ndarray]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    a, b = (tuple(int(n) for n in row) for row in frames)
-    return a, b
+    return Improvement(comparison.at(first).mean, comparison.at(found).mean)

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import Images, PosedImages
@@ -188,7 +188,9 @@ def read_stack(
             f"{tracked.name}: expected at least {FEWEST_FRAMES} frames with readings, got {len(frames)}"
         )
     grid = tracked.grid
-    source = PosedImages(tracked.images, grid, _every_pose(tracked, frames))
+    with naming(tracked.name):
+        # Images are read here, not placed: their poses do not matter, only how many there are.
+        source = PosedImages(tracked.images, grid, RigidTransform.identity(len(tracked.frame_time_s)))
     size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
     bins = np.minimum(np.maximum(1, np.round(pixel_mm / size)).astype(int), [grid.vectors, grid.samples])
     shape = (len(frames), grid.vectors // bins[0], grid.samples // bins[1])
@@ -210,17 +212,6 @@ def read_stack(
     images[:, still & ~np.isnan(images).any(axis=0)] = np.nan
     first = size * (bins - 1) / 2.0 + [0.0, grid.first_sample_depth_mm]
     return Stack(images, np.concatenate([size * bins, first]), tracked.world_from_sensor(frames)), frames
-
-
-def _every_pose(tracked: TrackedImages, frames: IntArray) -> RigidTransform:
-    """One placeholder pose per image, which `PosedImages` requires; images are read here, not placed."""
-    known = getattr(tracked.images, "shape", (len(tracked.frame_time_s),))[0]
-    if known != len(tracked.frame_time_s):
-        raise MismatchError(
-            f"{tracked.name}: expected {known} frame times for {known} images, "
-            f"got {len(tracked.frame_time_s)}"
-        )
-    return RigidTransform.identity(len(tracked.frame_time_s))
 
 
 def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:

@@ -3,37 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from speckle3d.cli.calibrate_phantoms import find_lines
 from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import (
-    Images,
-    Json,
-    PixelMm,
-    Poses,
-    Region,
-    calibrate,
-    emit,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import Images, Json, PixelMm, Poses, Region, calibrate, emit, note, progress_bar
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
-    from calibration.clock.offset import ClockOffset
     from speckle3d.core.calibration import Calibration
-
-
-class By(StrEnum):
-    """Which motion in the images tells the delay."""
-
-    line = "line"
-    images = "images"
 
 
 @calibrate.command("clock")
@@ -42,11 +23,11 @@ def calibrate_clock(
     poses: Poses = None,
     pixel_mm: PixelMm = None,
     by: Annotated[
-        By,
+        Literal["line", "images"],
         typer.Option(
             help="line: a plane's echo follows the sensor; images: a sweep forward and back over tissue."
         ),
-    ] = By.line,
+    ] = "line",
     sensor: Annotated[str, typer.Option(help="line: tracker or orientation.")] = "tracker",
     region: Region = None,
     search_s: Annotated[float, typer.Option(min=0.02, help="Delays to either side of the file's own.")] = 0.5,
@@ -62,17 +43,42 @@ def calibrate_clock(
     The offset is added to the sensor's times; PLUS's LocalTimeOffsetSec, of the image device, is the same
     with the other sign.
     """
+    from calibration.clock.images import delay_from_images
+    from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
+    from speckle3d.cli.recordings import open_recording, open_tracked, require_unsized
     from speckle3d.io.calibrations import write_calibration
     from speckle3d.study.results import json_text
 
     if out is not None:
         require_free(out, images, poses, calibration)
     known = _known(by, sensor, calibration, out)
-    if by is By.images:
-        found, frames = _by_images(images, poses, pixel_mm, known, search_s)
+    require_unsized(images, pixel_mm)
+    if by == "images":
+        given_s = None if known is None else known.time_offset_s
+        tracked, mounting = open_tracked(images, poses, pixel_mm, given_s)
+        mounting = mounting if known is None else known.sensor_from_image
+        if mounting is None:
+            raise InsufficientDataError(
+                f"{images}: expected --calibration, how the image sits on the sensor, at least roughly; "
+                "got none"
+            )
+        with progress_bar("trying delays") as progress, naming(str(images)):
+            found = delay_from_images(tracked, mounting, search_s, progress=progress)
+        frames = len(tracked.frame_time_s)
         told = f"images of the two ways correlate by {found.followed:.2f}"
     else:
-        found, frames = _by_line(images, poses, pixel_mm, sensor, region, search_s)
+        recording = open_recording(images, poses, pixel_mm, sensor)
+        seen = find_lines(recording, region, images)
+        frames, times = len(seen), recording.frame_time_s
+        if frames < FEWEST_FRAMES:
+            raise InsufficientDataError(
+                f"{images}: expected a line in at least {FEWEST_FRAMES} frames, got one in {frames} of "
+                f"{len(times)}: record a plane's echo, for longer; of tissue use --by images"
+            )
+        with naming(str(images)):
+            signal = line_signal(seen.pixels, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
+            readings, around_s = recording.readings, recording.time_offset_s
+            found = delay_from_lines(signal, times[seen.frame], readings, around_s, search_s)
         told = f"the sensor explains {100 * found.followed:.0f} % of the line's motion in {frames} frames"
     if known is not None and out is not None:
         write_calibration(out, replace(known, time_offset_s=found.seconds))
@@ -90,69 +96,19 @@ def calibrate_clock(
     emit(told)
 
 
-def _known(by: By, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
+def _known(by: str, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
     """Read the calibration, if one is given, after checking that the options fit each other and it."""
     from speckle3d.io.calibrations import read_calibration
 
     if out is not None and calibration is None:
         raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
-    if by is By.line and calibration is not None and out is None:
+    if by == "line" and calibration is not None and out is None:
         raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
     known = None if calibration is None else read_calibration(calibration)
     if known is not None and known.sensor != sensor:
         raise MismatchError(
             f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
         )
-    if by is By.images and sensor != "tracker":
+    if by == "images" and sensor != "tracker":
         raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
     return known
-
-
-def _by_line(
-    images: Path,
-    poses: Path | None,
-    pixel_mm: tuple[float, float] | None,
-    sensor: str,
-    region: str | None,
-    search_s: float,
-) -> tuple[ClockOffset, int]:
-    """Find the delay from a plane's line; returns it and the number of frames with a line."""
-    from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
-    from speckle3d.cli.recordings import open_recording, require_unsized
-
-    require_unsized(images, pixel_mm)
-    recording = open_recording(images, poses, pixel_mm, sensor)
-    seen = find_lines(recording, region, images)
-    if len(seen.frame) < FEWEST_FRAMES:
-        raise InsufficientDataError(
-            f"{images}: expected a line in at least {FEWEST_FRAMES} frames, got one in {len(seen.frame)} of "
-            f"{len(recording.frame_time_s)}: record a plane's echo, for longer; of tissue use --by images"
-        )
-    with naming(str(images)):
-        signal = line_signal(seen.marks_px, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
-        times = recording.frame_time_s[seen.frame]
-        found = delay_from_lines(signal, times, recording.readings, recording.time_offset_s, search_s)
-    return found, len(seen.frame)
-
-
-def _by_images(
-    images: Path,
-    poses: Path | None,
-    pixel_mm: tuple[float, float] | None,
-    known: Calibration | None,
-    search_s: float,
-) -> tuple[ClockOffset, int]:
-    """Find the delay from images of a sweep forward and back; returns it and the number of frames."""
-    from calibration.clock.images import delay_from_images
-    from speckle3d.cli.recordings import open_tracked, require_unsized
-
-    require_unsized(images, pixel_mm)
-    tracked, held = open_tracked(images, poses, pixel_mm, None if known is None else known.time_offset_s)
-    mounting = held if known is None else known.sensor_from_image
-    if mounting is None:
-        raise InsufficientDataError(
-            f"{images}: expected --calibration, how the image sits on the sensor, at least roughly; got none"
-        )
-    with progress_bar("trying delays") as progress, naming(str(images)):
-        found = delay_from_images(tracked, mounting, search_s, progress=progress)
-    return found, len(tracked.frame_time_s)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -17,7 +16,6 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, nami
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
-    from calibration.clock.offset import ClockOffset
     from calibration.images.angulation import Angulation
     from calibration.images.solver import ImageCalibration, ImageSettings
     from calibration.images.stacks import TrackedImages
@@ -29,22 +27,6 @@ _FAR_MM = 300.0
 
 MOST_OFFSET_S = 1e6
 """Largest clock offset, s: clocks that start at switching on and at midnight differ by less."""
-
-
-class ImageMethod(StrEnum):
-    """Optimisation method."""
-
-    gauss_newton = "gauss-newton"
-    nelder_mead = "nelder-mead"
-
-
-@dataclass(frozen=True)
-class _Inputs:
-    """Both sweeps, the starting mounting, and the sweep from which the clock offset is found."""
-
-    sweeps: tuple[TrackedImages, TrackedImages]
-    start: RigidTransform
-    clock: TrackedImages | None
 
 
 @calibrate.command("images")
@@ -70,8 +52,9 @@ def calibrate_images(
     ] = None,
     pixel_mm: PixelMm = None,
     method: Annotated[
-        ImageMethod, typer.Option(help="By derivatives, or as published (Wein 2008).")
-    ] = ImageMethod.gauss_newton,
+        Literal["gauss-newton", "nelder-mead"],
+        typer.Option(help="By derivatives, or as published (Wein 2008)."),
+    ] = "gauss-newton",
     scales: Annotated[bool, typer.Option("--scales", help="Estimate the pixel size too.")] = False,
     capture_mm: Annotated[float, typer.Option(help="How far the start may be off, each way.")] = 20.0,
     capture_deg: Annotated[float, typer.Option(help="The same for its turns.")] = 20.0,
@@ -85,32 +68,50 @@ def calibrate_images(
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor from two crossing sweeps of anything with visible structure."""
+    from calibration.clock.images import delay_from_images
+    from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.images.solver import ImageSettings
+    from speckle3d.cli.recordings import open_tracked, require_unsized
+    from speckle3d.io.calibrations import read_calibration
 
     if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
     with naming_options():
-        settings = ImageSettings(
-            method=method.value, scales=scales, capture_mm=capture_mm, capture_deg=capture_deg
-        )
-    given = _open(first, second, readings, pixel_mm, time_offset_s, clock, start, start_mm, start_deg)
-    if (far := math.hypot(*given.start.translation)) > _FAR_MM:
+        settings = ImageSettings(method=method, scales=scales, capture_mm=capture_mm, capture_deg=capture_deg)
+    for path in (first, second):
+        require_unsized(path, pixel_mm)
+    known = None if start is None else read_calibration(start)
+    offset_s = known.time_offset_s if time_offset_s is None and known is not None else time_offset_s
+    one, mounting = open_tracked(first, readings[0], pixel_mm, offset_s)
+    other, _ = open_tracked(second, readings[1], pixel_mm, offset_s)
+    back = None if clock is None else open_tracked(clock, None, pixel_mm, offset_s)[0]
+    begin = _start(known, start_mm, start_deg, mounting, first)
+    if (far := math.hypot(*begin.translation)) > _FAR_MM:
         note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")
-    enough = _angulation(given.sweeps, given.start)
-    enough.require()
-    found = _solve(given.sweeps, given.start, settings)
-    delay = None
-    if given.clock is not None:
-        delay = _clock(clock, given.clock, found.sensor_from_image)
-        note(f"sensor clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s; solving again")
-        sweeps = tuple(replace(each, time_offset_s=delay.seconds) for each in given.sweeps)
-        given = replace(given, sweeps=(sweeps[0], sweeps[1]))
-        found = _solve(given.sweeps, found.sensor_from_image, settings)
+    sweeps = one, other
+    _angulation(sweeps, begin).require()
+    found = _solve(sweeps, begin, settings)
+    told = []
+    if back is not None:
+        with progress_bar("trying delays") as progress, naming(str(clock)):
+            delay = delay_from_images(back, found.sensor_from_image, progress=progress)
+        said = f"clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s"
+        note(f"sensor {said}; solving again")
+        told.append(f"{said}, from images")
+        sweeps = replace(one, time_offset_s=delay.seconds), replace(other, time_offset_s=delay.seconds)
+        found = _solve(sweeps, found.sensor_from_image, settings)
     # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
-    enough = _angulation(given.sweeps, found.sensor_from_image)
-    _finish((first, second), out, given, found, enough, delay, as_json)
+    enough = _angulation(sweeps, found.sensor_from_image)
+    write_with_report(
+        calibration_from_images(found, enough, sweeps),
+        (first, second),
+        out,
+        lambda _: figure_of(found, enough, sweeps),
+        notes_of(found, enough) + told,
+        as_json=as_json,
+    )
 
 
 def _one_each(poses: list[Path] | None) -> list[Path | None]:
@@ -119,31 +120,6 @@ def _one_each(poses: list[Path] | None) -> list[Path | None]:
     if len(poses) != 2:
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
     return list(poses)
-
-
-def _open(
-    first: Path,
-    second: Path,
-    readings: list[Path | None],
-    pixel_mm: tuple[float, float] | None,
-    time_offset_s: float | None,
-    clock: Path | None,
-    start: Path | None,
-    start_mm: tuple[float, float, float] | None,
-    start_deg: tuple[float, float, float] | None,
-) -> _Inputs:
-    from speckle3d.cli.recordings import open_tracked, require_unsized
-    from speckle3d.io.calibrations import read_calibration
-
-    for path in (first, second):
-        require_unsized(path, pixel_mm)
-    known = None if start is None else read_calibration(start)
-    if time_offset_s is None and known is not None:
-        time_offset_s = known.time_offset_s
-    one, mounting = open_tracked(first, readings[0], pixel_mm, time_offset_s)
-    other, _ = open_tracked(second, readings[1], pixel_mm, time_offset_s)
-    back = None if clock is None else open_tracked(clock, None, pixel_mm, time_offset_s)[0]
-    return _Inputs((one, other), _start(known, start_mm, start_deg, mounting, first), back)
 
 
 def _start(
@@ -193,35 +169,3 @@ def _solve(
 
     with progress_bar("comparing sweeps") as bar:
         return solve(*sweeps, start, settings, lambda _stage, done, of: bar(done, of))
-
-
-def _clock(path: Path | None, tracked: TrackedImages, mounting: RigidTransform) -> ClockOffset:
-    from calibration.clock.images import delay_from_images
-
-    with progress_bar("trying delays") as progress, naming(str(path)):
-        return delay_from_images(tracked, mounting, progress=progress)
-
-
-def _finish(
-    paths: tuple[Path, Path],
-    out: Path,
-    given: _Inputs,
-    found: ImageCalibration,
-    enough: Angulation,
-    delay: ClockOffset | None,
-    as_json: bool,
-) -> None:
-    """Write the calibration with its report."""
-    from calibration.images.results import calibration_from_images, figure_of, notes_of
-
-    told = notes_of(found, enough)
-    if delay is not None:
-        told.append(f"clock offset {delay.seconds:+.4f} +- {delay.standard_error_s:.4f} s, from images")
-    write_with_report(
-        calibration_from_images(found, enough, given.sweeps),
-        paths,
-        out,
-        lambda _: figure_of(found, enough, given.sweeps),
-        told,
-        as_json=as_json,
-    )

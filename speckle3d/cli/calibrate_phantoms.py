@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -28,9 +28,9 @@ from speckle3d.cli.common import (
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
-    from calibration.chain import ImagePoints
+    from calibration.chain import ImagePoints, Seen
     from calibration.detection.lines import LineSettings
-    from calibration.job import JobSettings, Outcome, Recording, Seen
+    from calibration.job import JobSettings, Outcome, Recording
     from speckle3d.core.arrays import FloatArray
 
 TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
@@ -53,35 +53,6 @@ Validation = Annotated[
 ]
 
 
-class Stages(StrEnum):
-    """How a plane calibration is solved."""
-
-    three = "three"
-    one = "one"
-
-
-class Reflector(StrEnum):
-    """Object whose echo is the plane."""
-
-    wall = "wall"
-    bar = "bar"
-
-
-class Registration(StrEnum):
-    """How far the phantom's pose in the configuration is trusted."""
-
-    held = "held"
-    turned = "turned"
-    free = "free"
-
-
-class Viewed(StrEnum):
-    """Side from which the plane is seen."""
-
-    above = "above"
-    below = "below"
-
-
 @calibrate.command("plane")
 def calibrate_plane(
     images: Images,
@@ -89,10 +60,13 @@ def calibrate_plane(
     poses: Poses = None,
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
-    stages: Annotated[Stages, typer.Option(help="Angles, distances, all; or all at once.")] = Stages.three,
+    stages: Annotated[
+        Literal["three", "one"], typer.Option(help="Angles, distances, all; or all at once.")
+    ] = "three",
     reflector: Annotated[
-        Reflector, typer.Option(help="A bare wall, whose bias is predicted, or a thin bar (Cambridge).")
-    ] = Reflector.wall,
+        Literal["wall", "bar"],
+        typer.Option(help="A bare wall, whose bias is predicted, or a thin bar (Cambridge)."),
+    ] = "wall",
     beam_mm: Annotated[
         list[float] | None, typer.Option(help="Thickness of the beam for that prediction; may be repeated.")
     ] = None,
@@ -114,16 +88,14 @@ def calibrate_plane(
 
     require_free(out, images, poses, validation)
     lines = from_options(LineSettings, locals())
-    recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
-    seen = find_lines(recording, region, images, lines)
-    widths = () if reflector is Reflector.bar else tuple(beam_mm or (1.0, 2.0, 3.0))
-    with naming(str(images)):
-        outcome = plane_job(recording, seen, job, not fixed_pixels, stages.value, widths)
-    notes = []
-    if validation is not None:
-        other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
-        notes = _validated(outcome, other, find_lines(other, region, validation, lines), validation)
-    _finish(images, out, outcome, seen, as_json, notes)
+    widths = () if reflector == "bar" else tuple(beam_mm or (1.0, 2.0, 3.0))
+
+    def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
+        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma)
+        return recording, find_lines(recording, region, path, lines), job
+
+    solve = partial(plane_job, fit_pixels=not fixed_pixels, stages=stages, beam_mm=widths)
+    _calibrate(scan, solve, images, poses, validation, out, as_json)
 
 
 @calibrate.command("orientation")
@@ -136,8 +108,8 @@ def calibrate_orientation(
         bool, typer.Option("--level", help="The plane is level: three unknowns, not five.")
     ] = False,
     viewed_from: Annotated[
-        Viewed, typer.Option(help="Whether the beam points down on average, or up.")
-    ] = Viewed.above,
+        Literal["above", "below"], typer.Option(help="Whether the beam points down on average, or up.")
+    ] = "above",
     sensor: Annotated[
         str, typer.Option(help="orientation, or tracker: use only what a tracker says of orientation.")
     ] = "orientation",
@@ -159,15 +131,13 @@ def calibrate_orientation(
 
     require_free(out, images, poses, validation)
     lines = from_options(LineSettings, locals())
-    recording, job = _prepared(images, poses, pixel_mm, sensor, time_offset, outlier_sigma)
-    seen = find_lines(recording, region, images, lines)
-    with naming(str(images)):
-        outcome = orientation_job(recording, seen, job, level, viewed_from.value)
-    notes = []
-    if validation is not None:
-        other, _ = _prepared(validation, None, pixel_mm, sensor, time_offset, outlier_sigma)
-        notes = _validated(outcome, other, find_lines(other, region, validation, lines), validation)
-    _finish(images, out, outcome, seen, as_json, notes)
+
+    def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
+        recording, job = _prepared(path, readings, pixel_mm, sensor, time_offset, outlier_sigma)
+        return recording, find_lines(recording, region, path, lines), job
+
+    solve = partial(orientation_job, level=level, viewed_from=viewed_from)
+    _calibrate(scan, solve, images, poses, validation, out, as_json)
 
 
 @calibrate.command("wires")
@@ -182,9 +152,9 @@ def calibrate_wires(
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
     registration: Annotated[
-        Registration,
+        Literal["held", "turned", "free"],
         typer.Option(help="The place a configuration says: hold it, its middle only, or estimate it."),
-    ] = Registration.turned,
+    ] = "turned",
     region: Region = None,
     time_offset: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
@@ -195,7 +165,7 @@ def calibrate_wires(
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
-    from calibration.job import crossing_job, wires_job
+    from calibration.job import wires_job
     from speckle3d.core.wires import three_wires
     from speckle3d.io.plus_config import WireConfig, read_wire_phantom
 
@@ -207,20 +177,53 @@ def calibrate_wires(
         config = read_wire_phantom(phantom)
         if pixel_mm is None and config.pixel_mm is not None:
             pixel_mm = (config.pixel_mm, config.pixel_mm)
-    recording, job = _prepared(images, poses, pixel_mm, "tracker", time_offset, outlier_sigma)
-    seen = _seen_wires(recording, phantom, config, points, region, images)
+    geometry = config.phantom if config else three_wires() if phantom == "three" else None
+
+    def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
+        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma)
+        picked = validation_points if path is validation else points
+        return recording, _seen_wires(recording, phantom, config, picked, region, path), job
+
+    fit_pixels = not fixed_pixels
+    solve = partial(wires_job, phantom=geometry, fit_pixels=fit_pixels, registration=registration)
+    names = () if config is None else config.phantom.names
+    _calibrate(scan, solve, images, poses, validation, out, as_json, names)
+
+
+def _calibrate(
+    scan: Callable[[Path, Path | None], tuple[Recording, Seen, JobSettings]],
+    solve: Callable[[Recording, Seen, JobSettings], Outcome],
+    images: Path,
+    poses: Path | None,
+    validation: Path | None,
+    out: Path,
+    as_json: bool,
+    wire_names: tuple[str, ...] = (),
+) -> None:
+    """Calibrate, check on the other recording, and write the calibration, its report and the dots."""
+    from calibration.report import figure_report
+    from speckle3d.io.points import PickedPoints, write_points
+
+    recording, seen, job = scan(images, poses)
     with naming(str(images)):
-        if phantom == "cross":
-            outcome = crossing_job(recording, seen, job, not fixed_pixels)
-        else:
-            geometry = three_wires() if config is None else config.phantom
-            outcome = wires_job(recording, seen, job, geometry, not fixed_pixels, registration.value)
+        outcome = solve(recording, seen, job)
     notes = _nwire_notes(outcome, outcome.solution.points)
+    if (found := outcome.offset) is not None:
+        notes.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
     if validation is not None:
-        other, _ = _prepared(validation, None, pixel_mm, "tracker", time_offset, outlier_sigma)
-        other_seen = _seen_wires(other, phantom, config, validation_points, region, validation)
+        other, other_seen, _ = scan(validation, None)
         notes += _validated(outcome, other, other_seen, validation)
-    _finish(images, out, outcome, seen, as_json, notes, () if config is None else config.phantom.names)
+    if not seen.are_lines:
+        write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.pixels, seen.wire), wire_names)
+    write_with_report(
+        outcome.calibration,
+        [images],
+        out,
+        lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
+        notes,
+        outcome.beam,
+        as_json,
+    )
 
 
 def _prepared(
@@ -273,17 +276,18 @@ def find_lines(
     recording: Recording, region: str | None, images: Path, settings: LineSettings | None = None
 ) -> Seen:
     """Find the plane's line in every image, showing progress."""
-    from calibration.job import Seen
+    from calibration.detection.lines import detect_lines
 
     corners = _region(region)
     with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
-        return Seen.lines(recording, settings, corners, progress)
+        return detect_lines(recording.images, recording.pixel_mm, settings, corners, progress)
 
 
 def _seen_wires(
     recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
 ) -> Seen:
-    from calibration.job import Seen
+    from calibration.chain import Seen
+    from calibration.job import find_crossings, find_nwires
     from speckle3d.io.points import read_points
 
     names = ("x", "y", "z") if phantom == "three" else () if config is None else config.phantom.names
@@ -300,9 +304,9 @@ def _seen_wires(
     corners = _region(region)
     with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
         if config is None:
-            return Seen.crossings(recording, corners, progress)
+            return find_crossings(recording, corners, progress)
         clip = config.clip_px if corners is None else corners
-        return Seen.nwires(recording, config.phantom, clip, progress)
+        return find_nwires(recording, config.phantom, clip, progress)
 
 
 def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
@@ -313,9 +317,9 @@ def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> li
     found = outcome.calibration.time_offset_s
     with naming(str(path)):
         points, _ = paired(other, seen, other.time_offset_s if found is None else found)
-        checked = validate(outcome.solution, points)
+        residuals = validate(outcome.solution, points)
     frames = len(set(points.frame.tolist()))
-    rms, unit = readable(checked.rms, outcome.calibration.rms_unit)
+    rms, unit = readable(float((residuals**2).mean() ** 0.5), outcome.calibration.rms_unit)
     notes = [f"on {path.name}, not used: RMS residual {rms} {unit}, {frames} frames, none left out"]
     return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, points)]
 
@@ -331,36 +335,6 @@ def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     place = chain.target_from_world.inv()
     mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place))
     return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
-
-
-def _finish(
-    images: Path,
-    out: Path,
-    outcome: Outcome,
-    seen: Seen,
-    as_json: bool,
-    notes: Sequence[str] = (),
-    wire_names: tuple[str, ...] = (),
-) -> None:
-    """Write the calibration with its report, and the dots beside it."""
-    from calibration.report import figure_report
-    from speckle3d.io.points import PickedPoints, write_points
-
-    told = list(notes)
-    if outcome.offset is not None:
-        found = outcome.offset
-        told.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
-    if not seen.are_lines:
-        write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.marks_px, seen.wire), wire_names)
-    write_with_report(
-        outcome.calibration,
-        [images],
-        out,
-        lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
-        told,
-        outcome.beam,
-        as_json,
-    )
 
 
 @calibrate.command("repeatability")

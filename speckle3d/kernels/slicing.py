@@ -228,12 +228,7 @@ def compare_patches(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
 def _images_near(
-    sample: PlacedImages,
-    source: PlacedImages,
-    patches: PatchGrid,
-    p: int,
-    max_gap_mm: float,
-    near: IntArray,
+    sample: PlacedImages, source: PlacedImages, patches: PatchGrid, p: int, max_gap_mm: float, near: IntArray
 ) -> int:
     """Fill `near` with the numbers of images that pass near patch `p`; return how many."""
     pixels = sample.pixels
@@ -320,30 +315,49 @@ def _cut_patch(
                 rise = (level[1] - level[0]) / (gap * max(gap, LEAST_GAP * max_gap_mm))
                 slope[0, 2] = rise * distance[1]
                 slope[1, 2] = rise * distance[0]
-                for c in range(PARAMETERS):
-                    rows[c, n] = 0.0
-                for s in range(2):
-                    amount = part if s == 1 else 1.0 - part
-                    ax, ay, az = amount * slope[s, 0], amount * slope[s, 1], slope[s, 2]
-                    t = source.poses[frame[s]]
-                    # The same slope along the axes of the world, then of the sample's image.
-                    gx = t[0, 0] * ax + t[1, 0] * ay + t[2, 0] * az
-                    gy = t[0, 1] * ax + t[1, 1] * ay + t[2, 1] * az
-                    gz = t[0, 2] * ax + t[1, 2] * ay + t[2, 2] * az
-                    bx = pose[0, 0] * gx + pose[1, 0] * gy + pose[2, 0] * gz
-                    by = pose[0, 1] * gx + pose[1, 1] * gy + pose[2, 1] * gz
-                    bz = pose[0, 2] * gx + pose[1, 2] * gy + pose[2, 2] * gz
-                    px, py, pz = place[s]
-                    rows[0, n] += y * bz - (py * az - pz * ay)
-                    rows[1, n] += -x * bz - (pz * ax - px * az)
-                    rows[2, n] += x * by - y * bx - (px * ay - py * ax)
-                    rows[3, n] += bx - ax
-                    rows[4, n] += by - ay
-                    rows[5, n] += bz - az
-                    rows[6, n] += x * bx - px * ax
-                    rows[7, n] += y * by - py * ay
+                _fill_rows(source.poses, frame, pose, x, y, slope, place, part, rows[:, n])
             n += 1
     return n, wanted
+
+
+# Inlined, which costs no time; a function of its own for the images beside a point took 40 % more.
+@njit(cache=True, inline="always")
+def _fill_rows(
+    poses: FloatArray,
+    frame: IntArray,
+    pose: FloatArray,
+    x: float,
+    y: float,
+    slope: FloatArray,
+    place: FloatArray,
+    part: float,
+    row: FloatArray,
+) -> None:
+    """Fill in how the level cut at point (x, y) of the sample's image changes with the parameters.
+
+    `frame`, `slope` and `place` are of the images on either side; the second counts by `part`.
+    """
+    row[:] = 0.0
+    for s in range(2):
+        amount = part if s == 1 else 1.0 - part
+        ax, ay, az = amount * slope[s, 0], amount * slope[s, 1], slope[s, 2]
+        t = poses[frame[s]]
+        # The same slope along the axes of the world, then of the sample's image.
+        gx = t[0, 0] * ax + t[1, 0] * ay + t[2, 0] * az
+        gy = t[0, 1] * ax + t[1, 1] * ay + t[2, 1] * az
+        gz = t[0, 2] * ax + t[1, 2] * ay + t[2, 2] * az
+        bx = pose[0, 0] * gx + pose[1, 0] * gy + pose[2, 0] * gz
+        by = pose[0, 1] * gx + pose[1, 1] * gy + pose[2, 1] * gz
+        bz = pose[0, 2] * gx + pose[1, 2] * gy + pose[2, 2] * gz
+        px, py, pz = place[s]
+        row[0] += y * bz - (py * az - pz * ay)
+        row[1] += -x * bz - (pz * ax - px * az)
+        row[2] += x * by - y * bx - (px * ay - py * ax)
+        row[3] += bx - ax
+        row[4] += by - ay
+        row[5] += bz - az
+        row[6] += x * bx - px * ax
+        row[7] += y * by - py * ay
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)

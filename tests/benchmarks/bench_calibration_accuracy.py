@@ -13,7 +13,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from calibration.job import JobSettings, Recording, Seen, orientation_job, plane_job
+from calibration.detection.lines import detect_lines
+from calibration.job import JobSettings, Recording, orientation_job, plane_job
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.images import GreyImages
@@ -43,7 +44,8 @@ def trial(seed, frames, reflector):
         )
     )[0]
     sweep = simulated.sweep
-    seen = Seen.lines(recording_of(sweep, sweep.orientation))
+    recording = recording_of(sweep, sweep.orientation)
+    seen = detect_lines(recording.images, recording.pixel_mm)
     found = {}
     for level in (False, True):
         outcome = orientation_job(recording_of(sweep, sweep.orientation), seen, JobSettings(), level)

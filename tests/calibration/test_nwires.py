@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
-from calibration.chain import ImagePoints
+from calibration.chain import ImagePoints, Seen
 from calibration.detection.dots import Dots, dots_in_frames
-from calibration.detection.labelling import LabelledDots
 from calibration.nwires import (
     label_and_start,
     middle_wires,
@@ -18,7 +17,7 @@ from calibration.nwires import (
     start_from_nwires,
     trimmed_mean_mm,
 )
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.metaimage import ImportSettings, read_metaimage, read_poses
 from speckle3d.io.plus_config import read_wire_phantom
 
@@ -30,9 +29,9 @@ def points_of(shown, noise_mm=0.0, seed=0):
     frames, wires = shown.pixels.shape[:2]
     rng = np.random.default_rng(seed)
     pixels = shown.pixels + rng.normal(size=shown.pixels.shape) * noise_mm / PIXEL_MM
-    return LabelledDots(
-        np.repeat(np.arange(frames), wires), pixels.reshape(-1, 2), np.tile(np.arange(wires), frames)
-    ).points(shown.world_from_sensor)
+    frame = np.repeat(np.arange(frames), wires)
+    seen = Seen(frame, pixels.reshape(-1, 2), np.tile(np.arange(wires), frames))
+    return seen.points(shown.world_from_sensor[frame])
 
 
 def apart(chain, shown):
@@ -49,20 +48,20 @@ def test_middle_dots_are_placed_in_the_phantom_whatever_the_pixels(seed, stretch
     points = points_of(shown)
     shuffled = np.random.default_rng(seed).permutation(len(points))
     squeezed = replace(points, pixels=points.pixels * [1.0, stretch])[shuffled]
-    middle = middle_wires(squeezed, shown.phantom)
-    assert len(middle.points) == 4 * 3
-    assert set(middle.points.wire) == {1, 4, 7}
-    seen = middle.points.pixels / [1.0, stretch] * PIXEL_MM
-    world = middle.points.world_from_sensor * shown.sensor_from_image
+    middle, phantom_mm = middle_wires(squeezed, shown.phantom)
+    assert len(middle) == 4 * 3
+    assert set(middle.wire) == {1, 4, 7}
+    seen = middle.pixels / [1.0, stretch] * PIXEL_MM
+    world = middle.world_from_sensor * shown.sensor_from_image
     truth = (shown.phantom.world_from_phantom.inv() * world).apply(np.column_stack([seen, np.zeros(12)]))
-    np.testing.assert_allclose(middle.phantom_mm, truth, atol=1e-8)
+    np.testing.assert_allclose(phantom_mm, truth, atol=1e-8)
 
 
 def test_an_n_that_lacks_a_dot_says_nothing():
     shown = scene(1, frames=3)
     points = points_of(shown)
-    middle = middle_wires(points[~((points.frame == 1) & (points.wire == 5))], shown.phantom)
-    assert sorted(zip(middle.points.frame, middle.points.wire, strict=True)) == [
+    middle, _ = middle_wires(points[~((points.frame == 1) & (points.wire == 5))], shown.phantom)
+    assert sorted(zip(middle.frame, middle.wire, strict=True)) == [
         (0, 1), (0, 4), (0, 7), (1, 1), (1, 7), (2, 1), (2, 4), (2, 7),
     ]  # fmt: skip
 
@@ -160,6 +159,8 @@ def test_a_sequence_without_wires_says_why():
     few = Dots(np.array([0, 0, 2]), np.ones((3, 2)), np.ones(3), {1: "no dot"})
     with pytest.raises(InsufficientDataError, match="all wires"):
         label_and_start(few, shown.phantom, shown.world_from_sensor, PIXEL_MM)
+    with pytest.raises(MismatchError, match=r"frame 2.*2 poses"):
+        label_and_start(few, shown.phantom, shown.world_from_sensor[:2], PIXEL_MM)
 
 
 def poses_of(folder, kind):
@@ -168,8 +169,8 @@ def poses_of(folder, kind):
 
 def published(folder, kind):
     frames, pixels, errors, matrix = plus_results(folder, kind)
-    labelled = LabelledDots(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
-    return labelled.points(poses_of(folder, kind)), errors, matrix
+    labelled = Seen(np.repeat(frames, 9), pixels.reshape(-1, 2), np.tile(np.arange(9), len(frames)))
+    return labelled.points(poses_of(folder, kind)[labelled.frame]), errors, matrix
 
 
 @pytest.fixture
@@ -218,7 +219,7 @@ def test_dots_found_here_calibrate_real_images_for_others(realdata, fcal):
         # Measured 0.8 px in the middle, 6.7 px at most; the next wire is 100 px away.
         assert np.median(away) < 1.0
         assert away.max() < 10.0
-    points: ImagePoints = labelled["Validation"].points(poses)
+    points: ImagePoints = labelled["Validation"].points(poses[labelled["Validation"].frame])
     place = fcal.phantom.world_from_phantom
     errors = nwire_errors_mm(points, fcal.phantom, pixel_matrix(starts["Calibration"]), place)
     # PLUS, with its own points, has 0.540 mm; a tenth more for other dots in other frames (measured 0.575).

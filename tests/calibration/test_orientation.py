@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 from calibration_examples import line_directions
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from calibration.chain import ANGLES, ImagePoints
 from calibration.orientation import calibrate_orientation
-from calibration.plane import LineDirections
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 SQUARE = np.ones(2)
@@ -169,10 +167,3 @@ def test_too_few_lines_and_unknown_sides_are_refused():
     directions, readings, _ = line_directions(np.random.default_rng(0), 20)
     with pytest.raises(InvalidInputError, match="viewed_from"):
         calibrate(directions, readings, viewed_from="left")
-
-
-def test_the_phantom_of_directions_has_unit_rows_for_unit_directions():
-    points = ImagePoints(np.array([[3.0, 4.0]]), np.array([0]), RigidTransform.identity(1))
-    rows, _ = LineDirections(np.array([1.0, 1.0])).vanishing(points)
-    np.testing.assert_allclose(rows, [[[0.0, 0.0, 0.2]]])
-    assert ANGLES == ("alpha", "beta", "gamma")

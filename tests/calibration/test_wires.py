@@ -120,11 +120,7 @@ def test_few_right_points_are_lost():
 
 @pytest.mark.parametrize(
     ("held", "named"),
-    [
-        (("tilt_deg", "roll_deg"), 0),
-        (("tilt_deg", "yaw_deg"), 0),
-        (("roll_deg", "yaw_deg"), 2),
-    ],
+    [(("tilt_deg", "roll_deg"), 0), (("tilt_deg", "yaw_deg"), 0), (("roll_deg", "yaw_deg"), 2)],
 )
 def test_a_crossing_needs_turns_about_two_axes(held, named):
     points = scan_crossing(0, noise_mm=0.3, **dict.fromkeys(held, 0.0))

@@ -78,6 +78,7 @@ def test_images_that_show_nothing_leave_no_calibration(refused, noise, held, tmp
 def test_a_calibration_of_another_sensor_is_refused(refused, back, tmp_path):
     held = tmp_path / "imu.h5"
     write_calibration(held, calibration(Rotation.identity(), None))
+    assert "expected --calibration" in refused("calibrate", "clock", back, *IMAGES, "-o", tmp_path / "c.h5")
     line = refused("calibrate", "clock", back, "--calibration", held, "-o", tmp_path / "c.h5")
     assert str(held) in line
     assert "orientation" in line

@@ -4,7 +4,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.similarity import Comparison
+from calibration.images.similarity import Comparison, Estimate
 from calibration.images.stacks import Stack
 from speckle3d.kernels.slicing import PatchGrid
 
@@ -54,7 +54,7 @@ def expected(comparison, way, scales=(1.0, 1.0)):
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (1.1, 0.95)])
 def test_correlations_are_those_of_the_definition(comparison, scales):
-    found = comparison.at(CALIBRATION, np.array(scales)).alike
+    found = comparison.at(Estimate(CALIBRATION, np.array(scales))).alike
     wanted = np.concatenate([expected(comparison, way, scales) for way in (0, 1)])
     assert np.isfinite(wanted).sum() >= 3
     # Single precision of the images.
@@ -70,9 +70,9 @@ def test_gradient_is_the_change_of_correlation(comparison, parameter):
         change[parameter] = amount
         turn = Rotation.from_rotvec(change[:3])
         at = CALIBRATION * RigidTransform.from_components(change[3:6], turn)
-        return comparison.at(at, 1.0 + change[6:]).alike
+        return comparison.at(Estimate(at, 1.0 + change[6:])).alike
 
-    gradient = comparison.at(CALIBRATION, derivatives=True).gradient[:, parameter]
+    gradient = comparison.at(Estimate(CALIBRATION, np.ones(2)), derivatives=True).gradient[:, parameter]
     slope = (moved(step) - moved(-step)) / (2 * step)
     valid = np.isfinite(slope)
     assert valid.sum() >= 3
@@ -84,7 +84,7 @@ def test_gradient_is_the_change_of_correlation(comparison, parameter):
 
 def test_points_without_support_do_not_count(comparison):
     away = CALIBRATION * RigidTransform.from_translation([0.0, 0.0, 200.0])
-    found = comparison.at(away, derivatives=True)
+    found = comparison.at(Estimate(away, np.ones(2)), derivatives=True)
     assert not found.valid.any()
     assert (found.normal == 0).all()
     assert found.score == -1.0

@@ -142,7 +142,7 @@ def test_the_real_water_tank_has_the_published_delay(realdata):
     sweep = read_metaimage(plus / "WaterTankBottomTranslationVideoBuffer.igs.mha", needed)
     readings = read_poses(plus / "WaterTankBottomTranslationTrackerBuffer.igs.mha").readings
     lines = detect_lines(sweep.frames, (0.078, 0.078))
-    signal = line_signal(lines.points_px, np.array([0.078, 0.078]), 409.5)
+    signal = line_signal(lines.pixels, np.array([0.078, 0.078]), 409.5)
     found = delay_from_lines(signal, sweep.frame_time_s[lines.frame], readings)
     # PLUS: TrackerLagSec -0.0648266, the same delay with its sign the other way round. Measured 0.0651.
     assert found.seconds == pytest.approx(0.0648266, abs=0.003)

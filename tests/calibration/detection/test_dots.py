@@ -130,7 +130,7 @@ def test_a_single_wire_is_its_frames_strongest_dot_if_that_is_clear():
     np.testing.assert_array_equal(one.pixels, [[0, 1], [8, 9]])
     assert one.dropped == {1: "no dot clearly the strongest", 2: "no dot"}
     assert len(single_dots(dots, clear=1.0)) == 3
-    assert len(single_dots(dots[dots.frame > 9])) == 0
+    assert len(single_dots(Dots(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)))) == 0
 
 
 @pytest.mark.parametrize(

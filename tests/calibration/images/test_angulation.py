@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.angulation import PARAMETERS, _disagreements, _grid, _passing, angulation
+from calibration.images.angulation import PARAMETERS, _disagreements, _grid, angulation
 from speckle3d.core.errors import InsufficientDataError
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [38.0, 0.0, 0.0], [0.0, 44.0, 0.0], [38.0, 44.0, 0.0]])
@@ -51,7 +51,8 @@ def test_disagreements_are_the_derivative_of_equation_5():
     first, second = fan(3, 30.0, 8.0, 0.0), fan(5, 40.0, 8.0, 80.0)
     blocks, _ = _disagreements(first, second, CORNERS)
     points, centre, h = _grid(CORNERS), CORNERS.mean(axis=0), 1e-6
-    nearest, _ = _passing(np.stack([(each.inv() * first[1]).apply(points)[:, 2] for each in second]))
+    distance = np.stack([(each.inv() * first[1]).apply(points)[:, 2] for each in second])
+    nearest = np.abs(distance).argmin(axis=0)
     for n in np.flatnonzero(np.isfinite(blocks[len(points) : 2 * len(points)]).all(axis=(1, 2)))[::7]:
         for k, unit in enumerate(np.eye(6)):
             turn = Rotation.from_rotvec(h * unit[:3])
@@ -76,10 +77,7 @@ def test_sensitivities_are_those_of_small_errors():
 
 @pytest.mark.parametrize(
     ("first", "second"),
-    [
-        (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 0.0)),
-        (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 90.0)),
-    ],
+    [(fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 0.0)), (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 90.0))],
     ids=["parallel", "crossing but not tilted"],
 )
 def test_sweeps_that_cannot_tell_are_refused_with_the_reason(first, second):

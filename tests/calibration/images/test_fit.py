@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from crossing_scenes import crossing_sweeps, displaced
 
-from calibration.images.fit import APART_MM, LEVERS_MM, SETTLED, Estimate, curvature, refine, settle
-from calibration.images.similarity import Level, prepare
+from calibration.images.fit import APART_MM, LEVERS_MM, SETTLED, curvature, refine, settle
+from calibration.images.similarity import Estimate, Level, prepare
 
 FREE = tuple(range(6))
 
@@ -23,7 +23,7 @@ def refined():
 
 @pytest.fixture(scope="module")
 def settled(refined):
-    return settle(refined).refined
+    return settle(refined)[0]
 
 
 def test_the_similarity_falls_as_its_curvature_says(refined, settled):
@@ -41,7 +41,7 @@ def test_the_similarity_falls_as_its_curvature_says(refined, settled):
 
 def alike_at(refined, step):
     moved = refined.estimate.stepped(step, refined.pivot_mm)
-    return refined.comparison.at(moved.sensor_from_image, moved.scales).alike
+    return refined.comparison.at(moved).alike
 
 
 def test_gauss_newtons_matrix_is_stiffer(refined):

@@ -7,8 +7,8 @@ from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS
-from calibration.images.report import similarity_curves, similarity_map
-from calibration.images.similarity import prepare
+from calibration.images.report import similarities
+from calibration.images.similarity import Estimate, prepare
 from calibration.images.solver import ImageSettings, calibrate_from_sweeps, calibrate_images
 from calibration.images.stacks import read_stack
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -65,8 +65,8 @@ def test_result_says_what_was_gained(found):
     assert found.held_out.after > 0.9
     assert found.converged
     assert found.evaluations > 1000
-    for used, held in zip(found.frames_used, found.frames_held_out, strict=True):
-        assert sorted(used + held) == list(range(36))
+    for used, held in zip(found.sweeps.frames_used, found.sweeps.frames_held_out, strict=True):
+        assert sorted([*used, *held]) == list(range(36))
         assert len(held) == 3
 
 
@@ -164,7 +164,7 @@ def test_frames_without_readings_are_left_out(scene):
     few = TimedPoses(first.readings.time_s[kept], first.readings.world_from_sensor[kept])
     start = displaced(truth, np.random.default_rng(7), 3.0, 3.0)
     result = calibrate_images(dataclasses.replace(first, readings=few), second, start, REFINE)
-    assert min(result.frames_used[0] + result.frames_held_out[0]) == 6
+    assert min(*result.sweeps.frames_used[0], *result.sweeps.frames_held_out[0]) == 6
     assert np.linalg.norm(centre_error_mm(result.sensor_from_image, truth, first.grid)) < 0.5
 
 
@@ -186,21 +186,16 @@ def test_parallel_sweeps_leave_translation_undetermined():
     assert np.sqrt(parallel.covariance[4, 4]) > 1.0
 
 
-def test_similarity_falls_from_the_answer_whichever_parameter_moves(crossing, found):
-    curves = similarity_curves(crossing, found.sensor_from_image, span=6.0, points=13)
-    assert curves.similarity.shape == (len(PARAMETERS), 13)
-    best = curves.offset[np.nanargmax(curves.similarity, axis=1)]
-    assert (np.abs(best) <= 0.5).all()
-    assert (curves.similarity[:, 6] - np.nanmin(curves.similarity, axis=1) > 0.05).all()
-
-
-def test_similarity_map_contains_the_curves(crossing, found):
-    curves = similarity_curves(crossing, found.sensor_from_image, span=4.0, points=5)
-    surface = similarity_map(crossing, found.sensor_from_image, ("x", "yaw"), span=4.0, points=5)
-    np.testing.assert_allclose(surface.similarity[:, 2], curves.similarity[PARAMETERS.index("x")])
-    np.testing.assert_allclose(surface.similarity[2], curves.similarity[PARAMETERS.index("yaw")])
-    with pytest.raises(InvalidInputError, match=r"axes.*sideways"):
-        similarity_map(crossing, found.sensor_from_image, ("x", "sideways"))
+def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, found):
+    comparison = crossing.whole(1.0, 10, found.sensor_from_image)
+    about = Estimate(found.sensor_from_image, found.scales)
+    offset = np.linspace(-6.0, 6.0, 13)
+    curves = np.stack([similarities(comparison, about, (name,), offset) for name in PARAMETERS])
+    assert (np.abs(offset[np.nanargmax(curves, axis=1)]) <= 0.5).all()
+    assert (curves[:, 6] - np.nanmin(curves, axis=1) > 0.05).all()
+    surface = similarities(comparison, about, ("x", "yaw"), offset[4:9])
+    np.testing.assert_allclose(surface[:, 2], curves[PARAMETERS.index("x"), 4:9])
+    np.testing.assert_allclose(surface[2], curves[PARAMETERS.index("yaw"), 4:9])
 
 
 def test_progress_is_told(found, told):
