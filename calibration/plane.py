@@ -155,6 +155,8 @@ def solve_chain(
         if (agreeing == used).all():
             break
         used = agreeing
+    # Once more from the answer: the covariance holds in the frames where the last refinement began.
+    _, fit, jacobian = _refined(points[used], phantom, chain, free)
     return ChainSolution(
         chain,
         phantom,
