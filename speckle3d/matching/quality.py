@@ -59,7 +59,7 @@ class FrameFlag(enum.IntFlag):
     NO_SPECKLE = 8
     """A signal without the statistics of speckle, or none."""
     UNMATCHED = 16
-    """Shares too little with any earlier frame; set by who matches them."""
+    """Shares too little speckle with any earlier frame; set where frames are matched."""
 
 
 _WORDS = {
