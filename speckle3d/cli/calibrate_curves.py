@@ -17,6 +17,7 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
+from speckle3d.cli.outputs import require_own_place
 
 
 @calibrate.command("curves")
@@ -31,6 +32,7 @@ def calibrate_curves(
     from speckle3d.io.load import load_sweep
     from speckle3d.pipeline import calibrate_curves as measure
 
+    require_own_place(out, "curves", *phantoms, config_file)
     with progress_bar("correlating phantom frames") as progress:
         curves = measure([load_sweep(path) for path in phantoms], load_settings(config_file), progress)
     write_curves(out, curves)

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from speckle3d.cli.common import emit, emit_json, note, require_own_place
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.cli.common import emit, emit_json, note
+from speckle3d.cli.outputs import require_own_place
+from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,21 +44,11 @@ def require_free(out: Path, *inputs: Path | None) -> None:
         raise InvalidInputError(
             f"{out}: expected a calibration file, not {', '.join(_BESIDE)}, which are written beside it"
         )
-    require_own_place(out, "a calibration", _is_calibration, *inputs)
+    require_own_place(out, "calibration", *inputs)
     beside = {out.with_suffix(suffix).resolve() for suffix in _BESIDE}
     for path in inputs:
         if path is not None and path.resolve() in beside:
             raise InvalidInputError(f"{path}: would be overwritten by the results: give -o another name")
-
-
-def _is_calibration(path: Path) -> bool:
-    from speckle3d.io.calibrations import FORMAT
-    from speckle3d.io.load import kind_of
-
-    try:
-        return kind_of(path) == FORMAT
-    except (FileError, InvalidInputError):
-        return False
 
 
 def write_with_report(

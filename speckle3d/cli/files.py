@@ -9,6 +9,7 @@ import typer
 
 from speckle3d.cli.calibrations import fitted_pixels, mount, resize
 from speckle3d.cli.common import CalibrationFiles, Json, app, emit, emit_rows, from_options, progress_bar
+from speckle3d.cli.outputs import require_own_place
 
 
 @app.command()
@@ -74,8 +75,11 @@ def simulate(
     from speckle3d.simulation.presets import simulate as prepare
 
     settings = from_options(SimulationSettings, locals())
-    for number, simulated in enumerate(prepare(settings)):
-        path = out if number == 0 else out.with_name(f"{out.stem}-crossing{out.suffix}")
+    prepared = prepare(settings)
+    paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(prepared)]
+    for path in paths:
+        require_own_place(path, "simulation")
+    for path, simulated in zip(paths, prepared, strict=True):
         with progress_bar(f"simulating {path.name}") as progress:
             write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
 
@@ -104,6 +108,7 @@ def convert(
     from speckle3d.io.sweep_writer import write_sweep
 
     names = ImportSettings.__dataclass_fields__
+    require_own_place(out, "sweep", source, *(calibration or ()))
     given = {k: v for k, v in locals().items() if k in names and v is not None}
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given}
     sweep = resize(load_sweep(source, ImportSettings(**(fitted | given))), fitted)

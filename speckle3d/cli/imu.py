@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
+from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def imu_convert(
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
     from xsens.logs.textlogs import write_csv
 
-    _require_another(out, log_file)
+    require_own_place(out, "log", log_file)
     log = read(log_file, rate_hz)
     write_csv(out, log)
     tell(log)
@@ -125,7 +125,8 @@ def imu_orient(
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
     require_finite_offset(time_offset_s)
-    _require_another(out, log_file)
+    if out is not None:
+        require_own_place(out, "log", log_file, into, calibration)
     log = read(log_file, rate_hz)
     with naming(str(log_file)):
         rotations, found = orientation_of(log, method, magnetometer)
@@ -182,12 +183,6 @@ def require_finite_offset(time_offset_s: float) -> None:
     """Refuse a clock offset that is NaN or infinite."""
     if not math.isfinite(time_offset_s):
         raise InvalidInputError(f"--time-offset-s: expected a finite number, got {time_offset_s}")
-
-
-def _require_another(out: Path | None, log_file: Path) -> None:
-    """Refuse to write over the log that is read."""
-    if out is not None and out.exists() and log_file.exists() and os.path.samefile(out, log_file):
-        raise InvalidInputError(f"{out}: expected another file than the log that is read, got the same")
 
 
 def read(path: Path, rate_hz: float | None) -> ImuLog:

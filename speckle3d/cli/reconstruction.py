@@ -18,6 +18,7 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
+from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ def volume(
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.images import grey_images, open_reconstruction
 
+    require_own_place(out, "volume", reconstruction_file, sweep_file)
     reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
     with progress_bar(f"compounding {out.name}") as progress:
         images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
@@ -155,6 +157,7 @@ def reslice(
 
     if lateral_mm is not None and depth_mm is not None:
         raise InvalidInputError("expected --lateral-mm or --depth-mm, got both")
+    require_own_place(out, "picture", reconstruction_file, sweep_file)
     reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
     poses = poses_of(reconstruction, mode)
     with progress_bar(f"reslicing {out.name}") as progress:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, note, require_own_place
+from speckle3d.cli.common import Json, app, emit, note
+from speckle3d.cli.outputs import require_own_place
 from speckle3d.cli.reconstruction import Mode, ReconstructionFile
 from speckle3d.core.errors import InvalidInputError
 
@@ -42,11 +43,11 @@ def export(
     length_unit: Unit = "m",
 ) -> None:
     """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""
-    from speckle3d.io.tum import is_tum, write_tum
+    from speckle3d.io.tum import write_tum
     from speckle3d.scoring.trajectories import load_reconstructed
 
     unit = cast("LengthUnit", length_unit)
-    require_own_place(out, "TUM text", is_tum, reconstruction_file)
+    require_own_place(out, "trajectory", reconstruction_file)
     held = load_reconstructed(reconstruction_file, mode)
     write_tum(out, held.time_s, held.poses, unit)
 

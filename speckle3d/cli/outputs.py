@@ -1,0 +1,108 @@
+"""What a command may write over: never an input, and of other files only its own kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from speckle3d.core.errors import FileError, InvalidInputError
+
+Kind = Literal["calibration", "curves", "log", "picture", "simulation", "sweep", "trajectory", "volume"]
+
+_FIRST_BYTES = 4096
+_PNG, _GZIP = b"\x89PNG\r\n\x1a\n", b"\x1f\x8b"
+
+
+def require_own_place(out: Path, kind: Kind, *inputs: Path | None) -> None:
+    """Refuse to write over an input, or over another kind of file than the command writes.
+
+    Parameters
+    ----------
+    out : path
+        A file without content is always free.
+    kind : str
+        What the command writes.
+    inputs : path or None
+        Files that the command reads.
+
+    Raises
+    ------
+    FileError
+        If the place cannot be written.
+    InvalidInputError
+        If it is taken.
+    """
+    from speckle3d.io.hdf5 import require_target
+
+    target = require_target(out)
+    if not target.exists():
+        return
+    if any(path is not None and path.exists() and path.samefile(target) for path in inputs):
+        raise InvalidInputError(f"{out}: is an input and would be overwritten: give another name")
+    words, is_own = _KINDS[kind]
+    if target.stat().st_size and not is_own(target):
+        raise InvalidInputError(f"{out}: expected a new name or {words} to replace, got another kind of file")
+
+
+def _of_format(wanted: str) -> Callable[[Path], bool]:
+    def is_of_format(path: Path) -> bool:
+        from speckle3d.io.load import kind_of
+
+        try:
+            return kind_of(path) == wanted
+        except (FileError, InvalidInputError):
+            return False
+
+    return is_of_format
+
+
+def _is_simulation(path: Path) -> bool:
+    from speckle3d.io.hdf5 import open_hdf5
+
+    if not _of_format("speckle3d.sweep")(path):
+        return False
+    with open_hdf5(path) as file:
+        return "simulation" in file
+
+
+def _start(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_FIRST_BYTES)
+
+
+def _is_picture(path: Path) -> bool:
+    return _start(path).startswith(_PNG)
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file begins as `xsens.write_csv` writes it: comments, then a heading from ``time_s`` on."""
+    lines = (line for line in _start(path).splitlines() if not line.startswith(b"#"))
+    return next(lines, b"").startswith(b"time_s,")
+
+
+def _is_volume(path: Path) -> bool:
+    """Whether a file is a NIfTI, MetaImage or NRRD image that is no sequence of frames."""
+    from speckle3d.io.headers import is_metaimage, is_nrrd
+
+    start = _start(path)
+    nifti = start[344:347] == b"n+1" or (start.startswith(_GZIP) and path.name.endswith(".nii.gz"))
+    return nifti or ((is_metaimage(start) or is_nrrd(start)) and b"Seq_Frame" not in start)
+
+
+def _is_trajectory(path: Path) -> bool:
+    from speckle3d.io.tum import is_tum
+
+    return is_tum(path)
+
+
+_KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
+    "calibration": ("a calibration", _of_format("speckle3d.calibration")),
+    "curves": ("curves", _of_format("speckle3d.curves")),
+    "log": ("a CSV of a sensor's log", _is_log),
+    "picture": ("a PNG", _is_picture),
+    "simulation": ("a simulated sweep", _is_simulation),
+    "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
+    "trajectory": ("TUM text", _is_trajectory),
+    "volume": ("a volume", _is_volume),
+}

@@ -1,0 +1,95 @@
+"""No command writes over what it reads, or over a file of another kind than it writes."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from imu_logs import samples
+
+from xsens import ImuLog, write_csv
+
+SMALLEST = ("--preset", "phantom", "--vectors", 16, "--samples", 600, "--frames", 3, "--length-mm", 1)
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "log.csv"
+    write_csv(path, ImuLog(**{**samples(50), "source": "turning"}))
+    return path
+
+
+@pytest.fixture
+def calls(bench, reconstructed, log):
+    """Commands by name, each given the place it is to write to."""
+    made = reconstructed / "reconstruction.h5"
+    return {
+        "simulate": lambda out: ("simulate", out, *SMALLEST),
+        "convert": lambda out: ("convert", bench / "sweep.h5", out),
+        "volume": lambda out: ("volume", made, "-o", out, "--voxel-mm", 1),
+        "reslice": lambda out: ("reslice", made, "-o", out),
+        "export": lambda out: ("trajectory", "export", made, "-o", out),
+        "curves": lambda out: ("calibrate", "curves", bench / "stepped.h5", "-o", out),
+        "imu convert": lambda out: ("imu", "convert", log, out),
+        "imu orient": lambda out: ("imu", "orient", log, "-o", out),
+    }
+
+
+OUT = {
+    "simulate": "s.h5",
+    "convert": "c.h5",
+    "volume": "v.nrrd",
+    "reslice": "r.png",
+    "export": "t.tum",
+    "curves": "k.h5",
+    "imu convert": "l.csv",
+    "imu orient": "o.csv",
+}
+
+
+@pytest.mark.parametrize("name", OUT)
+def test_a_file_of_another_kind_stays_as_it_is(refused, calls, tmp_path, name):
+    place = tmp_path / OUT[name]
+    place.write_text("precious, 1, 2\n", encoding="utf-8")
+    assert str(place) in refused(*calls[name](place))
+    assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
+
+
+@pytest.mark.parametrize(
+    "name", ["convert", "imu convert", "imu orient", "volume", "reslice", "export", "curves"]
+)
+def test_an_input_stays_as_it_is(refused, calls, name):
+    arguments = calls[name]("there")
+    given = next(path for path in arguments[1:] if hasattr(path, "read_bytes"))
+    before = given.read_bytes()
+    assert str(given) in refused(*calls[name](given))
+    assert given.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "name", ["simulate", "convert", "volume", "reslice", "export", "imu convert", "imu orient"]
+)
+def test_what_the_command_wrote_before_is_replaced(run, calls, tmp_path, name):
+    place = tmp_path / OUT[name]
+    for _ in range(2):
+        code, _, err = run(*calls[name](place))
+        assert code == 0, err
+
+
+def test_a_recorded_sweep_is_not_replaced_by_a_simulated_one(refused, bench, calls, tmp_path):
+    recorded = tmp_path / "recorded.h5"
+    shutil.copy(bench / "sweep.h5", recorded)
+    with h5py.File(recorded, "r+") as file:
+        del file["simulation"]
+        before = np.asarray(file["rf"])
+    assert "recorded.h5" in refused(*calls["simulate"](recorded))
+    with h5py.File(recorded) as file:
+        np.testing.assert_array_equal(file["rf"], before)
+
+
+def test_a_sequence_of_frames_is_no_volume_to_replace(refused, calls, tmp_path):
+    sequence = tmp_path / "sequence.mha"
+    sequence.write_bytes(
+        b"ObjectType = Image\nNDims = 3\nSeq_Frame0000_Timestamp = 1\nElementDataFile = LOCAL\n"
+    )
+    assert "sequence.mha" in refused(*calls["volume"](sequence))
