@@ -164,7 +164,7 @@ def test_real_wires_are_found_where_others_found_them(realdata):
     frames, points, _, _ = plus_results(folder, "Validation")
     away = []
     for frame, point in list(zip(frames, points, strict=True))[::4]:
-        pixels, _ = dots_in_image(sweep.frames[frame], [config.pixel_mm] * 2, None, config.clip.corners_px)
+        pixels, _ = dots_in_image(sweep.frames[frame], [config.pixel_mm] * 2, None, config.clip_px)
         away.append(np.linalg.norm(pixels[None] - point[:, None], axis=2).min(axis=1))
     # Measured 0.79 px in the middle and 3.9 px at most; a dot's echo is 40 px wide and 13 px high.
     assert np.median(away) < 1.0
