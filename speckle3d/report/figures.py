@@ -258,7 +258,7 @@ def plot_panels(views: Mapping[str, Sequence[Panel]], columns: int, height: int)
         figure.update_yaxes(title_text=panel.axes[1], **place)
     if levels:
         ticks = {"tickvals": list(range(len(levels))), "ticktext": list(levels)}
-        figure.update_yaxes(autorange="reversed", automargin=True, **ticks)
+        figure.update_yaxes(autorange="reversed", automargin=True, zeroline=False, **ticks)
     else:
         figure.update_layout(hovermode="x unified")
     if len(views) > 1:
