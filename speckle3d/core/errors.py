@@ -26,6 +26,10 @@ class FileError(Speckle3DError, OSError):
     """A file cannot be opened, read or written."""
 
 
+class NoSpaceError(FileError):
+    """There is no room left to write a file: the disk is full, or a limit on files is reached."""
+
+
 @contextmanager
 def naming(where: str) -> Iterator[None]:
     """Put `where` before the message of an error about data raised in the block, unless it is there."""

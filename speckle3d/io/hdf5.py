@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
-import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -17,8 +17,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError, Speckle3DError
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.io.parts import DiskFile, clear_parts, marked, part_beside
 
 PathLike = str | os.PathLike[str]
 Node: TypeAlias = h5py.Group | h5py.Dataset
@@ -29,6 +30,9 @@ _CHUNK_CACHE_BYTES = 32 * 2**20
 _READ_FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
 """What h5py raises, by place, when the bytes of a file do not make sense."""
 
+_NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""A full disk, a limit on the size of a file, and one on what a user may store."""
+
 _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Stored kinds that may become the kind asked for."""
 
@@ -37,7 +41,8 @@ _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 def atomic_path(path: PathLike) -> Iterator[Path]:
     """Yield a temporary sibling that becomes `path` when the block succeeds and vanishes when it does not.
 
-    The sibling keeps the suffix, by which some writers choose their format.
+    The sibling keeps the suffix, by which some writers choose their format. Siblings that killed processes
+    left are removed.
 
     Raises
     ------
@@ -45,16 +50,24 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         If the folder does not exist, `path` is not an ordinary file, or the system refuses to write.
     """
     target = require_target(path)
-    part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
+    clear_parts(target)
+    part = part_beside(target)
     try:
-        yield part
-        os.replace(part, target)
+        with marked(part):
+            yield part
+            os.replace(part, target)
     except Speckle3DError:
         raise
     except OSError as error:
-        raise FileError(f"{path}: cannot be written: {one_line(error)}") from error
+        raise cannot_write(path, error) from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def cannot_write(path: PathLike, error: OSError) -> FileError:
+    """Error of one line for a file that the system refuses to write."""
+    kind = NoSpaceError if error.errno in _NO_SPACE else FileError
+    return kind(f"{path}: cannot be written: {one_line(error)}")
 
 
 def require_target(path: PathLike) -> Path:
@@ -84,13 +97,14 @@ def make_folder(path: PathLike) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(f"{path}: cannot be made a folder: {one_line(error)}") from error
+        kind = NoSpaceError if error.errno in _NO_SPACE else FileError
+        raise kind(f"{path}: cannot be made a folder: {one_line(error)}") from error
 
 
 @contextmanager
 def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
     """Open an HDF5 file of the family for writing; `path` appears whole or not at all (`atomic_path`)."""
-    with atomic_path(path) as part, h5py.File(part, "w") as file:
+    with atomic_path(path) as part, DiskFile(part) as disk, h5py.File(disk, "w") as file:
         file.attrs["format"] = format_name
         file.attrs["version"] = version
         yield file
@@ -105,7 +119,11 @@ class HDF5Writer:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, *self._format))
+            part = stack.enter_context(atomic_path(self._path))
+            self._disk = stack.enter_context(DiskFile(part))
+            self._file = stack.enter_context(h5py.File(self._disk, "w"))
+            for name, value in zip(("format", "version"), self._format, strict=True):
+                self._file.attrs[name] = value
             stack.push(self._finish_unless)
             self._begin()
             self._stack = stack.pop_all()
@@ -115,6 +133,10 @@ class HDF5Writer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.__exit__(kind, error, trace)
+
+    def _require_room(self) -> None:
+        """Raise if what was written so far does not fit on the disk; to be called after every piece."""
+        self._disk.check()
 
     def _begin(self) -> None:
         """Write what is known before the block."""

@@ -103,6 +103,7 @@ class ReconstructionWriter(HDF5Writer):
         for name in _PAIR_FIELDS:
             group[name].resize(start + len(pairs), axis=0)
             group[name][start:] = getattr(pairs, name)
+        self._require_room()
 
     def finish(
         self,

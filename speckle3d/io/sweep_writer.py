@@ -24,6 +24,7 @@ from speckle3d.core.sweep import (
     Tracker,
 )
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
+from speckle3d.io.parts import DiskFile
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None
@@ -99,6 +100,7 @@ class SweepWriter(HDF5Writer):
         if frame.dtype.kind == "f":
             require_finite(frame, where)
         self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
+        self._require_room()
         self._time_s.append(float(time_s))
 
     def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
@@ -210,7 +212,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
         held = "orientation" in file
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
-        with h5py.File(part, "r+") as file:
+        with DiskFile(part, keep=True) as disk, h5py.File(disk, "r+") as file:
             if held:
                 del file["orientation"]
             _write_sensor(file, sensor)
