@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, Speckle3DError
-from speckle3d.io.hdf5 import atomic_path, cannot_write, make_folder, require_target
-from speckle3d.io.parts import clear_parts, locks
+from speckle3d.core.parts import cannot_write, clear_parts, locks
+from speckle3d.io.hdf5 import atomic_path, make_folder, require_target
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,9 +16,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.io.parts import DiskFile, clear_parts, marked, part_beside
+from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
 
 PathLike = str | os.PathLike[str]
 Node: TypeAlias = h5py.Group | h5py.Dataset
@@ -29,9 +28,6 @@ _CHUNK_CACHE_BYTES = 32 * 2**20
 
 _READ_FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
 """What h5py raises, by place, when the bytes of a file do not make sense."""
-
-_NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
-"""A full disk, a limit on the size of a file, and one on what a user may store."""
 
 _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Stored kinds that may become the kind asked for."""
@@ -64,12 +60,6 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def cannot_write(path: PathLike, error: OSError) -> FileError:
-    """Error of one line for a file that the system refuses to write."""
-    kind = NoSpaceError if error.errno in _NO_SPACE else FileError
-    return kind(f"{path}: cannot be written: {one_line(error)}")
-
-
 def require_target(path: PathLike) -> Path:
     """Path of a file that may be written, resolved; to be asked before long work, too.
 
@@ -97,8 +87,7 @@ def make_folder(path: PathLike) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        kind = NoSpaceError if error.errno in _NO_SPACE else FileError
-        raise kind(f"{path}: cannot be made a folder: {one_line(error)}") from error
+        raise cannot_write(path, error, "cannot be made a folder") from error
 
 
 @contextmanager

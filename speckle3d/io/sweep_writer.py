@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
+from speckle3d.core.parts import DiskFile
 from speckle3d.core.sweep import (
     INERTIAL,
     BModeSettings,
@@ -24,7 +25,6 @@ from speckle3d.core.sweep import (
     Tracker,
 )
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
-from speckle3d.io.parts import DiskFile
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import os
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ SUFFIXES = (".nrrd", ".mha", ".nii.gz")
 
 _PIECE_BYTES = 2**20
 _GZIP_SIGNATURE = b"\x1f\x8b"
+_STDERR = 2
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -47,8 +51,15 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     """
     if not Path(path).name.lower().endswith(SUFFIXES):
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
-    with atomic_path(path) as part, image_library(path, "written") as itk:
-        itk.WriteImage(_to_image(itk, volume), str(part), useCompression=compress)
+    with atomic_path(path) as part:
+        try:
+            with image_library(path, "written") as itk, _silence():
+                itk.WriteImage(_to_image(itk, volume), str(part), useCompression=compress)
+            if part.suffix.lower() == ".gz":
+                _unpack(part)  # ITK does not notice that a disk is full
+        except FileError as error:
+            _require_room(part)
+            raise FileError(str(error).replace(str(part), str(path))) from error
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -73,6 +84,25 @@ def read_volume(path: PathLike) -> Volume:
         )
     with naming(str(path)):
         return _from_image(image, voxels)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep MetaIO's own words off stderr: it prints a line there on top of the exception."""
+    told, nowhere = os.dup(_STDERR), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, _STDERR)
+    try:
+        yield
+    finally:
+        os.dup2(told, _STDERR)
+        os.close(told)
+        os.close(nowhere)
+
+
+def _require_room(part: Path) -> None:
+    """Raise the system's own `OSError` if a file that was not written whole can take no more."""
+    with open(part, "ab") as stream:
+        stream.write(bytes(_PIECE_BYTES))
 
 
 def _to_image(itk: Any, volume: Volume) -> Any:

@@ -68,7 +68,8 @@ def only_run(directory: Path) -> Iterator[None]:
     """Hold a study's folder, which is made if need be, during the block.
 
     The operating system releases the lock when the process ends, however it ends; the lock file's text only
-    tells the reader of an error who holds it.
+    tells the reader of an error who holds it. A folder that was made, and in which nothing came to be, is
+    removed again.
 
     Raises
     ------
@@ -79,6 +80,7 @@ def only_run(directory: Path) -> Iterator[None]:
     if folder in _HELD.get():
         yield
         return
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
     try:
         file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
@@ -92,6 +94,10 @@ def only_run(directory: Path) -> Iterator[None]:
     finally:
         if token is not None:
             _HELD.reset(token)
+            if made and os.listdir(folder) == [LOCK]:
+                (folder / LOCK).unlink()
+                for each in made:
+                    each.rmdir()
         os.close(file)
 
 

@@ -19,12 +19,20 @@ from pydantic_core import to_json
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.tables import text_table
+from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.overall import over_sweeps, overall_text, shared_means
 
 FORMAT = "speckle3d.study"
 VERSION = 1
+
+FILES = FileSet(
+    "study.json",
+    ("table.txt", "table.csv"),
+    ("report.html", "figures/overview.png", "figures/overview.svg", "paper.txt", "paper.json"),
+)
+"""What a study writes, and what is made from it afterwards."""
 
 _COLUMNS = (
     ("sweep", "sweep", "{}"),
@@ -122,6 +130,8 @@ def write_summary(directory: Path, summary: Summary) -> list[Path]:
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
     """Gather what is in the sweeps' folders, and write ``study.json``, ``table.txt`` and ``table.csv``.
 
+    They replace those of an earlier study together; its report is removed.
+
     Raises
     ------
     FileError
@@ -165,8 +175,33 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
     lines = [row | {"path": paths[row["sweep"]], "copy_of": copies.get(row["sweep"], "")} for row in rows]
     lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in failed]
     texts = {"study.json": json_text(contents), "table.txt": table}
-    write_texts(directory, texts | {"table.csv": csv_text(lines, "path", "copy_of", "reason")})
+    with FILES.replaced(directory) as part:
+        write_texts(part, texts | {"table.csv": csv_text(lines, "path", "copy_of", "reason")})
     return Study(directory, outcomes, summaries, drift, table, copies)
+
+
+def is_study(directory: Path) -> bool:
+    """Whether a folder holds a study; a file of that name and other content is none."""
+    try:
+        return bool(json.loads((directory / FILES.primary).read_text(encoding="utf-8"))["format"] == FORMAT)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def require_own_study(directory: Path) -> None:
+    """Refuse a folder in which a study's names stand for something else.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first such file.
+    """
+    held = [name for name in FILES.names if (directory / name).exists()]
+    if held and not is_study(directory):
+        raise InvalidInputError(
+            f"{directory / held[0]}: expected a new folder or a study to go on with or to replace, "
+            "got a file of another origin"
+        )
 
 
 def rows_of(summaries: Sequence[Summary]) -> list[dict[str, Any]]:

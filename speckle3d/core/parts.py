@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import re
@@ -11,6 +12,18 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+
+from speckle3d.core.errors import FileError, NoSpaceError
+
+_NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""A full disk, a limit on the size of a file, and one on what a user may store."""
+
+
+def cannot_write(path: str | os.PathLike[str], error: OSError, words: str = "cannot be written") -> FileError:
+    """Error of one line for a file that the system refuses to write."""
+    kind = NoSpaceError if error.errno in _NO_SPACE else FileError
+    reason = (error.strerror or str(error).strip() or type(error).__name__).splitlines()[0]
+    return kind(f"{path}: {words}: {reason}")
 
 
 def part_beside(target: Path) -> Path:
@@ -72,7 +85,7 @@ class DiskFile:
     """
 
     def __init__(self, path: Path, keep: bool = False) -> None:
-        self._file = open(path, "r+b" if keep else "w+b", buffering=0)
+        self._file = open(path, "r+b" if keep else "w+b", buffering=0)  # noqa: SIM115 - closed with the block
         self._at = 0
         self._failure: OSError | None = None
         self._kept: list[tuple[int, bytes]] = []
