@@ -55,8 +55,11 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         try:
             with image_library(path, "written") as itk, _silence():
                 itk.WriteImage(_to_image(itk, volume), str(part), useCompression=compress)
-            if part.suffix.lower() == ".gz":
-                _unpack(part)  # ITK does not notice that a disk is full
+                # ITK does not notice a disk that fills up while it packs, or with its last bytes.
+                held = itk.GetArrayFromImage(itk.ReadImage(str(part))).T
+            _require_whole(part)
+            if not np.array_equal(held, volume.voxels, equal_nan=True):
+                raise FileError(f"{path}: cannot be written: it was cut short")
         except FileError as error:
             _require_room(part)
             raise FileError(str(error).replace(str(part), str(path))) from error
@@ -125,19 +128,24 @@ def _from_image(image: Any, voxels: npt.NDArray[Any]) -> Volume:
 def _require_whole(path: PathLike) -> None:
     """Refuse damaged files, which ITK fills with zeros or reports without naming them."""
     with reading(path), open(path, "rb") as stream:
-        start = stream.read(512)
+        start = stream.read(4096)
     if is_metaimage(start):
         read_header(path)
     elif start.startswith(_GZIP_SIGNATURE):
         _unpack(path)
     elif not is_nrrd(start):
         raise InvalidInputError(f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else")
+    elif _GZIP_SIGNATURE in start and b"\n\n" in start:
+        header, _, data = start.partition(b"\n\n")
+        if data.startswith(_GZIP_SIGNATURE):
+            _unpack(path, len(header) + 2)
 
 
-def _unpack(path: PathLike) -> None:
-    """Read a gzip file to its end, where it keeps its check sum."""
+def _unpack(path: PathLike, offset: int = 0) -> None:
+    """Read what is packed from an offset on to its end, where gzip keeps its check sum."""
     try:
-        with reading(path), gzip.open(path) as unpacked:
+        with reading(path), open(path, "rb") as packed, gzip.open(packed) as unpacked:
+            packed.seek(offset)
             while unpacked.read(_PIECE_BYTES):
                 pass
     except (EOFError, zlib.error) as error:
