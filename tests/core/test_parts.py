@@ -1,28 +1,16 @@
 """Temporary files, and files on a disk that is full."""
 
 import os
-import resource
-from contextlib import contextmanager
 
 import h5py
 import numpy as np
 import pytest
+from disks import limited
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import FileError, NoSpaceError
 from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
-
-
-@contextmanager
-def limited(size):
-    """Let no file of this process become larger: a full disk that needs no rights."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_what_a_killed_process_left_is_removed_and_what_is_at_work_is_not(tmp_path):

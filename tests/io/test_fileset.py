@@ -51,7 +51,9 @@ def test_a_set_takes_the_place_of_the_old_one_and_other_files_stay(tmp_path):
     assert tmp_path.stat().st_ino == before
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no"), OSError(28, "No space left on device")])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), ValueError("no"), OSError(28, "No space left on device")]
+)
 def test_a_failure_leaves_everything_as_it_was(tmp_path, error):
     kind = FileError if isinstance(error, OSError) else type(error)
     with pytest.raises(kind):
