@@ -213,7 +213,10 @@ def _calibrate(
     if validation is not None:
         other, other_seen, _ = scan(validation, None)
         notes += _validated(outcome, other, other_seen, validation)
-    dots = PickedPoints(seen.frame, seen.pixels, seen.wire)
+
+    def write_dots(path: Path) -> None:
+        write_points(path, PickedPoints(seen.frame, seen.pixels, seen.wire), wire_names)
+
     write_with_report(
         outcome.calibration,
         [images],
@@ -222,7 +225,7 @@ def _calibrate(
         notes,
         outcome.beam,
         as_json,
-        None if seen.are_lines else lambda path: write_points(path, dots, wire_names),
+        None if seen.are_lines else write_dots,
     )
 
 
