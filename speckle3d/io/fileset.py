@@ -57,26 +57,27 @@ class FileSet:
             If another run is at work on the same set, or the system refuses to write.
         """
         # A link to a folder, or the working directory as ".", stays what it is.
-        folder = folder.resolve()
-        for name in self.names:
-            if folder.is_dir():
-                require_target(folder / name)
+        given, folder = folder, folder.resolve()
         existed = folder.is_dir()
+        if folder.exists() and not existed:
+            raise FileError(f"{given}: expected a folder or a new name, got a file")
+        for name in self.names if existed else ():
+            require_target(folder / name)
         base, name = (folder, self.primary) if existed else (folder.parent, folder.name)
         above = [each for each in (base, *base.parents) if not each.exists()]
         make_folder(base)
         part = _part(base, name)
         try:
-            with _held(part, folder):
+            with _held(part, given):
                 self._finish_killed(folder)
                 yield part
                 self._put_in_place(part, folder)
         except Speckle3DError as error:
             if str(part) not in str(error):
                 raise
-            raise type(error)(str(error).replace(str(part), str(folder))) from error
+            raise type(error)(str(error).replace(str(part), str(given))) from error
         except OSError as error:
-            raise cannot_write(folder, error) from error
+            raise cannot_write(given, error) from error
         finally:
             for each in above:
                 with suppress(OSError):  # it holds something by now
@@ -90,8 +91,8 @@ class FileSet:
         if not folder.exists():
             os.rename(part, folder)
             return
-        os.rename(part, self._decided(folder))
         try:
+            os.rename(part, self._decided(folder))
             self._move(folder)
         except BaseException:  # Ctrl-C, too, comes too late
             self._move(folder)

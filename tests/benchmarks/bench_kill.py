@@ -23,13 +23,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+DRIFT = ("--drift", "orientation", "--drift", "pose")
 SMALL = ("--vectors", "26", "--samples", "1800", "--length-mm", "3", "--frames", "24")
 PLANE = ("--preset", "plane", "--vectors", "40", "--frames", "60", "--duration-s", "12", "--reflector", "bar")
 STEPPED = ("--preset", "stepped", "--steps", "15", "--step-mm", "0.06", "--blocks", "2")
@@ -60,16 +61,7 @@ class Case:
 
 
 def cases(inputs: Path) -> dict[str, Case]:
-    """All commands, on inputs that are made here."""
-    for seed in ("5", "6", "7"):
-        command("simulate", str(inputs / f"s{seed}.h5"), *SMALL, "--seed", seed)
-    for seed in ("8", "9"):
-        command("simulate", str(inputs / f"plane{seed}.h5"), *PLANE, "--seed", seed)
-        command("simulate", str(inputs / f"stepped{seed}.h5"), *SMALL[:4], *STEPPED, "--seed", seed)
-    command("calibrate", "curves", str(inputs / "stepped8.h5"), "-o", str(inputs / "curves.h5"))
-    for seed in ("5", "6"):
-        command("reconstruct", str(inputs / f"s{seed}.h5"), "-o", str(inputs / f"r{seed}"), *DRIFT)
-    (inputs / "blocks.toml").write_text(BLOCKS)
+    """All commands, and what is to be killed of them."""
 
     def pair(*words: str, first: str, second: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         made = [tuple(word.format(i=inputs, n=n, out="{out}") for word in words) for n in (first, second)]
@@ -104,7 +96,31 @@ def cases(inputs: Path) -> dict[str, Case]:
     return found
 
 
-DRIFT = ("--drift", "orientation", "--drift", "pose")
+def make_inputs(chosen: Iterable[Case], inputs: Path) -> None:
+    """Make the files that commands read."""
+    words = {word for case in chosen for word in (*case.old, *case.new)}
+    for name in sorted({Path(word).relative_to(inputs).parts[0] for word in words if str(inputs) in word}):
+        make_input(inputs / name)
+
+
+def make_input(path: Path) -> None:
+    """Make one file, and before it those that it is made from."""
+    if path.exists():
+        return
+    seed, beside = path.stem[-1], path.parent
+    if path.name == "blocks.toml":
+        path.write_text(BLOCKS)
+    elif path.name == "curves.h5":
+        make_input(beside / "stepped8.h5")
+        command("calibrate", "curves", str(beside / "stepped8.h5"), "-o", str(path))
+    elif path.name.startswith("r"):
+        make_input(beside / f"s{seed}.h5")
+        command("reconstruct", str(beside / f"s{seed}.h5"), "-o", str(path), *DRIFT)
+    else:
+        kind = {"plane": PLANE, "stepped": (*SMALL[:4], *STEPPED), "s": SMALL}[path.stem[:-1]]
+        command("simulate", str(path), *kind, "--seed", seed)
+        if kind == SMALL:
+            make_input(beside / "curves.h5")
 
 
 def command(*arguments: str) -> float:
@@ -264,6 +280,7 @@ def main(moments: int = 100, seed: int = 1, wanted: tuple[str, ...] = ()) -> int
         chosen = {
             n: c for n, c in cases(inputs).items() if not wanted or n.split(",")[0].split()[0] in wanted
         }
+        make_inputs(chosen.values(), inputs)
         for number, (name, case) in enumerate(chosen.items()):
             share = moments // len(chosen) + (number < moments % len(chosen))
             total += measure(name, case, share, rng, Path(folder) / f"case{number}")
