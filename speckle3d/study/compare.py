@@ -156,10 +156,12 @@ def _run(
                 outcome = outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
             so_far.add(outcome, where.workers)
             tell(so_far)
-    finally:
+    except BaseException:
         _clear(jobs)
-        with suppress(OSError):  # it holds sweeps
+        with suppress(OSError):  # it holds finished sweeps
             folders.rmdir()
+        raise
+    _clear(jobs)
     return outcomes
 
 
