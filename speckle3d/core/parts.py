@@ -52,13 +52,18 @@ def clear_parts(target: Path) -> None:
     """Remove temporary siblings of a file that are marked by no process; without locks, none."""
     fcntl = locks()
     own = re.compile(rf"\.part-[0-9a-f]{{8}}-{re.escape(target.name)}")
-    left = [each for each in os.scandir(target.parent) if own.fullmatch(each.name) and each.is_file()]
-    for entry in left if fcntl is not None else ():
+    try:
+        left = [
+            each.path for each in os.scandir(target.parent) if own.fullmatch(each.name) and each.is_file()
+        ]
+    except OSError:  # a folder that may be written, but not listed
+        return
+    for path in left if fcntl is not None else ():
         with suppress(OSError):  # gone by now, of another user, or marked
-            file = os.open(entry.path, os.O_RDONLY)
+            file = os.open(path, os.O_RDONLY)
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                os.unlink(entry.path)
+                os.unlink(path)
             finally:
                 os.close(file)
 
