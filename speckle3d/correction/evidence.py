@@ -71,8 +71,8 @@ class _Lag:
     seconds: float
 
 
-class ImageEvidence:
-    """Motion of the image's centre between frames some way apart, as the images have it.
+class MotionEvidence:
+    """Motion of the image's centre between frames some way apart, as the images or a tracker have it.
 
     In-plane motion and roll are measured on speckle that both frames show; tilt and yaw are known roughly;
     the sign of the elevational motion is open, and with it those of tilt and yaw.
@@ -82,11 +82,15 @@ class ImageEvidence:
     time_s : ndarray, shape (n,)
     centre_mm : ndarray, shape (3,)
     image : RigidTransform, length n
-        Image-based poses.
+        Poses of the image.
+    by_images : bool
+        Whether the poses are from images; if not, from a tracker, which knows every turn and every sign.
     """
 
-    def __init__(self, time_s: FloatArray, centre_mm: FloatArray, image: RigidTransform) -> None:
-        self.time_s, self.centre_mm, self.image = time_s, centre_mm, image
+    def __init__(
+        self, time_s: FloatArray, centre_mm: FloatArray, image: RigidTransform, by_images: bool = True
+    ) -> None:
+        self.time_s, self.centre_mm, self.image, self.by_images = time_s, centre_mm, image, by_images
         n, pause = len(image), float(np.median(np.diff(time_s)))
         longest = max(2, n // 3)
         lags = {int(np.clip(round(_SHORT_S / pause), 2, longest)), max(2, n // 5), longest}
@@ -177,10 +181,10 @@ class ImageEvidence:
         return Rotation.from_matrix(left @ proper @ right)
 
     def elevational_scale(self, tracker: Tracker) -> tuple[float, float]:
-        """Travel of the image's centre along the first image's z over the images' own, and its standard error.
+        """Travel along the first image's z over the images' own, and its standard error.
 
-        Both paths are compared over the whole sweep, where jitter counts least; the error is from what is left,
-        which wanders: some `_WANDERING` independent values.
+        Both paths are compared over the whole sweep, where jitter counts least; the error is from what is
+        left, which wanders: some `_WANDERING` independent values.
         """
         covered = np.flatnonzero(tracker.covers(self.time_s))
         sensed = _elevation(tracker.world_from_image(self.time_s[covered]), self.centre_mm)
@@ -208,7 +212,8 @@ class ImageEvidence:
         size = _spread(forward)
         wander = np.sqrt(lag.seconds / _SHORT_S) * np.array([_WANDER_MM] * 3 + [_WANDER_DEG] * 3)[-columns:]
         turning = np.zeros(columns)
-        turning[-3:-1] = np.hypot(_TURN_DEG, _TURN_SHARE * size[-3:-1])
+        if self.by_images:
+            turning[-3:-1] = np.hypot(_TURN_DEG, _TURN_SHARE * size[-3:-1])
         parts = (noise[-columns:], self._jitter[-columns:], wander, turning, _SCALE_ERROR * size)
         expected = np.sqrt(np.sum(np.square(parts), axis=0))
         independent = 1.0 + float(covered.mean()) * max(lag.independent, 0.0)
@@ -221,7 +226,7 @@ class ImageEvidence:
                 left[:, 2] = sensed[:, 2] - np.clip(scale, *_ELEVATION_RANGE) * seen[:, 2]
             return Agreement(_spread(left), size, expected, independent)
 
-        return fit(forward), fit(forward * _MIRRORED[-columns:])
+        return fit(forward), fit(forward * _MIRRORED[-columns:]) if self.by_images else fit(forward)
 
 
 def total_misfit(agreements: list[Agreement]) -> float:
@@ -246,12 +251,15 @@ class GyroscopeEvidence:
     ----------
     left, measured : ndarray, shape (3,)
         Standard deviation of gyroscope less readings, and of the gyroscope's turns.
+    bias : float
+        Rate by which the gyroscope turns on the whole and the readings do not, or the other way, deg/s.
     noise, steps : float
         As in `Agreement`.
     """
 
     left: FloatArray
     measured: FloatArray
+    bias: float
     noise: float
     steps: float
 
@@ -286,8 +294,9 @@ def gyroscope_evidence(sensor: OrientationSensor) -> GyroscopeEvidence | None:
     left = integrated - read
     measured = _spread(integrated - np.median(integrated, axis=0))
     noise = 0.1 + _SCALE_ERROR * float(measured.max())
-    # The gyroscope's bias is no fault of the readings.
-    return GyroscopeEvidence(_spread(left - np.median(left, axis=0)), measured, noise, len(turned) / lag)
+    drift = np.median(left, axis=0)
+    bias = float(np.linalg.norm(drift) / np.median(time_s[first + lag] - time_s[first]))
+    return GyroscopeEvidence(_spread(left - drift), measured, bias, noise, len(turned) / lag)
 
 
 def gravity_from_vertical(sensor: OrientationSensor) -> float | None:
