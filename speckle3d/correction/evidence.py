@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +103,7 @@ class MotionEvidence:
         n = len(self.image)
         count = min(n - lag, _MOST_STEPS)
         first = np.unique(np.linspace(0, n - 1 - lag, count).round().astype(int))
-        steps = _steps(self.image[first], self.image[first + lag], self.centre_mm)
+        steps = steps_between(self.image[first], self.image[first + lag], self.centre_mm)
         return _Lag(first, first + lag, steps, (n - lag) / lag, lag * pause_s)
 
     def agreements(
@@ -120,10 +121,8 @@ class MotionEvidence:
             Instead, how a sensor that does not move would fit.
         """
         found: tuple[list[Agreement], ...] = ([], [])
-        for lag in self.lags:
-            covered = self._covered(sensor, lag)
+        for lag, covered, sensed in self._sensed(sensor):
             if covered.sum() >= _FEWEST_STEPS:
-                sensed = self._sensed(sensor, lag, covered)
                 both = self._both_signs(np.zeros_like(sensed) if still else sensed, noise, lag, covered)
                 for agreements, agreement in zip(found, both, strict=True):
                     agreements.append(agreement)
@@ -151,7 +150,8 @@ class MotionEvidence:
         if not enough.any():
             return misfit, steps
         wanted = covered & enough[:, None]
-        sensed = sensed_steps(sensor, times[:, 0][wanted], times[:, 1][wanted], self.centre_mm)
+        first, second = (sensor.world_from_image(times[:, i][wanted]) for i in (0, 1))
+        sensed = steps_between(first, second, self.centre_mm)
         parts = np.split(sensed, np.cumsum(wanted.sum(axis=1))[:-1])
         for i in np.flatnonzero(enough):
             best = min(
@@ -163,11 +163,9 @@ class MotionEvidence:
     def turn(self, sensor: OrientationSensor | Tracker, noise: FloatArray, sign: int) -> Rotation:
         """Rotation of the image on the sensor that best maps the images' steps to the sensor's."""
         sensed, seen = [], []
-        for lag in self.lags:
-            covered = self._covered(sensor, lag)
+        for lag, covered, measured in self._sensed(sensor):
             if covered.sum() < _FEWEST_STEPS:
                 continue
-            measured = self._sensed(sensor, lag, covered)
             columns = measured.shape[1]
             images = lag.steps[covered, -columns:] * (_MIRRORED[-columns:] if sign < 0 else 1.0)
             for axes in (slice(0, 3), slice(-3, None))[-(columns // 3) :]:
@@ -196,12 +194,14 @@ class MotionEvidence:
         spread = float(np.std(sensed - scale * seen))
         return abs(scale), spread * float(np.sqrt(covered.size / (_WANDERING * power)))
 
-    def _covered(self, sensor: OrientationSensor | Tracker, lag: _Lag) -> BoolArray:
-        return sensor.covers(self.time_s[lag.first]) & sensor.covers(self.time_s[lag.second])
-
-    def _sensed(self, sensor: OrientationSensor | Tracker, lag: _Lag, covered: BoolArray) -> FloatArray:
-        first, second = self.time_s[lag.first[covered]], self.time_s[lag.second[covered]]
-        return sensed_steps(sensor, first, second, self.centre_mm)
+    def _sensed(self, sensor: OrientationSensor | Tracker) -> Iterator[tuple[_Lag, BoolArray, FloatArray]]:
+        """Each lag, which of its steps a sensor covers, and these as the sensor has them."""
+        covered = sensor.covers(self.time_s)
+        poses, index = sensor.world_from_image(self.time_s[covered]), np.cumsum(covered) - 1
+        for lag in self.lags:
+            both: BoolArray = covered[lag.first] & covered[lag.second]
+            first, second = poses[index[lag.first[both]]], poses[index[lag.second[both]]]
+            yield lag, both, steps_between(first, second, self.centre_mm)
 
     def _both_signs(
         self, sensed: FloatArray, noise: FloatArray, lag: _Lag, covered: BoolArray
@@ -309,25 +309,21 @@ def gravity_from_vertical(sensor: OrientationSensor) -> float | None:
     return float(np.degrees(np.arccos(min(1.0, abs(float(up[2])) / size)))) if size > 0 else None
 
 
-def sensed_steps(
-    sensor: OrientationSensor | Tracker, first_s: FloatArray, second_s: FloatArray, centre_mm: FloatArray
+def steps_between(
+    first: RigidTransform | Rotation, second: RigidTransform | Rotation, centre_mm: FloatArray
 ) -> FloatArray:
-    """Motion of the image between two times each, as a sensor has it, seen from the first place.
+    """Motion from first to second places, seen from the first.
 
     Returns
     -------
     ndarray, shape (m, 6) or (m, 3)
-        x, y, z of the image's centre in mm, where the sensor knows it, and tilt, yaw, roll in degrees.
+        x, y, z of the image's centre in mm, where places are known, and tilt, yaw, roll in degrees.
     """
-    if isinstance(sensor, Tracker):
-        return _steps(sensor.world_from_image(first_s), sensor.world_from_image(second_s), centre_mm)
-    turn = sensor.world_from_image(first_s).inv() * sensor.world_from_image(second_s)
-    return np.asarray(turn.as_rotvec(degrees=True))
-
-
-def _steps(first: RigidTransform, second: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    step = first.inv() * second
-    return np.hstack([step.apply(centre_mm) - centre_mm, step.rotation.as_rotvec(degrees=True)])
+    if isinstance(first, RigidTransform) and isinstance(second, RigidTransform):
+        step = first.inv() * second
+        return np.hstack([step.apply(centre_mm) - centre_mm, step.rotation.as_rotvec(degrees=True)])
+    turns = [each.rotation if isinstance(each, RigidTransform) else each for each in (first, second)]
+    return np.asarray((turns[0].inv() * turns[1]).as_rotvec(degrees=True))
 
 
 def _elevation(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
