@@ -31,9 +31,11 @@ from speckle3d.correction.suspects import Suspect, suspects
 TRACKER, ORIENTATION = "tracker", "orientation sensor"
 
 _HELD_S, _LONGEST_STILL_S = 0.15, 0.5
-"""Loggers repeat a reading until the next; beyond the second time, unchanged readings are left out."""
+"""Loggers repeat a reading until the next; beyond the second time, unchanged readings are told."""
 _MOST_STILL = 0.2
 """Share of the sweep over which readings that do not change at all refute a sensor."""
+_MOVED_MM = 0.5
+"""By which images must have moved meanwhile: a probe may rest, and a simulated sensor have no noise."""
 _NOISE, _MOST_NOISE = (1.5, 1.5), (10.0, 10.0)
 """Jitter of a step, mm and degrees: that of sensors in use is below 0.5 and 0.3."""
 _MOST_SPIKES = 0.3
@@ -79,7 +81,7 @@ class Trust:
 
 
 def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
-    """Leave out single wild readings, and readings that stand still while the probe moves, and count them.
+    """Leave out single wild readings, and count them.
 
     Parameters
     ----------
@@ -88,11 +90,11 @@ def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
     Returns
     -------
     Sweep
-        With what is left of its sensors' readings; as they are where a sensor is refuted.
+        With what is left of its sensors' readings.
     tuple of Doubt
     """
-    tracker, about_tracker = _cleaned(sweep.tracker, TRACKER, sweep)
-    orientation, about_orientation = _cleaned(sweep.orientation, ORIENTATION, sweep)
+    tracker, about_tracker = _cleaned(sweep.tracker)
+    orientation, about_orientation = _cleaned(sweep.orientation)
     doubts = (*about_tracker, *about_orientation)
     return (replace(sweep, tracker=tracker, orientation=orientation) if doubts else sweep), doubts
 
@@ -109,28 +111,15 @@ def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
     )
 
 
-def _cleaned(sensor: Sensor | None, about: str, sweep: Sweep) -> tuple[Sensor | None, list[Doubt]]:
-    if sensor is None:
-        return None, []
-    doubts = []
-    wild = spikes(sensor)
-    if wild.any():
-        share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
-        if wild.mean() > _MOST_SPIKES:
-            return sensor, [Doubt(about, "noise or scrambled values", f"expected a path, but {share}", True)]
-        doubts.append(Doubt(about, "spikes", f"{share}, and are left out", False))
-        sensor = without(sensor, wild)
-    begin, end = standstill(sensor)
-    first, last = sweep.frame_time_s[[0, -1]] - sensor.time_offset_s
-    still = max(0.0, min(end, last) - max(begin, first))
-    refuted = bool(still > max(_HELD_S, _MOST_STILL * (last - first)))
-    if refuted or still > _LONGEST_STILL_S:
-        seen = f"expected readings that change, got the same one for {still:.2f} of {last - first:.2f} s"
-        doubts.append(Doubt(about, "frozen", seen, refuted))
-        if not refuted:
-            time_s = sensor.readings.time_s
-            sensor = without(sensor, (time_s > begin) & (time_s <= end))
-    return sensor, doubts
+def _cleaned(sensor: Sensor | None) -> tuple[Sensor | None, list[Doubt]]:
+    wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
+    if sensor is None or not wild.any():
+        return sensor, []
+    share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
+    if wild.mean() > _MOST_SPIKES:
+        evidence = f"expected a path, but {share}"
+        return sensor, [Doubt(name_of(sensor), "noise or scrambled values", evidence, True)]
+    return without(sensor, wild), [Doubt(name_of(sensor), "spikes", f"{share}, and are left out", False)]
 
 
 def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) -> Trust:
@@ -152,14 +141,14 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) ->
     seen = MotionEvidence(sweep.frame_time_s, sweep.grid.centre_mm, image)
     doubts: list[Doubt] = []
     if sweep.tracker is not None and _usable(sweep.tracker, seen):
-        found = [*_Examination(TRACKER, sweep.tracker, seen).doubts()]
+        found = [*_frozen_doubts(sweep.tracker, seen)] or [*_Examination(sweep.tracker, seen).doubts()]
         doubts += found or _unequal_lengths(sweep.tracker, seen, length_sigma)
     confirmed = False
     if sweep.orientation is not None and _usable(sweep.orientation, seen):
-        examination = _Examination(ORIENTATION, sweep.orientation, seen)
-        found = [*examination.doubts()]
+        examination = _Examination(sweep.orientation, seen)
+        found = [*_frozen_doubts(sweep.orientation, seen)] or [*examination.doubts()]
         if not found and sweep.tracker is not None and not doubts and _usable(sweep.tracker, seen):
-            found = [*_Examination(ORIENTATION, sweep.orientation, _tracked(sweep, sweep.tracker)).doubts()]
+            found = [*_Examination(sweep.orientation, _tracked(sweep, sweep.tracker)).doubts()]
         found = found or [*examination.weak_doubts(), *_gravity_doubts(sweep.orientation)]
         confirmed = examination.turn_confirmed() and not any(doubt.refuted for doubt in found)
         doubts += found
@@ -215,8 +204,8 @@ class _Gain:
 class _Examination(Generic[Sensor]):
     """One sensor against the images, and against its gyroscope if it has one."""
 
-    def __init__(self, about: str, sensor: Sensor, seen: MotionEvidence) -> None:
-        self.about, self.seen = about, seen
+    def __init__(self, sensor: Sensor, seen: MotionEvidence) -> None:
+        self.about, self.seen = name_of(sensor), seen
         self.sensor: Sensor = sensor
         self.noise = noise_of(sensor, seen.time_s, seen.centre_mm)
         self.agreements = seen.agreements(sensor, self.noise)
@@ -315,6 +304,22 @@ class _Examination(Generic[Sensor]):
         whose = "images'" if self.seen.by_images else "tracker's"
         seen = f"expected steps in {names[part]} as the {whose} ({last.seen[part]:.2f} {unit} rms) to "
         return f"{seen}{last.noise[part]:.2f} {unit}, got a difference of {last.left[part]:.2f}"
+
+
+def _frozen_doubts(sensor: OrientationSensor | Tracker, seen: MotionEvidence) -> Iterator[Doubt]:
+    """Readings that are all the same while the images move."""
+    begin, end = standstill(sensor)
+    time_s = seen.time_s - sensor.time_offset_s
+    during = (time_s >= begin) & (time_s <= end)
+    if during.sum() < 2:
+        return
+    still, whole = float(np.ptp(time_s[during])), float(np.ptp(time_s))
+    path_mm = seen.image[during].apply(seen.centre_mm)
+    moved = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
+    refuted = still > max(_HELD_S, _MOST_STILL * whole)
+    if moved > _MOVED_MM and (refuted or still > _LONGEST_STILL_S):
+        evidence = f"expected readings that change, got the same one for {still:.2f} of {whole:.2f} s"
+        yield Doubt(name_of(sensor), "frozen", evidence, refuted)
 
 
 def _turned(sensor: Sensor, turn: Rotation, centre_mm: FloatArray) -> Sensor:
