@@ -81,8 +81,8 @@ def cases(inputs: Path) -> dict[str, Case]:
     crossed = ("simulate", "{out}/a.h5", *SMALL[:6], "--preset", "crossed", "--frames", "12", "--seed", "{n}")
     beside = ("c.h5", "c.txt", "c.png")
     found = {
-        "reconstruct": Case(*reconstruct, results),
-        "reconstruct, new folder": Case(*reconstruct, results, fresh=True),
+        "reconstruct over results": Case(*reconstruct, results),
+        "reconstruct into a new folder": Case(*reconstruct, results, fresh=True),
         "compare": Case(*compare, **held),
         "compare --workers 2": Case(compare[0], (*compare[1], "--workers", "2"), **held),
         "simulate": Case(*pair(*crossed, first="3", second="4"), ("a.h5", "a-crossing.h5")),
