@@ -52,17 +52,16 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     if not Path(path).name.lower().endswith(SUFFIXES):
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
     with atomic_path(path) as part:
-        try:
-            with image_library(path, "written") as itk, _silence():
+        with image_library(path, "written") as itk, _silence():
+            try:
                 itk.WriteImage(_to_image(itk, volume), str(part), useCompression=compress)
-                # ITK does not notice a disk that fills up while it packs, or with its last bytes.
-                held = itk.GetArrayFromImage(itk.ReadImage(str(part))).T
-            _require_whole(part)
-            if not np.array_equal(held, volume.voxels, equal_nan=True):
-                raise FileError(f"{path}: cannot be written: it was cut short")
-        except FileError as error:
+            except RuntimeError:
+                _require_room(part)
+                raise
+        # ITK does not notice a disk that fills up while it packs, or with its last bytes.
+        if not _holds(part, volume):
             _require_room(part)
-            raise FileError(str(error).replace(str(part), str(path))) from error
+            raise FileError(f"{path}: cannot be written: it was cut short")
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -100,6 +99,15 @@ def _silence() -> Iterator[None]:
         os.dup2(told, _STDERR)
         os.close(told)
         os.close(nowhere)
+
+
+def _holds(path: Path, volume: Volume) -> bool:
+    """Whether a file that was just written has all voxels."""
+    try:
+        held = read_volume(path).voxels
+    except (FileError, InvalidInputError):
+        return False
+    return np.array_equal(held, volume.voxels.astype(held.dtype), equal_nan=True)
 
 
 def _require_room(part: Path) -> None:
