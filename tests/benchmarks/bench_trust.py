@@ -3,10 +3,11 @@
 Run: ``python tests/benchmarks/bench_trust.py [--first-seed N] [--good 64] [--faulty 8] [--fault WORD]``.
 
 First, 64 good sweeps (`corpus.py`): how many are refused, wholly or in a mode, and how many flagged. Then
-every fault of ``tests/faults.py`` on some of them and on the sweep that comes with the project: what was
-said, whether it names the suspect, and how often the result is confident and wrong, that is, given without a
-doubt although a length is off by more than three claimed deviations and 3 %, or a tilt by more than 1 degree,
-beyond what the same sweep gives without the fault. The truth is for judging: no sweep has it when tracked.
+every fault of ``tests/faults.py`` and ``tests/rare_faults.py`` on some of them and on the sweep that comes
+with the project: what was said, whether it names the suspect, whether it blames what is innocent, and how
+often the result is confident and wrong. That is: given without a doubt although a length is off by more than
+three claimed deviations and 3 %, or a tilt by more than 1 degree, beyond what the same sweep gives without
+the fault. The truth is for judging: no sweep has it when tracked.
 
 Ends with status 1 where good sweeps are refused, more than one in 64 is flagged, or anything crashes.
 Seeds from 7001 on were never used in development; take others to judge thresholds chosen on these.
@@ -32,7 +33,8 @@ from cache import DEFAULT
 from corpus import COUNT, CURVES, FIRST_SEED, drawn, good_sweep
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from faults import FAULTS, FAULTS_BY_NAME, Fault
+from faults import FAULTS, Fault
+from rare_faults import RARE
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
@@ -45,6 +47,7 @@ from speckle3d.pipeline import Tracked, correct, match_ahead, track
 from speckle3d.scoring.lengths import compare_modes
 
 SHIPPED = CURVES.parent / "phantom.h5"
+EVERY = {fault.name: fault for fault in (*FAULTS, *RARE)}
 MODES = ("orientation", "pose")
 MOST_FLAGGED = 1 / 64
 WRONG_PERCENT, WRONG_DEVIATIONS, WRONG_TILT_DEG = 3.0, 3.0, 1.0
@@ -206,7 +209,7 @@ def judge(path: Path, names: Sequence[str], curves: DecorrelationCurves) -> tupl
     good = reconstruct(sweep, curves, matched.get)
     rows = []
     for name in names:
-        fault = FAULTS_BY_NAME[name]
+        fault = EVERY[name]
         bad, read = fault.into(sweep), fault.into_curves(curves)
         # What sees the same images shares the matches, which do not depend on sensors or curves.
         same = bad.frames is sweep.frames and bad.grid == sweep.grid
@@ -263,7 +266,7 @@ def report_faults(rows: list[Judged]) -> None:
     """Print the table of faults."""
     heads = ("sweeps", "refused", "flagged", "nothing", "named", "innocent", "wrong")
     print(f"\n{'fault':42}" + "".join(f"{head:>9}" for head in heads) + "  confident and wrong")
-    for fault in FAULTS:
+    for fault in EVERY.values():
         mine = [row for row in rows if row.fault == fault.name]
         if not mine:
             continue
@@ -306,7 +309,7 @@ def main() -> None:
         sweeps = [future.result() for future in made]
         opened = {path: load_sweep(path) for path in sweeps}
         wanted: dict[Path, list[str]] = {path: [] for path in [SHIPPED, *sweeps]}
-        for fault in FAULTS if options.faulty else ():
+        for fault in EVERY.values() if options.faulty else ():
             if options.fault in fault.name:
                 for path in chosen(fault, opened, options.faulty):
                     wanted[path].append(fault.name)
