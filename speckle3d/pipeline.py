@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
@@ -34,12 +35,14 @@ from speckle3d.matching.blocks import (
 from speckle3d.matching.chosen import match_again, match_in_order
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
+from speckle3d.motion.plausibility import far_apart, interleaved, standing, undetermined
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -81,6 +84,8 @@ class Tracked:
         What the images' own yaw and tilt are worth.
     times : StageTimes
         Seconds spent in each stage.
+    doubts : tuple of Doubt
+        What of the recording is used, but not to be relied on.
     """
 
     image: RigidTransform
@@ -94,6 +99,7 @@ class Tracked:
     coherence: Coherence | None
     slopes: SlopeEvidence
     times: StageTimes
+    doubts: tuple[Doubt, ...] = ()
 
 
 def track(
@@ -135,7 +141,8 @@ def track(
     MismatchError
         If the curves belong to another probe, frequency, sampling or patch size.
     InsufficientDataError
-        If too many frames have no speckle in common with others.
+        If too many frames have no speckle in common with others, if the images do not determine the length,
+        or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
 
     Examples
     --------
@@ -156,10 +163,13 @@ def track(
         sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
     )
     flags = _flagged(sweep, found, settings)
+    _believed(sweep, interleaved(found.table, len(sweep), settings.trajectory.least_correlation))
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
     flags = _with_unjoined(flags, reader, pairs)
+    with times.of("standing echoes"):
+        doubts = _believed(sweep, _standing(sweep, matcher, curves, path, flags))
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -185,6 +195,7 @@ def track(
             0.0 if coherence is None else float(coherence.share.mean()),
         )
         direction, source = settle_direction(sweep, trajectory.poses, settings.sensors)
+    doubts += _believed(sweep, _undetermined(trajectory.poses, covariance, matcher, curves))
 
     # -> orientation-consistent subset -> its own trajectory
     with times.of(PLANES):
@@ -205,6 +216,7 @@ def track(
         coherence=coherence,
         slopes=slopes,
         times=times,
+        doubts=doubts,
     )
 
 
@@ -271,6 +283,31 @@ def _measured(
             pairs = reader.measure(table, path, sound, coherence)
             path = reader.path(table, pairs, coherence)
     return pairs, coherence, path
+
+
+def _believed(sweep: Sweep, doubt: Doubt | None) -> tuple[Doubt, ...]:
+    """Refuse what is refuted; anything else is used and flagged."""
+    if doubt is not None and doubt.refuted:
+        raise InsufficientDataError(f"{sweep.name}: {doubt}")
+    return () if doubt is None else (doubt,)
+
+
+def _standing(
+    sweep: Sweep, matcher: FrameMatcher, curves: DecorrelationCurves, path: FloatArray, flags: IntArray
+) -> Doubt | None:
+    frames = far_apart(path[:, 0], flags == 0, curves)
+    if len(frames) < 2:
+        return None
+    share = standing_share(sweep, matcher, frames.tolist())
+    return standing(share, len(frames), float(np.median(curves.cells)))
+
+
+def _undetermined(
+    poses: RigidTransform, covariance: FloatArray, matcher: FrameMatcher, curves: DecorrelationCurves
+) -> Doubt | None:
+    return undetermined(
+        poses.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])
+    )
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:

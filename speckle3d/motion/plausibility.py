@@ -1,0 +1,138 @@
+"""Whether a sweep's images can be what they are taken for: one probe that moves past what it images.
+
+Each test asks for what no honest sweep shows, however noisy, and needs no truth: frames far apart that hold
+the same echoes in the same place, frames that resemble the one before less than the one before that, and a
+length that the images leave open.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.doubts import Doubt
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.distances import LEAST_CORRELATION
+
+IMAGES = "images"
+"""What all doubts of this module are about."""
+
+OPEN_SHARE, LOOSE_SHARE = 0.5, 0.25
+"""Standard error over length from which a length is refused and flagged. Good sweeps claim up to 0.06, those
+with noise of half the signal's power 0.15."""
+
+MOST_FRAMES = 10
+"""Frames in which standing echoes are looked for: 45 pairs, held at once."""
+STANDING_FLAGGED, STANDING_REFUSED = 0.01, 0.05
+"""Share of power, in the median patch. Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard
+errors wrong at 0.09; 64 patches without clutter come to +-0.005."""
+STANDING_SIGMA = 5.0
+"""Standard errors that the median patch's share must be above zero."""
+PATCH_STANDING = 0.2
+"""Share at which a patch is lost to what stands still; without, patches scatter by 0.02."""
+PATCHES_FLAGGED, PATCHES_REFUSED = 0.1, 1 / 3
+"""Share of such patches. Of 0.25 of them the adaptation to coherent echoes makes good, of 0.5 not."""
+
+OUT_OF_TURN = 0.1
+"""By how much a frame must be less like the last one than like the one before that: ten times what the median
+over fifty patches scatters by."""
+MOST_OUT_OF_TURN = 0.6
+"""Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
+MOST_STRANGERS = 0.3
+"""Share of frames like neither of the last two, but like an earlier one."""
+
+
+def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
+    """Doubt a length whose standard error is a large part of itself and of what the curves measure.
+
+    Parameters
+    ----------
+    position_mm, sigma_mm : ndarray, shape (n,)
+        Elevational position of every frame, and its standard deviation against the first.
+    reach_mm : float
+        Largest distance in the curves: a probe at rest is known to much less.
+    """
+    length, sigma = float(np.ptp(position_mm)), float(np.max(sigma_mm))
+    allowed = max(OPEN_SHARE * length, reach_mm)
+    loose = max(LOOSE_SHARE * length, reach_mm / 2)
+    if sigma <= loose:
+        return None
+    limit = allowed if sigma > allowed else loose
+    evidence = (
+        f"expected a length known to {limit:.3g} mm, got {length:.3g} mm with a standard error of "
+        f"{sigma:.3g} mm: the correlations do not determine it"
+    )
+    return Doubt(IMAGES, "too little speckle in common", evidence, sigma > allowed)
+
+
+def interleaved(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
+    """Doubt a sweep whose frames resemble earlier ones more than the last: not recorded in this order."""
+    last, before, best = (np.full(frames, np.nan) for _ in range(3))
+    lag = table.second - table.first
+    last[table.second[lag == 1]] = table.median[lag == 1]
+    before[table.second[lag == 2]] = table.median[lag == 2]
+    best[table.second] = -np.inf
+    np.maximum.at(best, table.second, table.median)
+    known = np.isfinite(last) & np.isfinite(before) & (best >= least_correlation)
+    if known.sum() < 4:
+        return None
+    swapped = float(np.mean(before[known] > last[known] + OUT_OF_TURN))
+    strangers = float(np.mean(np.maximum(last, before)[known] < least_correlation))
+    if swapped <= MOST_OUT_OF_TURN and strangers <= MOST_STRANGERS:
+        return None
+    share, what = max((swapped, "the one before the last"), (strangers, "frames before the last two"))
+    evidence = (
+        f"expected frames most like the one just before, got {share:.0%} of them ({int(known.sum())}) more "
+        f"like {what}"
+    )
+    return Doubt(IMAGES, "sweeps interleaved, or frames out of order", evidence, True)
+
+
+def far_apart(position_mm: FloatArray, usable: BoolArray, curves: DecorrelationCurves) -> IntArray:
+    """Frames of which each lies beyond the reach of speckle from the one before, `MOST_FRAMES` at most.
+
+    Parameters
+    ----------
+    position_mm : ndarray, shape (n,)
+    usable : ndarray of bool, shape (n,)
+    """
+    left = np.median(curves.correlation, axis=0)
+    apart_mm = float(curves.distance_mm[np.argmax(left <= max(LEAST_CORRELATION, left[-1]))])
+    chosen: list[int] = []
+    for frame in np.flatnonzero(usable).tolist():
+        if not chosen or abs(position_mm[frame] - position_mm[chosen[-1]]) >= apart_mm:
+            chosen.append(frame)
+    some = np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_FRAMES))
+    return np.array([chosen[round(float(k))] for k in some], dtype=np.int64)
+
+
+def standing(share: FloatArray, frames: int, cells: float) -> Doubt | None:
+    """Doubt images that hold the same echoes in the same place however far apart they are.
+
+    Parameters
+    ----------
+    share : ndarray, shape (p,)
+        Of each patch's power, from `speckle3d.matching.standing.standing_share`.
+    frames : int
+        From which it was found.
+    cells : float
+        Independent speckle cells in a patch.
+    """
+    known = share[np.isfinite(share)]
+    if not known.size or frames < 2:
+        return None
+    median, lost = float(np.median(known)), float(np.mean(known > PATCH_STANDING))
+    # Each pair's coherence scatters by one over the root of twice its cells; pairs that share a frame are
+    # nearly independent, and a median scatters by a quarter more than a mean.
+    pairs = frames * (frames - 1) / 2
+    chance = STANDING_SIGMA * 1.25 / np.sqrt(2 * cells * pairs * known.size)
+    refuted = median > max(STANDING_REFUSED, chance) or lost > PATCHES_REFUSED
+    if not refuted and median <= max(STANDING_FLAGGED, chance) and lost <= PATCHES_FLAGGED:
+        return None
+    evidence = (
+        f"expected nothing in common between {frames} frames beyond speckle's reach, got {median:.1%} of the "
+        f"echo's power the same at the same place in the median patch, and over {PATCH_STANDING:.0%} in "
+        f"{lost:.0%} of the patches"
+    )
+    return Doubt(IMAGES, "static clutter, or noise on a probe at rest", evidence, refuted)
