@@ -43,7 +43,7 @@ from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
-from speckle3d.motion.plausibility import far_apart, interleaved, standing, undetermined
+from speckle3d.motion.plausibility import far_apart, folded, interleaved, standing, undetermined
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -196,6 +196,7 @@ def track(
             0.0 if coherence is None else float(coherence.share.mean()),
         )
     doubts += _believed(sweep, _undetermined(trajectory.poses, covariance, matcher, curves))
+    doubts += _believed(sweep, folded(found.table, trajectory.poses, matcher.patches.centre_mm, flags == 0))
 
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
