@@ -43,7 +43,7 @@ from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
-from speckle3d.motion.plausibility import far_apart, folded, interleaved, standing, undetermined
+from speckle3d.motion.plausibility import far_apart, folded, interleaved, severed, standing, undetermined
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -169,6 +169,7 @@ def track(
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
     flags = _with_unjoined(flags, reader, pairs)
+    _require_placed(sweep, flags)
     with times.of("standing echoes"):
         doubts = _believed(sweep, _standing(sweep, matcher, curves, path, flags))
 
@@ -196,6 +197,8 @@ def track(
             0.0 if coherence is None else float(coherence.share.mean()),
         )
     doubts += _believed(sweep, _undetermined(trajectory.poses, covariance, matcher, curves))
+    ends = [pair.first for pair in pairs], [pair.second for pair in pairs]
+    doubts += _believed(sweep, severed(*ends, flags == 0))
     doubts += _believed(sweep, folded(found.table, trajectory.poses, matcher.patches.centre_mm, flags == 0))
 
     # -> sensors that images and their own readings do not contradict -> sign of the motion
@@ -258,13 +261,18 @@ def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
     """Flags of all frames, if few enough have one."""
     flags = flag_frames(found.features, config.quality)
     flags[found.table.unmatched(len(sweep), config.trajectory.least_correlation)] |= FrameFlag.UNMATCHED
+    _require_placed(sweep, flags)
+    return flags
+
+
+def _require_placed(sweep: Sweep, flags: IntArray) -> None:
+    """Raise if too many frames have a flag."""
     lost = int((flags != 0).sum())
     if lost > MOST_LOST * len(sweep):
         raise InsufficientDataError(
             f"{sweep.name}: expected frames with speckle in common, got {lost} of {len(sweep)} that cannot "
             f"be placed: {'; '.join(describe(flags))}"
         )
-    return flags
 
 
 def _measured(

@@ -7,6 +7,8 @@ that are equally alike and not equally far apart, and a length that the images l
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.spatial.transform import RigidTransform
@@ -16,6 +18,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.distances import LEAST_CORRELATION
+from speckle3d.motion.trajectory import HELD_MM
 
 IMAGES = "images"
 """What all doubts of this module are about."""
@@ -49,6 +52,8 @@ ALIKE = (0.2, 0.9)
 WINDOW = 8
 """Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
 no more. Half a window on comes the next."""
+LISTED = 4
+"""Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
 FOLD_FLAGGED, FOLD_REFUSED = 0.22, 0.28
@@ -189,6 +194,32 @@ def folded(
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
     return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_REFUSED)
+
+
+def severed(first: Sequence[int], second: Sequence[int], usable: BoolArray) -> Doubt | None:
+    """Doubt a sweep in pieces: frames that no pair joins to any before them, though both sides are sound.
+
+    Parameters
+    ----------
+    first, second : sequence of int
+        Frames of the pairs that the trajectory was solved from.
+    usable : ndarray of bool, shape (n,)
+    """
+    spans = np.zeros(usable.size + 1, dtype=int)
+    np.add.at(spans, np.asarray(first, dtype=int) + 1, 1)
+    np.add.at(spans, np.asarray(second, dtype=int) + 1, -1)
+    open_before = np.flatnonzero(np.cumsum(spans)[:-1] == 0)
+    cuts = [k for k in open_before[open_before > 0].tolist() if usable[:k].any() and usable[k:].any()]
+    # Lost frames are open on both sides; one cut at each run of them.
+    cuts = [k for k in cuts if k - 1 not in cuts]
+    if not cuts:
+        return None
+    more = f" and {len(cuts) - LISTED} more" if len(cuts) > LISTED else ""
+    evidence = (
+        f"expected speckle that joins all frames, got none across frame {', '.join(map(str, cuts[:LISTED]))}"
+        f"{more}: what was travelled there is a guess within {HELD_MM:g} mm"
+    )
+    return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False)
 
 
 def _distance(relative: RigidTransform, patch_centre_mm: FloatArray) -> FloatArray:
