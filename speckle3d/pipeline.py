@@ -313,7 +313,7 @@ def _standing(
     if len(frames) < 2:
         return None
     share = standing_share(sweep, matcher, frames.tolist())
-    return standing(share, len(frames), float(np.median(curves.cells)))
+    return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
 
 
 def _undetermined(

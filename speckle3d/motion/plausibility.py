@@ -29,15 +29,19 @@ with noise of half the signal's power 0.15."""
 
 MOST_FRAMES = 10
 """Frames in which standing echoes are looked for: 45 pairs, held at once."""
-STANDING_FLAGGED, STANDING_REFUSED = 0.01, 0.05
-"""Share of power, in the median patch. Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard
-errors wrong at 0.09; 64 patches without clutter come to +-0.005."""
+ECHO_LIMITS = (0.01, 0.1), (0.05, 1 / 3)
+"""From which clutter is flagged and refused: share of the median patch's power, and share of patches lost.
+Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard errors wrong at 0.09; sweeps without
+clutter have up to 0.005. A quarter of the patches lost is made good by the adaptation to coherent echoes,
+half not."""
+INTENSITY_LIMITS = (0.1, 1 / 3), (0.25, 2 / 3)
+"""The same for images without phase, where layers along the sweep count, too: bone and spine have 0.01 to
+0.05 and lose 0.14 to 0.21 of their patches. A quarter of the intensity's variation is half of the echo's
+power."""
 STANDING_SIGMA = 5.0
-"""Standard errors that the median patch's share must be above zero."""
-PATCH_STANDING = 0.2
-"""Share at which a patch is lost to what stands still; without, patches scatter by 0.02."""
-PATCHES_FLAGGED, PATCHES_REFUSED = 0.1, 1 / 3
-"""Share of such patches. Of 0.25 of them the adaptation to coherent echoes makes good, of 0.5 not."""
+"""Standard errors that a share must be above zero."""
+PATCH_LOST = 0.2
+"""Share from which a patch is lost to what stands still; without, patches scatter by 0.02."""
 
 OUT_OF_TURN = 0.1
 """By how much a frame must be less like the last one than like the one before that: ten times what the median
@@ -51,12 +55,12 @@ ALIKE = (0.2, 0.9)
 """Median correlations between which distances are compared: more hides in noise, less in what stays."""
 WINDOW = 8
 """Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
-no more. Half a window on comes the next."""
+no more. A quarter of a window on comes the next."""
 LISTED = 4
 """Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
-FOLD_FLAGGED, FOLD_REFUSED = 0.22, 0.28
+FOLD_FLAGGED, FOLD_REFUSED = 0.22, 0.25
 """Mean departure over mean distance in the worst window. Tuned on 32 sweeps of 6 to 21 patches: up to 0.15,
 0.20 where the length is three standard errors off; a direction lost 0.27 and more."""
 
@@ -125,7 +129,7 @@ def far_apart(position_mm: FloatArray, usable: BoolArray, curves: DecorrelationC
     return np.array([chosen[round(float(k))] for k in some], dtype=np.int64)
 
 
-def standing(share: FloatArray, frames: int, cells: float) -> Doubt | None:
+def standing(share: FloatArray, frames: int, cells: float, of_echo: bool = True) -> Doubt | None:
     """Doubt images that hold the same echoes in the same place however far apart they are.
 
     Parameters
@@ -136,24 +140,30 @@ def standing(share: FloatArray, frames: int, cells: float) -> Doubt | None:
         From which it was found.
     cells : float
         Independent speckle cells in a patch.
+    of_echo : bool
+        Whether the images have phase.
     """
     known = share[np.isfinite(share)]
     if not known.size or frames < 2:
         return None
-    median, lost = float(np.median(known)), float(np.mean(known > PATCH_STANDING))
     # Each pair's coherence scatters by one over the root of twice its cells; pairs that share a frame are
     # nearly independent, and a median scatters by a quarter more than a mean.
-    pairs = frames * (frames - 1) / 2
-    chance = STANDING_SIGMA * 1.25 / np.sqrt(2 * cells * pairs * known.size)
-    refuted = median > max(STANDING_REFUSED, chance) or lost > PATCHES_REFUSED
-    if not refuted and median <= max(STANDING_FLAGGED, chance) and lost <= PATCHES_FLAGGED:
+    chance = STANDING_SIGMA * 1.25 / np.sqrt(cells * frames * (frames - 1))
+    least = max(PATCH_LOST, chance)
+    median, lost = float(np.median(known)), float(np.mean(known > least))
+    chance *= 1.25 / np.sqrt(known.size)
+    flagged, refused = (
+        median > max(limit, chance) or lost > most
+        for limit, most in (ECHO_LIMITS if of_echo else INTENSITY_LIMITS)
+    )
+    if not flagged:
         return None
     evidence = (
         f"expected nothing in common between {frames} frames beyond speckle's reach, got {median:.1%} of the "
-        f"echo's power the same at the same place in the median patch, and over {PATCH_STANDING:.0%} in "
+        f"echo's power the same at the same place in the median patch, and over {least:.0%} in "
         f"{lost:.0%} of the patches"
     )
-    return Doubt(IMAGES, "static clutter, or noise on a probe at rest", evidence, refuted)
+    return Doubt(IMAGES, "static clutter, or noise on a probe at rest", evidence, refused)
 
 
 def folded(
@@ -182,10 +192,12 @@ def folded(
     apart = _distance(poses[table.first[rows]].inv() * poses[second], patch_centre_mm)
     expected = np.asarray(isotonic_regression(apart).x)
     worst, at = 0.0, 0
-    for start in range(0, len(poses), WINDOW // 2):
+    for start in range(0, len(poses), WINDOW // 4):
         inside = (second >= start) & (second < start + WINDOW)
-        if inside.sum() >= LEAST_COMPARED and expected[inside].sum() > 0:
-            departure = float(np.abs(apart - expected)[inside].sum() / expected[inside].sum())
+        if inside.sum() >= LEAST_COMPARED:
+            # Where the probe rests there is no distance to compare with.
+            typical = max(float(expected[inside].mean()), float(expected.mean()) / 4, 1e-9)
+            departure = float(np.abs(apart - expected)[inside].mean()) / typical
             worst, at = max((worst, at), (departure, start))
     if worst <= FOLD_FLAGGED:
         return None
