@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,8 +72,8 @@ class _Lag:
     seconds: float
 
 
-class ImageEvidence:
-    """Motion of the image's centre between frames some way apart, as the images have it.
+class MotionEvidence:
+    """Motion of the image's centre between frames some way apart, as the images or a tracker have it.
 
     In-plane motion and roll are measured on speckle that both frames show; tilt and yaw are known roughly;
     the sign of the elevational motion is open, and with it those of tilt and yaw.
@@ -82,11 +83,15 @@ class ImageEvidence:
     time_s : ndarray, shape (n,)
     centre_mm : ndarray, shape (3,)
     image : RigidTransform, length n
-        Image-based poses.
+        Poses of the image.
+    by_images : bool
+        Whether the poses are from images; if not, from a tracker, which knows every turn and every sign.
     """
 
-    def __init__(self, time_s: FloatArray, centre_mm: FloatArray, image: RigidTransform) -> None:
-        self.time_s, self.centre_mm, self.image = time_s, centre_mm, image
+    def __init__(
+        self, time_s: FloatArray, centre_mm: FloatArray, image: RigidTransform, by_images: bool = True
+    ) -> None:
+        self.time_s, self.centre_mm, self.image, self.by_images = time_s, centre_mm, image, by_images
         n, pause = len(image), float(np.median(np.diff(time_s)))
         longest = max(2, n // 3)
         lags = {int(np.clip(round(_SHORT_S / pause), 2, longest)), max(2, n // 5), longest}
@@ -98,7 +103,7 @@ class ImageEvidence:
         n = len(self.image)
         count = min(n - lag, _MOST_STEPS)
         first = np.unique(np.linspace(0, n - 1 - lag, count).round().astype(int))
-        steps = _steps(self.image[first], self.image[first + lag], self.centre_mm)
+        steps = steps_between(self.image[first], self.image[first + lag], self.centre_mm)
         return _Lag(first, first + lag, steps, (n - lag) / lag, lag * pause_s)
 
     def agreements(
@@ -116,10 +121,8 @@ class ImageEvidence:
             Instead, how a sensor that does not move would fit.
         """
         found: tuple[list[Agreement], ...] = ([], [])
-        for lag in self.lags:
-            covered = self._covered(sensor, lag)
+        for lag, covered, sensed in self._sensed(sensor):
             if covered.sum() >= _FEWEST_STEPS:
-                sensed = self._sensed(sensor, lag, covered)
                 both = self._both_signs(np.zeros_like(sensed) if still else sensed, noise, lag, covered)
                 for agreements, agreement in zip(found, both, strict=True):
                     agreements.append(agreement)
@@ -147,7 +150,8 @@ class ImageEvidence:
         if not enough.any():
             return misfit, steps
         wanted = covered & enough[:, None]
-        sensed = sensed_steps(sensor, times[:, 0][wanted], times[:, 1][wanted], self.centre_mm)
+        first, second = (sensor.world_from_image(times[:, i][wanted]) for i in (0, 1))
+        sensed = steps_between(first, second, self.centre_mm)
         parts = np.split(sensed, np.cumsum(wanted.sum(axis=1))[:-1])
         for i in np.flatnonzero(enough):
             best = min(
@@ -159,11 +163,9 @@ class ImageEvidence:
     def turn(self, sensor: OrientationSensor | Tracker, noise: FloatArray, sign: int) -> Rotation:
         """Rotation of the image on the sensor that best maps the images' steps to the sensor's."""
         sensed, seen = [], []
-        for lag in self.lags:
-            covered = self._covered(sensor, lag)
+        for lag, covered, measured in self._sensed(sensor):
             if covered.sum() < _FEWEST_STEPS:
                 continue
-            measured = self._sensed(sensor, lag, covered)
             columns = measured.shape[1]
             images = lag.steps[covered, -columns:] * (_MIRRORED[-columns:] if sign < 0 else 1.0)
             for axes in (slice(0, 3), slice(-3, None))[-(columns // 3) :]:
@@ -177,10 +179,10 @@ class ImageEvidence:
         return Rotation.from_matrix(left @ proper @ right)
 
     def elevational_scale(self, tracker: Tracker) -> tuple[float, float]:
-        """Travel of the image's centre along the first image's z over the images' own, and its standard error.
+        """Travel along the first image's z over the images' own, and its standard error.
 
-        Both paths are compared over the whole sweep, where jitter counts least; the error is from what is left,
-        which wanders: some `_WANDERING` independent values.
+        Both paths are compared over the whole sweep, where jitter counts least; the error is from what is
+        left, which wanders: some `_WANDERING` independent values.
         """
         covered = np.flatnonzero(tracker.covers(self.time_s))
         sensed = _elevation(tracker.world_from_image(self.time_s[covered]), self.centre_mm)
@@ -192,12 +194,14 @@ class ImageEvidence:
         spread = float(np.std(sensed - scale * seen))
         return abs(scale), spread * float(np.sqrt(covered.size / (_WANDERING * power)))
 
-    def _covered(self, sensor: OrientationSensor | Tracker, lag: _Lag) -> BoolArray:
-        return sensor.covers(self.time_s[lag.first]) & sensor.covers(self.time_s[lag.second])
-
-    def _sensed(self, sensor: OrientationSensor | Tracker, lag: _Lag, covered: BoolArray) -> FloatArray:
-        first, second = self.time_s[lag.first[covered]], self.time_s[lag.second[covered]]
-        return sensed_steps(sensor, first, second, self.centre_mm)
+    def _sensed(self, sensor: OrientationSensor | Tracker) -> Iterator[tuple[_Lag, BoolArray, FloatArray]]:
+        """Each lag, which of its steps a sensor covers, and these as the sensor has them."""
+        covered = sensor.covers(self.time_s)
+        poses, index = sensor.world_from_image(self.time_s[covered]), np.cumsum(covered) - 1
+        for lag in self.lags:
+            both: BoolArray = covered[lag.first] & covered[lag.second]
+            first, second = poses[index[lag.first[both]]], poses[index[lag.second[both]]]
+            yield lag, both, steps_between(first, second, self.centre_mm)
 
     def _both_signs(
         self, sensed: FloatArray, noise: FloatArray, lag: _Lag, covered: BoolArray
@@ -208,7 +212,8 @@ class ImageEvidence:
         size = _spread(forward)
         wander = np.sqrt(lag.seconds / _SHORT_S) * np.array([_WANDER_MM] * 3 + [_WANDER_DEG] * 3)[-columns:]
         turning = np.zeros(columns)
-        turning[-3:-1] = np.hypot(_TURN_DEG, _TURN_SHARE * size[-3:-1])
+        if self.by_images:
+            turning[-3:-1] = np.hypot(_TURN_DEG, _TURN_SHARE * size[-3:-1])
         parts = (noise[-columns:], self._jitter[-columns:], wander, turning, _SCALE_ERROR * size)
         expected = np.sqrt(np.sum(np.square(parts), axis=0))
         independent = 1.0 + float(covered.mean()) * max(lag.independent, 0.0)
@@ -221,7 +226,7 @@ class ImageEvidence:
                 left[:, 2] = sensed[:, 2] - np.clip(scale, *_ELEVATION_RANGE) * seen[:, 2]
             return Agreement(_spread(left), size, expected, independent)
 
-        return fit(forward), fit(forward * _MIRRORED[-columns:])
+        return fit(forward), fit(forward * _MIRRORED[-columns:]) if self.by_images else fit(forward)
 
 
 def total_misfit(agreements: list[Agreement]) -> float:
@@ -246,12 +251,15 @@ class GyroscopeEvidence:
     ----------
     left, measured : ndarray, shape (3,)
         Standard deviation of gyroscope less readings, and of the gyroscope's turns.
+    bias : float
+        Rate by which the gyroscope turns on the whole and the readings do not, or the other way, deg/s.
     noise, steps : float
         As in `Agreement`.
     """
 
     left: FloatArray
     measured: FloatArray
+    bias: float
     noise: float
     steps: float
 
@@ -286,8 +294,9 @@ def gyroscope_evidence(sensor: OrientationSensor) -> GyroscopeEvidence | None:
     left = integrated - read
     measured = _spread(integrated - np.median(integrated, axis=0))
     noise = 0.1 + _SCALE_ERROR * float(measured.max())
-    # The gyroscope's bias is no fault of the readings.
-    return GyroscopeEvidence(_spread(left - np.median(left, axis=0)), measured, noise, len(turned) / lag)
+    drift = np.median(left, axis=0)
+    bias = float(np.linalg.norm(drift) / np.median(time_s[first + lag] - time_s[first]))
+    return GyroscopeEvidence(_spread(left - drift), measured, bias, noise, len(turned) / lag)
 
 
 def gravity_from_vertical(sensor: OrientationSensor) -> float | None:
@@ -300,25 +309,21 @@ def gravity_from_vertical(sensor: OrientationSensor) -> float | None:
     return float(np.degrees(np.arccos(min(1.0, abs(float(up[2])) / size)))) if size > 0 else None
 
 
-def sensed_steps(
-    sensor: OrientationSensor | Tracker, first_s: FloatArray, second_s: FloatArray, centre_mm: FloatArray
+def steps_between(
+    first: RigidTransform | Rotation, second: RigidTransform | Rotation, centre_mm: FloatArray
 ) -> FloatArray:
-    """Motion of the image between two times each, as a sensor has it, seen from the first place.
+    """Motion from first to second places, seen from the first.
 
     Returns
     -------
     ndarray, shape (m, 6) or (m, 3)
-        x, y, z of the image's centre in mm, where the sensor knows it, and tilt, yaw, roll in degrees.
+        x, y, z of the image's centre in mm, where places are known, and tilt, yaw, roll in degrees.
     """
-    if isinstance(sensor, Tracker):
-        return _steps(sensor.world_from_image(first_s), sensor.world_from_image(second_s), centre_mm)
-    turn = sensor.world_from_image(first_s).inv() * sensor.world_from_image(second_s)
-    return np.asarray(turn.as_rotvec(degrees=True))
-
-
-def _steps(first: RigidTransform, second: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    step = first.inv() * second
-    return np.hstack([step.apply(centre_mm) - centre_mm, step.rotation.as_rotvec(degrees=True)])
+    if isinstance(first, RigidTransform) and isinstance(second, RigidTransform):
+        step = first.inv() * second
+        return np.hstack([step.apply(centre_mm) - centre_mm, step.rotation.as_rotvec(degrees=True)])
+    turns = [each.rotation if isinstance(each, RigidTransform) else each for each in (first, second)]
+    return np.asarray((turns[0].inv() * turns[1]).as_rotvec(degrees=True))
 
 
 def _elevation(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:

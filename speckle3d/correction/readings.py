@@ -42,7 +42,7 @@ def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
 
 def _medians(values: FloatArray) -> FloatArray:
     """Running medians along the first axis."""
-    return np.asarray(median_filter(values, (_WINDOW, *[1] * (values.ndim - 1)), mode="nearest"))
+    return np.asarray(median_filter(values, (_WINDOW, *[1] * (values.ndim - 1)), mode="mirror"))
 
 
 def without(sensor: Sensor, left_out: BoolArray) -> Sensor:

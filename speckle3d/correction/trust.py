@@ -19,7 +19,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.correction.evidence import (
-    ImageEvidence,
+    MotionEvidence,
     gravity_from_vertical,
     gyroscope_evidence,
     noise_of,
@@ -31,23 +31,25 @@ from speckle3d.correction.suspects import Suspect, suspects
 TRACKER, ORIENTATION = "tracker", "orientation sensor"
 
 _HELD_S, _LONGEST_STILL_S = 0.15, 0.5
-"""Loggers repeat a reading until the next; beyond the second time, unchanged readings are left out."""
+"""Loggers repeat a reading until the next; beyond the second time, unchanged readings are told."""
 _MOST_STILL = 0.2
 """Share of the sweep over which readings that do not change at all refute a sensor."""
+_MOVED_MM = 0.5
+"""By which images must have moved meanwhile: a probe may rest, and a simulated sensor have no noise."""
 _NOISE, _MOST_NOISE = (1.5, 1.5), (10.0, 10.0)
 """Jitter of a step, mm and degrees: that of sensors in use is below 0.5 and 0.3."""
 _MOST_SPIKES = 0.3
 """Share of readings; with more, there is no stream that spikes stand out of."""
 
 # Gains in the logarithm of the likelihood. The bounds stand between good and faulty sweeps, simulated with
-# small images (26 to 48 vectors): good trackers stay below 2 for every suspect, faulty ones above 10; good
-# orientation sensors reach 11 by the images alone, and 0.1 by their gyroscope, faulty ones 5 to 90.
-_TRACKER_GAIN = 7.0
-_IMAGE_GAIN = 15.0
-_GYROSCOPE_GAIN = 4.0
-_CLOCK_GAIN = {TRACKER: 7.0, ORIENTATION: 10.0}
+# small images (26 to 48 vectors). Conventions and mountings of trackers: good ones up to 1.8, faulty ones
+# from 10; of orientation sensors by images alone: 11, by their gyroscope: 0.1, faulty ones from 5; by a
+# tracker: 1.8. Clocks: good ones up to 9 by images and 14 by a tracker, a tracker late by 0.5 s from 16.
+_POSE_GAIN, _TURN_GAIN, _GYROSCOPE_GAIN = 6.0, 15.0, 4.0
+_CLOCK_GAIN, _CLOCK_GAIN_BY_TRACKER = 11.0, 17.0
 _CLOCK_RANGE_S = 1.5
-_LEAST_CLOCK_S = 0.05
+_LEAST_CLOCK_S, _WRONG_CLOCK_S = 0.05, 0.3
+"""Clocks are calibrated to a frame or two; within the second time a hand has turned round."""
 _LEAST_MOUNTING_DEG, _WRONG_MOUNTING_DEG = 8.0, 12.0
 """Calibrations are right to some degrees; beyond the second angle lengths and tilts are no longer."""
 _PREFERENCE = 5.0
@@ -56,6 +58,8 @@ _PREFERENCE = 5.0
 _UNEQUAL, _UNEQUAL_SIGMA = 0.06, 3.0
 """Elevational scale between tracker and images: images alone are right to a few per cent."""
 _VERTICAL_DEG, _UPRIGHT_DEG = 25.0, 10.0
+_MOST_BIAS_DEG_S = 3.0
+"""Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
 _ROLL_EXPLAINED = 0.6
 """Share of the variance of the images' roll that a sensor must have in common with it to confirm it."""
 
@@ -77,7 +81,7 @@ class Trust:
 
 
 def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
-    """Leave out single wild readings, and readings that stand still while the probe moves, and count them.
+    """Leave out single wild readings, and count them.
 
     Parameters
     ----------
@@ -86,11 +90,11 @@ def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
     Returns
     -------
     Sweep
-        With what is left of its sensors' readings; as they are where a sensor is refuted.
+        With what is left of its sensors' readings.
     tuple of Doubt
     """
-    tracker, about_tracker = _cleaned(sweep.tracker, TRACKER, sweep)
-    orientation, about_orientation = _cleaned(sweep.orientation, ORIENTATION, sweep)
+    tracker, about_tracker = _cleaned(sweep.tracker)
+    orientation, about_orientation = _cleaned(sweep.orientation)
     doubts = (*about_tracker, *about_orientation)
     return (replace(sweep, tracker=tracker, orientation=orientation) if doubts else sweep), doubts
 
@@ -107,28 +111,15 @@ def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
     )
 
 
-def _cleaned(sensor: Sensor | None, about: str, sweep: Sweep) -> tuple[Sensor | None, list[Doubt]]:
-    if sensor is None:
-        return None, []
-    doubts = []
-    wild = spikes(sensor)
-    if wild.any():
-        share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
-        if wild.mean() > _MOST_SPIKES:
-            return sensor, [Doubt(about, "noise or scrambled values", f"expected a path, but {share}", True)]
-        doubts.append(Doubt(about, "spikes", f"{share}, and are left out", False))
-        sensor = without(sensor, wild)
-    begin, end = standstill(sensor)
-    first, last = sweep.frame_time_s[[0, -1]] - sensor.time_offset_s
-    still = max(0.0, min(end, last) - max(begin, first))
-    refuted = bool(still > max(_HELD_S, _MOST_STILL * (last - first)))
-    if refuted or still > _LONGEST_STILL_S:
-        seen = f"expected readings that change, got the same one for {still:.2f} of {last - first:.2f} s"
-        doubts.append(Doubt(about, "frozen", seen, refuted))
-        if not refuted:
-            time_s = sensor.readings.time_s
-            sensor = without(sensor, (time_s > begin) & (time_s <= end))
-    return sensor, doubts
+def _cleaned(sensor: Sensor | None) -> tuple[Sensor | None, list[Doubt]]:
+    wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
+    if sensor is None or not wild.any():
+        return sensor, []
+    share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
+    if wild.mean() > _MOST_SPIKES:
+        evidence = f"expected a path, but {share}"
+        return sensor, [Doubt(name_of(sensor), "noise or scrambled values", evidence, True)]
+    return without(sensor, wild), [Doubt(name_of(sensor), "spikes", f"{share}, and are left out", False)]
 
 
 def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) -> Trust:
@@ -147,18 +138,28 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) ->
     -------
     Trust
     """
-    seen = ImageEvidence(sweep.frame_time_s, sweep.grid.centre_mm, image)
+    seen = MotionEvidence(sweep.frame_time_s, sweep.grid.centre_mm, image)
     doubts: list[Doubt] = []
     if sweep.tracker is not None and _usable(sweep.tracker, seen):
-        found = [*_Examination(TRACKER, sweep.tracker, seen).doubts()]
+        found = [*_frozen_doubts(sweep.tracker, seen)] or [*_Examination(sweep.tracker, seen).doubts()]
         doubts += found or _unequal_lengths(sweep.tracker, seen, length_sigma)
     confirmed = False
     if sweep.orientation is not None and _usable(sweep.orientation, seen):
-        examination = _Examination(ORIENTATION, sweep.orientation, seen)
-        found = [*examination.doubts()] or [*_gravity_doubts(sweep.orientation)]
+        examination = _Examination(sweep.orientation, seen)
+        found = [*_frozen_doubts(sweep.orientation, seen)] or [*examination.doubts()]
+        if not found and sweep.tracker is not None and not doubts and _usable(sweep.tracker, seen):
+            found = [*_Examination(sweep.orientation, _tracked(sweep, sweep.tracker)).doubts()]
+        found = found or [*examination.weak_doubts(), *_gravity_doubts(sweep.orientation)]
         confirmed = examination.turn_confirmed() and not any(doubt.refuted for doubt in found)
         doubts += found
     return Trust(tuple(doubts), confirmed)
+
+
+def _tracked(sweep: Sweep, tracker: Tracker) -> MotionEvidence:
+    """Motion as a believed tracker has it, to hold an orientation sensor against."""
+    time_s = sweep.frame_time_s[tracker.covers(sweep.frame_time_s)]
+    poses = tracker.world_from_image(time_s)
+    return MotionEvidence(time_s, sweep.grid.centre_mm, poses, by_images=False)
 
 
 def name_of(sensor: OrientationSensor | Tracker) -> str:
@@ -181,7 +182,7 @@ def require_believed(
             raise MismatchError(f"{where}: {doubt}; sensors.examine = false uses it as it is")
 
 
-def _usable(sensor: OrientationSensor | Tracker, seen: ImageEvidence) -> bool:
+def _usable(sensor: OrientationSensor | Tracker, seen: MotionEvidence) -> bool:
     """Whether there is enough of a sensor to be examined."""
     calibrated = sensor.sensor_from_image is not None
     return calibrated and int(sensor.covers(seen.time_s).sum()) >= 10 and bool(seen.lags)
@@ -203,8 +204,8 @@ class _Gain:
 class _Examination(Generic[Sensor]):
     """One sensor against the images, and against its gyroscope if it has one."""
 
-    def __init__(self, about: str, sensor: Sensor, seen: ImageEvidence) -> None:
-        self.about, self.seen = about, seen
+    def __init__(self, sensor: Sensor, seen: MotionEvidence) -> None:
+        self.about, self.seen = name_of(sensor), seen
         self.sensor: Sensor = sensor
         self.noise = noise_of(sensor, seen.time_s, seen.centre_mm)
         self.agreements = seen.agreements(sensor, self.noise)
@@ -224,15 +225,24 @@ class _Examination(Generic[Sensor]):
         best = max(conventions, key=lambda gain: gain.total)
         turned, degrees = self._mounting()
         late, seconds = self._clock()
+        least = _CLOCK_GAIN if self.seen.by_images else _CLOCK_GAIN_BY_TRACKER
         if self._beyond(best) and best.total > max(turned.images - _PREFERENCE, late.images):
             yield Doubt(self.about, best.name, self._evidence(), True)
-        elif late.images > max(_CLOCK_GAIN[self.about], turned.images):
+        elif late.images > max(least, turned.images):
             side = "later" if seconds > 0 else "earlier"
-            evidence = f"expected motion with the images', got it {abs(seconds):.2f} s {side}"
-            yield Doubt(self.about, "clock", evidence, False)
+            whose = "images'" if self.seen.by_images else "tracker's"
+            evidence = f"expected motion with the {whose}, got it {abs(seconds):.2f} s {side}"
+            refuted = abs(seconds) > _WRONG_CLOCK_S and late.images > 2.0 * least
+            yield Doubt(self.about, "clock", evidence, refuted)
         elif self._beyond(turned) and degrees > _LEAST_MOUNTING_DEG:
             evidence = f"{self._evidence()}; turned by {degrees:.0f} degrees it would fit"
             yield Doubt(self.about, turned.name, evidence, degrees > _WRONG_MOUNTING_DEG)
+
+    def weak_doubts(self) -> Iterator[Doubt]:
+        """A slow turn that the gyroscope does not have."""
+        if self.gyroscope is not None and self.gyroscope.bias > _MOST_BIAS_DEG_S:
+            evidence = f"expected turns as its gyroscope's, got {self.gyroscope.bias:.1f} degrees/s more"
+            yield Doubt(self.about, "heading drift, or a gyroscope's bias", evidence, False)
 
     def turn_confirmed(self) -> bool:
         """Whether roll, which images know well, or the gyroscope confirm the turns that are read."""
@@ -243,9 +253,9 @@ class _Examination(Generic[Sensor]):
         return bool(left) and max(left) < 1.0 - _ROLL_EXPLAINED
 
     def _beyond(self, gain: _Gain) -> bool:
-        if self.about == TRACKER:
-            return gain.images > _TRACKER_GAIN
-        return gain.total > _IMAGE_GAIN or (gain.gyroscope > _GYROSCOPE_GAIN and gain.total > _GYROSCOPE_GAIN)
+        if self.about == TRACKER or not self.seen.by_images:
+            return gain.images > _POSE_GAIN
+        return gain.total > (_GYROSCOPE_GAIN if gain.gyroscope > _GYROSCOPE_GAIN else _TURN_GAIN)
 
     def _gain(self, suspect: Suspect[Sensor]) -> _Gain:
         misfit = total_misfit(self.seen.agreements(suspect.mended, self.noise))
@@ -291,8 +301,25 @@ class _Examination(Generic[Sensor]):
         names = ("x", "y", "z", "tilt", "yaw", "roll")[-last.left.size :]
         part = int(np.argmax(last.left / last.noise))
         unit = "mm" if names[part] in "xyz" else "degrees"
-        seen = f"expected steps in {names[part]} as the images' ({last.seen[part]:.2f} {unit} rms) to "
+        whose = "images'" if self.seen.by_images else "tracker's"
+        seen = f"expected steps in {names[part]} as the {whose} ({last.seen[part]:.2f} {unit} rms) to "
         return f"{seen}{last.noise[part]:.2f} {unit}, got a difference of {last.left[part]:.2f}"
+
+
+def _frozen_doubts(sensor: OrientationSensor | Tracker, seen: MotionEvidence) -> Iterator[Doubt]:
+    """Readings that are all the same while the images move."""
+    begin, end = standstill(sensor)
+    time_s = seen.time_s - sensor.time_offset_s
+    during = (time_s >= begin) & (time_s <= end)
+    if during.sum() < 2:
+        return
+    still, whole = float(np.ptp(time_s[during])), float(np.ptp(time_s))
+    path_mm = seen.image[during].apply(seen.centre_mm)
+    moved = float(np.linalg.norm(path_mm - path_mm[0], axis=1).max())
+    refuted = still > max(_HELD_S, _MOST_STILL * whole)
+    if moved > _MOVED_MM and (refuted or still > _LONGEST_STILL_S):
+        evidence = f"expected readings that change, got the same one for {still:.2f} of {whole:.2f} s"
+        yield Doubt(name_of(sensor), "frozen", evidence, refuted)
 
 
 def _turned(sensor: Sensor, turn: Rotation, centre_mm: FloatArray) -> Sensor:
@@ -305,7 +332,7 @@ def _turned(sensor: Sensor, turn: Rotation, centre_mm: FloatArray) -> Sensor:
     return replace(sensor, sensor_from_image=mounting * turn)
 
 
-def _unequal_lengths(tracker: Tracker, seen: ImageEvidence, length_sigma: float) -> Iterator[Doubt]:
+def _unequal_lengths(tracker: Tracker, seen: MotionEvidence, length_sigma: float) -> Iterator[Doubt]:
     scale, error = seen.elevational_scale(tracker)
     both = float(np.hypot(error, length_sigma))
     if np.isfinite(scale) and abs(scale - 1.0) > max(_UNEQUAL, _UNEQUAL_SIGMA * both):
