@@ -20,7 +20,7 @@ def spoiled(sweep, frames, order=None):
     )
 
 
-def narrowed(sweep, vectors=36):
+def narrowed(sweep, vectors=24):
     """The first vectors of a sweep, held in memory."""
     frames = np.stack([sweep.frames[k][:vectors] for k in range(len(sweep))]).astype(np.float32)
     return spoiled(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=vectors)), frames)

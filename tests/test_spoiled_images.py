@@ -10,7 +10,7 @@ from speckle3d.pipeline import track
 
 @pytest.fixture(scope="module")
 def narrow(sweep):
-    """Three columns of patches of the shipped sweep."""
+    """Two columns of patches of the shipped sweep."""
     return spoil.narrowed(sweep)
 
 
@@ -48,9 +48,7 @@ def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
 
 REFUSED = {
     "clutter at -10 dB": lambda s, p: spoil.cluttered(s, p, -10.0),
-    "clutter at +6 dB": lambda s, p: spoil.cluttered(s, p, 6.0),
     "clutter in the upper half": lambda s, p: spoil.cluttered(s, p, 6.0, (0.0, 0.5)),
-    "noise at 0 dB at rest": lambda s, p: spoil.at_rest(s, 0.0),
     "noise at 6 dB at rest": lambda s, p: spoil.at_rest(s, 6.0),
     "every frame twice": lambda s, p: spoil.in_order(s, np.repeat(np.arange(len(s)), 2)),
     "shuffled": lambda s, p: spoil.in_order(s, np.random.default_rng(0).permutation(len(s))),
