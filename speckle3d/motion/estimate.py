@@ -15,7 +15,7 @@ from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, CoherenceSettings, estimate_coherence, scale_sigma
-from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
+from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, EchoModel, PatchDistances
 from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings, consistent_subset
 from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, SignResolver, pair_signs
 from speckle3d.motion.trajectory import (
@@ -260,7 +260,8 @@ class PairReader:
         near |= (left >= self._settings.least_correlation) & sound & (pairs[table.second] < ENOUGH_PAIRS)
         for frame in np.setdiff1d(table.second[sound], table.second[near]):
             rows = np.flatnonzero((table.second == frame) & sound)
-            near[rows[np.argmax(left[rows])]] = True
+            best = rows[np.argmax(left[rows])]
+            near[best] = table.median[best] >= LEAST_CORRELATION
         return np.flatnonzero(near)
 
     def _signs(self, pairs: Sequence[SignedPair], relative_error: float) -> FloatArray:
