@@ -23,7 +23,7 @@ from speckle3d.cli import (  # noqa: F401
     reconstruction,
     trajectory,
 )
-from speckle3d.cli.common import app
+from speckle3d.cli.common import app, note
 from speckle3d.core.errors import Speckle3DError
 
 __all__ = ["app", "main"]
@@ -57,5 +57,5 @@ def main() -> None:
 
 
 def _fail(message: str, code: int = 2) -> None:
-    sys.stderr.write(f"speckle3d: {' '.join(message.split())}\n")
+    note(f"speckle3d: {' '.join(message.split())}")
     sys.exit(code)

@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from speckle3d.core.printable import printable
+
 
 class Speckle3DError(Exception):
-    """Root of every error the package raises on purpose."""
+    """Root of every error the package raises on purpose.
+
+    Its words may quote a file: they are shown escaped, in one line.
+    """
+
+    def __init__(self, *words: object) -> None:
+        super().__init__(*(printable(each) if isinstance(each, str) else each for each in words))
 
 
 class InvalidInputError(Speckle3DError, ValueError):
@@ -32,6 +40,6 @@ def naming(where: str) -> Iterator[None]:
     try:
         yield
     except (InvalidInputError, InsufficientDataError) as error:
-        if str(error).startswith(where):
+        if str(error).startswith(printable(where)):
             raise
         raise type(error)(f"{where}: {error}") from error
