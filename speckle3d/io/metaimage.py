@@ -6,6 +6,7 @@ orientations such as ``MF`` (x towards the marked side, y far from the probe).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -20,7 +21,8 @@ from speckle3d.core.geometry import nearest_rotation, require_increasing, transf
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.headers import SequenceHeader, image_library, read_header
+from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.pixels import read_pixels
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -101,7 +103,8 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
     if 0 in header.size:
         raise InvalidInputError(f"{path}: expected pixels, got an image of size {header.size}")
     kept = _frames_kept(header)
-    frames = _to_samples(header, _read_pixels(header)[kept])
+    pixels = _read_pixels(header)
+    frames = _to_samples(header, pixels if kept.all() else pixels[kept])
     grid, signal = _geometry(header, settings, frames)
     return Sweep(
         frames=cast(Frames, frames),
@@ -288,16 +291,12 @@ def image_orientation(header: SequenceHeader) -> str:
 
 def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
     """Pixels as (frame, second axis, first axis)."""
-    with image_library(header.path, "read") as itk:
-        # The reader is named, because the library otherwise chooses it by the suffix.
-        image = itk.ReadImage(header.path, imageIO=f"{header.file_format}IO")
-    pixels: npt.NDArray[Any] = itk.GetArrayFromImage(image)
     expected = (header.frame_count, header.size[1], header.size[0])
-    if "list" in header.fields.get("kinds", "") and pixels.shape == (*expected[1:], expected[0]):
-        pixels = np.moveaxis(pixels, -1, 0)  # an NRRD list of frames arrives as one image of many components
-    if pixels.shape not in (expected, expected[1:]):
-        raise InvalidInputError(f"{header.path}: expected grey pixels {expected}, got {pixels.shape}")
-    return pixels.reshape(expected)
+    if header.pixels.count != math.prod(expected):
+        raise InvalidInputError(
+            f"{header.path}: expected grey pixels {expected}, got {header.pixels.count} numbers"
+        )
+    return read_pixels(header.pixels).reshape(expected)
 
 
 def _to_samples(header: SequenceHeader, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -351,8 +350,9 @@ def _analytic(path: str, pixels: npt.NDArray[Any], orientation: str, kind: str) 
         axis = 3 - axis
     if pixels.shape[axis] % 2:
         raise InvalidInputError(f"{path}: expected I and Q in pairs, got {pixels.shape[axis]}")
-    in_phase, quadrature = np.moveaxis(pixels, axis, 0)[0::2], np.moveaxis(pixels, axis, 0)[1::2]
-    analytic = (in_phase + 1j * quadrature).astype(np.complex64)
+    turned = np.moveaxis(pixels, axis, 0)
+    analytic = np.empty(turned[0::2].shape, dtype=np.complex64)
+    analytic.real, analytic.imag = turned[0::2], turned[1::2]
     return np.moveaxis(analytic, 0, axis)
 
 
