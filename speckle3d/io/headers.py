@@ -21,13 +21,6 @@ _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
 _HEADER_LIMIT_BYTES = 2**28
 """A header of a thousand bytes for each of a quarter million frames; beyond it the file is no header."""
 
-_PIXEL_FIELDS = (
-    frozenset({"DimSize", "ElementType", "ElementNumberOfChannels", "BinaryData", "BinaryDataByteOrderMSB"})
-    | {"ElementByteOrderMSB", "CompressedData", "CompressedDataSize", "HeaderSize"}
-    | {"sizes", "type", "encoding", "endian", "data file", "datafile"}
-)
-"""Fields of both formats that say where the pixels are, and how."""
-
 _NRRD_NAMES = {
     "ultrasound image orientation": "UltrasoundImageOrientation",
     "ultrasound image type": "UltrasoundImageType",
@@ -112,9 +105,9 @@ def read_header(path: PathLike) -> SequenceHeader:
         start = stream.read(512)
         stream.seek(0)
         if is_nrrd(start):
-            return _nrrd_header(path, _fields(path, _nrrd_lines(path, stream)), stream)
+            return _nrrd_header(path, dict(_nrrd_lines(stream)), stream)
         if is_metaimage(start):
-            return _meta_header(path, _fields(path, _meta_lines(path, stream)), stream)
+            return _meta_header(path, dict(_meta_lines(path, stream)), stream)
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
 
 
@@ -129,7 +122,7 @@ def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
     raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
 
 
-def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
+def _nrrd_lines(stream: BinaryIO) -> Iterator[tuple[str, str]]:
     for line in _lines(stream):
         if not line.strip():
             return
@@ -142,16 +135,6 @@ def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
             name, _, value = line.partition(":")
             yield name.strip().lower(), value.strip()
-
-
-def _fields(path: PathLike, lines: Iterator[tuple[str, str]]) -> dict[str, str]:
-    """Gather fields by name; what describes the pixels must not be said twice."""
-    fields: dict[str, str] = {}
-    for name, value in lines:
-        if name in fields and name in _PIXEL_FIELDS:
-            raise InvalidInputError(f"{path}: expected the field {name} once, got it twice")
-        fields[name] = value
-    return fields
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:

@@ -1,0 +1,272 @@
+"""Fuzz everything the package reads, for as long as there is time.
+
+    python tests/fuzz/run.py                                   # all kinds, until Ctrl-C
+    python tests/fuzz/run.py --kinds sweep tum --cases 10000   # seeds 0 to 9999 of two kinds
+    python tests/fuzz/run.py --case sweep 4711 --keep case     # one again, in this process, its file kept
+
+A case is a whole file, damaged as its seed says. It must be read, or refused by an error of the package in one
+line; without another exception or warning, a crash of the interpreter, a hang, or more memory than twice the file
+and a constant. Cases run in processes of their own; those that fail are kept in --failures with their seeds.
+"""
+
+import argparse
+import collections
+import faulthandler
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from pathlib import Path
+from queue import Empty, Queue
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+
+BATCH = 2000
+LONGEST_MESSAGE = 2000
+GOOD = ("read", "refused")
+
+
+def prepare(kind, seed, kept, folder):
+    """Write the damaged file of a seed, beside whole ones; returns its path."""
+    from kinds import kinds
+
+    rng = np.random.default_rng([*kind.encode(), seed])
+    whole = sorted(kept)
+    path = folder / whole[int(rng.integers(0, len(whole)))]
+    for name in whole:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(kept[name])
+    kinds()[kind].damage(rng, path)
+    return path
+
+
+def examples(kind):
+    """Bytes of whole files by name, and names of those that are fuzzed."""
+    from kinds import kinds
+
+    with tempfile.TemporaryDirectory() as folder:
+        kinds()[kind].write(Path(folder))
+        return {
+            str(path.relative_to(folder)): path.read_bytes()
+            for path in sorted(Path(folder).rglob("*"))
+            if path.is_file()
+        }
+
+
+def outcome(kind, path):
+    """Read a damaged file: "read", "refused", or what went wrong, and the words to it."""
+    from speckle3d.core.errors import Speckle3DError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            kind.read(path)
+    except Speckle3DError as error:
+        words = str(error)
+        if (
+            not words
+            or len(words.splitlines()) > 1
+            or len(words) > LONGEST_MESSAGE
+            or not words.isprintable()
+        ):
+            return "unreadable message", repr(words)[:300]
+        return "refused", words
+    except BaseException:
+        return "exception", traceback.format_exc()
+    return "read", ""
+
+
+def memory_bytes(field):
+    """A figure of this process's memory on Linux; 0 elsewhere."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(field)), 0)
+
+
+def forget_peak():
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return
+
+
+def work(name, first, count, measured):
+    """Run cases and say on stdout how each went, for `watch`."""
+    from kinds import kinds
+
+    faulthandler.enable()
+    kind, kept = kinds()[name], examples(name)
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole"
+        for each, content in kept.items():
+            (whole / each).parent.mkdir(parents=True, exist_ok=True)
+            (whole / each).write_bytes(content)
+            # So that numba's kernels and imports are no one's time or memory.
+            outcome(kind, whole / each)
+        for seed in range(first, first + count):
+            print(f"begin {seed}", flush=True)
+            place = Path(folder) / "case"
+            shutil.rmtree(place, ignore_errors=True)
+            place.mkdir()
+            path = prepare(name, seed, kept, place)
+            size = path.stat().st_size
+            before = 0
+            if measured:
+                forget_peak()
+                before = memory_bytes("VmRSS")
+            found, words = outcome(kind, path)
+            grown = memory_bytes("VmHWM") - before if measured else 0
+            if found in GOOD and grown > 2 * size + kind.beside_bytes:
+                found, words = "memory", f"{grown} bytes for a file of {size}"
+            print(
+                f"end {seed} {found.replace(' ', '-')} {words.encode().hex() if found not in GOOD else ''}",
+                flush=True,
+            )
+
+
+def watch(name, first, count, measured, say):
+    """Run seeds in another process; returns how often each outcome came, and failures as (seed, what, words)."""
+    from kinds import kinds
+
+    limit = kinds()[name].seconds
+    counts, failures, at = collections.Counter(), [], first
+    while at < first + count:
+        command = [
+            sys.executable,
+            __file__,
+            "--work",
+            name,
+            str(at),
+            str(first + count - at),
+            str(int(measured)),
+        ]
+        with (
+            tempfile.TemporaryFile() as errors,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+        ):
+            lines = Queue()
+            reader = threading.Thread(
+                target=lambda: [*map(lines.put, process.stdout), lines.put("")], daemon=True
+            )
+            reader.start()
+            running = None
+            while True:
+                try:
+                    # The first case waits for imports and kernels.
+                    line = lines.get(timeout=limit if running is not None else 300.0)
+                except Empty:
+                    process.kill()
+                    line = "hang"
+                word, *rest = line.split()[:4] or [""]
+                if word == "begin":
+                    running = int(rest[0])
+                    continue
+                if word == "end":
+                    found = rest[1].replace("-", " ")
+                    counts[found] += 1
+                    if found not in GOOD:
+                        failures.append(
+                            (running, found, bytes.fromhex(rest[2]).decode() if len(rest) > 2 else "")
+                        )
+                    at = running + 1
+                    continue
+                break
+            process.wait()
+            if at < first + count:
+                what = "hang" if word == "hang" else "crash"
+                errors.seek(0)
+                text = errors.read().decode("utf-8", "replace")
+                if running is None or running < at:
+                    raise RuntimeError(f"{name}: the worker died between cases:\n{text}")
+                counts[what] += 1
+                failures.append((running, what, f"exit code {process.returncode}\n{text[:4000]}"))
+                at = running + 1
+        say(failures)
+    return counts, failures
+
+
+def file_failure(folder, name, seed, what, words):
+    """Keep a case that failed: its file, and what happened."""
+    place = folder / f"{name}-{seed}"
+    place.mkdir(parents=True, exist_ok=True)
+    try:
+        prepare(name, seed, examples(name), place)
+    finally:
+        (place / "what.txt").write_text(f"{what}\n{words}\n", encoding="utf-8")
+
+
+def fuzz(names, cases, first, seconds, folder, measured):
+    """Go round the kinds, a batch each, until cases or time are used up; returns whether all went well."""
+    end = time.monotonic() + seconds
+    done = dict.fromkeys(names, 0)
+    total = {name: collections.Counter() for name in names}
+    seen = 0
+    while any(done[name] < cases for name in names) and time.monotonic() < end:
+        for name in names:
+            count = min(BATCH, cases - done[name])
+            if count <= 0 or time.monotonic() >= end:
+                continue
+            begin = time.monotonic()
+            counts, failures = watch(name, first + done[name], count, measured, lambda _: None)
+            spent = time.monotonic() - begin
+            done[name] += count
+            total[name] += counts
+            for seed, what, words in failures:
+                seen += 1
+                print(
+                    f"{name} {seed}: {what}: {words.strip().splitlines()[-1][:200] if words.strip() else ''}"
+                )
+                file_failure(folder, name, seed, what, words)
+            tally = ", ".join(f"{n} {what}" for what, n in sorted(total[name].items()))
+            print(
+                f"{name}: seeds {first} to {first + done[name] - 1}: {tally} ({spent:.0f} s for the last {count})",
+                flush=True,
+            )
+    return seen == 0
+
+
+def main():
+    from kinds import kinds
+
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--kinds", nargs="+", default=list(kinds()), choices=list(kinds()))
+    parser.add_argument("--cases", type=int, default=10**9, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first case")
+    parser.add_argument("--seconds", type=float, default=float("inf"))
+    parser.add_argument("--failures", type=Path, default=Path("fuzz-failures"))
+    parser.add_argument("--unmeasured", action="store_true", help="leave memory unwatched: faster")
+    parser.add_argument("--case", nargs=2, metavar=("KIND", "SEED"))
+    parser.add_argument("--keep", type=Path, help="where to leave the file of --case")
+    parser.add_argument("--work", nargs=4, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.work:
+        name, first, count, measured = given.work
+        work(name, int(first), int(count), bool(int(measured)))
+        return 0
+    if given.case:
+        name, seed = given.case[0], int(given.case[1])
+        with tempfile.TemporaryDirectory() as folder:
+            place = given.keep or Path(folder)
+            path = prepare(name, seed, examples(name), place)
+            found, words = outcome(kinds()[name], path)
+            print(f"{path}\n{found}\n{words}")
+        return 0 if found in GOOD else 1
+    return (
+        0
+        if fuzz(given.kinds, given.cases, given.first, given.seconds, given.failures, not given.unmeasured)
+        else 1
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
