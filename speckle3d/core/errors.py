@@ -7,15 +7,18 @@ from contextlib import contextmanager
 
 from speckle3d.core.printable import printable
 
+_LONGEST = 1200
+"""Letters of a message; a path alone may have hundreds."""
+
 
 class Speckle3DError(Exception):
     """Root of every error the package raises on purpose.
 
-    Its words may quote a file: they are shown escaped, in one line.
+    Its words may quote a file: they are shown escaped, in one line, and cut if longer than a screen.
     """
 
     def __init__(self, *words: object) -> None:
-        super().__init__(*(printable(each) if isinstance(each, str) else each for each in words))
+        super().__init__(*(_quotable(each) if isinstance(each, str) else each for each in words))
 
 
 class InvalidInputError(Speckle3DError, ValueError):
@@ -32,6 +35,13 @@ class InsufficientDataError(Speckle3DError, ValueError):
 
 class FileError(Speckle3DError, OSError):
     """A file cannot be opened, read or written."""
+
+
+def _quotable(words: str) -> str:
+    shown = printable(words)
+    if len(shown) <= _LONGEST:
+        return shown
+    return f"{shown[: _LONGEST // 2]} ... {shown[-_LONGEST // 4 :]}"
 
 
 @contextmanager

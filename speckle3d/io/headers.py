@@ -105,7 +105,7 @@ def read_header(path: PathLike) -> SequenceHeader:
         start = stream.read(512)
         stream.seek(0)
         if is_nrrd(start):
-            return _nrrd_header(path, dict(_nrrd_lines(stream)), stream)
+            return _nrrd_header(path, dict(_nrrd_lines(path, stream)), stream)
         if is_metaimage(start):
             return _meta_header(path, dict(_meta_lines(path, stream)), stream)
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
@@ -122,7 +122,8 @@ def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
     raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
 
 
-def _nrrd_lines(stream: BinaryIO) -> Iterator[tuple[str, str]]:
+def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
+    is_apart = False
     for line in _lines(stream):
         if not line.strip():
             return
@@ -134,7 +135,11 @@ def _nrrd_lines(stream: BinaryIO) -> Iterator[tuple[str, str]]:
         else:
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
             name, _, value = line.partition(":")
-            yield name.strip().lower(), value.strip()
+            name = name.strip().lower()
+            is_apart = is_apart or name in ("data file", "datafile")
+            yield name, value.strip()
+    if not is_apart:
+        raise FileError(f"{path}: expected an NRRD header up to an empty line, got a truncated one")
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:

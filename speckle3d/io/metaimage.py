@@ -248,7 +248,8 @@ def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> R
 def _squared(matrices: FloatArray) -> FloatArray:
     """Make rounded rotations exact; matrices farther off stay, for `transforms_from_matrices` to refuse."""
     r = matrices[:, :3, :3]
-    rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
     rounded[rounded] = np.linalg.det(r[rounded]) > 0
     squared = matrices.copy()
     squared[rounded, :3, :3] = nearest_rotation(r[rounded])

@@ -156,6 +156,7 @@ def read_pixels(pixels: Pixels) -> npt.NDArray[Any]:
     FileError
         If the file cannot be read, is damaged, or holds more or fewer.
     """
+    _require_plausible(str(pixels.path), pixels)
     with open_regular(pixels.path) as stream:
         stream.seek(pixels.start)
         if pixels.packing == "raw":
@@ -210,11 +211,15 @@ def _checked(where: str, pixels: Pixels, announced: int) -> Pixels:
     least = {"raw": pixels.size_bytes, "text": 2 * pixels.count - 1}.get(pixels.packing, announced)
     if pixels.count and pixels.stored_bytes < least:
         raise FileError(f"{where}: expected {least} bytes of pixels, got {pixels.stored_bytes}: truncated")
+    _require_plausible(where, pixels)
+    return pixels
+
+
+def _require_plausible(where: str, pixels: Pixels) -> None:
     most = plausible_bytes(pixels.stored_bytes, _MOST_TIMES_PACKED)
     if pixels.size_bytes > most:
         got = f"{pixels.size_bytes} from {pixels.stored_bytes} packed"
         raise InvalidInputError(f"{where}: expected at most {most} bytes of pixels, got {got}")
-    return pixels
 
 
 def _beside(path: Path, name: str, field: str) -> Path:
