@@ -204,7 +204,7 @@ def small_sweep(folder):
 
     from speckle3d.simulation.presets import SimulationSettings, simulate
 
-    settings = SimulationSettings(preset="tissue", vectors=20, samples=700, seed=5, length_mm=1.5, frames=12)
+    settings = SimulationSettings(preset="tissue", vectors=26, samples=1000, seed=5, length_mm=1.5, frames=12)
     write_sweep(folder / "s.h5", simulate(settings)[0].sweep)
     shutil.copy(Path(__file__).resolve().parents[2] / "data" / "curves.h5", folder / "curves.h5")
     return [folder / "s.h5", folder / "curves.h5"]
