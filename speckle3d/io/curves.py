@@ -68,6 +68,7 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         if not depth.size or (np.diff(depth) <= 0).any():
             raise InvalidInputError("/depth_mm: expected depths that increase, got others")
         distance = read_checked(file, "distance_mm", ("k",))
+        require_finite(distance, "/distance_mm")
         correlation = read_checked(file, "correlation", (depth.size, distance.size))
         cells = read_checked(file, "cells", (depth.size,))
         numbers = read_attributes(file, dict.fromkeys(PATCH_NUMBERS, float))

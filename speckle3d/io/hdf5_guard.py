@@ -26,6 +26,7 @@ Offset: TypeAlias = tuple[int, ...]
 """Index of a chunk's first sample."""
 
 _MOST_HOPS = 16
+_MOST_LEVELS = 32
 _MOST_TIMES_THE_FILE = 2
 """Beside whatever compresses well, a file of this family holds echoes, which do not."""
 
@@ -81,11 +82,7 @@ def require_held(node: h5py.Dataset) -> None:
     InvalidInputError
         If its data lie in other files, were never written, or take more room than the file has.
     """
-    settings = node.id.get_create_plist()
-    if node.is_virtual:
-        raise InvalidInputError("expected its data in the file, got a virtual data set (of other files)")
-    if settings.get_external_count():
-        raise InvalidInputError(f"expected its data in the file, got them in {_external_names(settings)}")
+    _require_inside(node)
     if not node.size:
         return
     file_bytes = node.file.id.get_filesize()
@@ -95,6 +92,32 @@ def require_held(node: h5py.Dataset) -> None:
     declared, stored = _bytes_of(node, node.shape), node.id.get_storage_size()
     if stored < declared or stored > file_bytes:
         raise InvalidInputError(f"expected {declared} bytes of data, got {min(stored, file_bytes)}")
+
+
+def require_own(group: h5py.Group, name: str) -> h5py.HLObject:
+    """Find a member with all that is below it, and refuse it if any data of it lie in other files.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming what lies elsewhere, or if groups lie in groups without end.
+    """
+    found = follow(group, name)
+    ahead, seen = [(found, 0)], {_address(found)}
+    while ahead:
+        node, depth = ahead.pop()
+        if isinstance(node, h5py.Dataset):
+            _require_inside(node)
+        if not isinstance(node, h5py.Group):
+            continue
+        if depth == _MOST_LEVELS:
+            raise InvalidInputError(f"{name}: expected at most {_MOST_LEVELS} groups in each other, got more")
+        for step in node.id:
+            below = follow(node, step.decode("utf-8", "surrogateescape"))
+            if _address(below) not in seen:
+                seen.add(_address(below))
+                ahead.append((below, depth + 1))
+    return found
 
 
 def require_readable(node: h5py.Dataset) -> None:
@@ -198,6 +221,18 @@ def unpacked(node: h5py.Dataset, offset: Offset) -> npt.NDArray[Any]:
 def _steps(path: bytes) -> list[bytes]:
     """Names along a path, the last first."""
     return [step for step in reversed(path.split(b"/")) if step not in (b"", b".")]
+
+
+def _address(node: h5py.HLObject) -> int:
+    return int(h5py.h5o.get_info(node.id).addr)
+
+
+def _require_inside(node: h5py.Dataset) -> None:
+    settings = node.id.get_create_plist()
+    if node.is_virtual:
+        raise InvalidInputError("expected its data in the file, got a virtual data set (of other files)")
+    if settings.get_external_count():
+        raise InvalidInputError(f"expected its data in the file, got them in {_external_names(settings)}")
 
 
 def _external_names(settings: Any) -> str:

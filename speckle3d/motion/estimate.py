@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
