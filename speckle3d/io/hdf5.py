@@ -22,7 +22,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, 
 from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.io.hdf5_guard import follow, require_held, require_readable
+from speckle3d.io.hdf5_guard import follow, require_held, require_readable, require_texts
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
@@ -268,6 +268,7 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
         raise InvalidInputError(f"{where}: expected texts of shape {shape}, got {node.shape} {node.dtype}")
     with reading(locate(group, name)), naming(locate(group, name)):
         require_readable(node)
+        require_texts(node)
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.files import plausible_bytes
+from speckle3d.core.files import open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 
 Offset: TypeAlias = tuple[int, ...]
@@ -37,6 +37,12 @@ _DEFLATE, _SHUFFLE, _CHECKSUM, _LZF = (
     h5py.h5z.FILTER_LZF,
 )
 _CHECKSUM_BYTES = 4
+
+_REFERENCE = np.dtype([("length", "<u4"), ("place", "<u8"), ("index", "<u4")])
+"""To a text, in files whose addresses have eight bytes, as HDF5 writes them."""
+
+_HEAP = b"GCOL"
+"""First bytes of the places in a file that hold texts."""
 
 
 def follow(group: h5py.Group, name: str) -> Any:
@@ -136,6 +142,30 @@ def require_readable(node: h5py.Dataset) -> None:
             raise InvalidInputError(f"expected {_chunk_count(node)} chunks, got {len(offsets)}")
         for offset in offsets:
             require_whole_chunk(node, offset)
+
+
+def require_texts(node: h5py.Dataset) -> None:
+    """Refuse texts of free length whose places in the file are not places of texts.
+
+    HDF5 makes room for as many bytes as a reference claims, up to 4 GB each, before it looks at the place.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first that is wrong, or if they are stored otherwise than in one run.
+    """
+    if not node.size or not node.id.get_type().is_variable_str():
+        return
+    at, file_bytes = node.id.get_offset(), node.file.id.get_filesize()
+    if node.id.get_create_plist().get_layout() != h5py.h5d.CONTIGUOUS or at is None:
+        raise InvalidInputError("expected texts stored in one run, got chunks")
+    with open_regular(node.file.filename) as stream:
+        stream.seek(at)
+        references = np.frombuffer(stream.read(node.size * _REFERENCE.itemsize), dtype=_REFERENCE)
+        for i, (length, place, _) in enumerate(references.tolist()):
+            stream.seek(min(place, file_bytes))
+            if length and (length > file_bytes or stream.read(len(_HEAP)) != _HEAP):
+                raise InvalidInputError(f"[{i}]: expected a text in the file, got {length} bytes at {place}")
 
 
 def require_whole_chunk(node: h5py.Dataset, offset: Offset) -> None:

@@ -130,7 +130,9 @@ def _draw(axes: Axes, turn: Turn, worst: bool) -> None:
     axes.plot(at, measured, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
     which = "worst" if worst else "best"
     axes.set_title(
-        f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}", fontsize="medium"
+        f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}",
+        fontsize="medium",
+        parse_math=False,
     )
     axes.set_xlabel("orientation in the turn")
     axes.set_ylabel(f"{turn.angle} / degrees")
