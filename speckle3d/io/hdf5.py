@@ -22,7 +22,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, 
 from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.io.hdf5_guard import follow, require_held, require_readable, require_texts
+from speckle3d.io.hdf5_guard import follow, require_held, require_readable, require_sound_heaps, require_texts
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
@@ -151,6 +151,8 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
+        with naming(str(path)):
+            require_sound_heaps(path)
         return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
 
 

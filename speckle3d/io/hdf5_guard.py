@@ -11,7 +11,9 @@ others (szip, plugins) make of a chunk is theirs to check.
 from __future__ import annotations
 
 import math
+import struct
 import zlib
+from io import BufferedReader
 from typing import Any, TypeAlias
 
 import h5py
@@ -19,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.files import open_regular, plausible_bytes
+from speckle3d.core.files import PathLike, open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 
 Offset: TypeAlias = tuple[int, ...]
@@ -43,6 +45,9 @@ _REFERENCE = np.dtype([("length", "<u4"), ("place", "<u8"), ("index", "<u4")])
 
 _HEAP = b"GCOL"
 """First bytes of the places in a file that hold texts."""
+
+_HEAP_START = _HEAP + b"\1\0\0\0"
+_SEARCHED_BYTES = 2**25
 
 
 def follow(group: h5py.Group, name: str) -> Any:
@@ -78,6 +83,46 @@ def follow(group: h5py.Group, name: str) -> Any:
             kind = "a circle of links" if link == h5py.h5l.TYPE_SOFT else "a link to another file"
             raise InvalidInputError(f"expected a member of the file itself, got {kind}")
     return node
+
+
+def require_sound_heaps(path: PathLike) -> None:
+    """Refuse a file whose heaps, in which HDF5 keeps texts, do not go on from each text to the next.
+
+    On an entry of no length HDF5 runs in a circle for good. Long files are looked through at both ends, where
+    attributes are.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the byte.
+    """
+    with open_regular(path) as stream:
+        size = stream.seek(0, 2)
+        spans = [(0, size)] if size <= 2 * _SEARCHED_BYTES else [
+            (0, _SEARCHED_BYTES), (size - _SEARCHED_BYTES, size)
+        ]  # fmt: skip
+        for start, stop in spans:
+            stream.seek(start)
+            content, at = stream.read(stop - start), -1
+            while (at := content.find(_HEAP_START, at + 1)) >= 0:
+                _require_sound_heap(stream, start + at, size)
+
+
+def _require_sound_heap(stream: BufferedReader, start: int, file_bytes: int) -> None:
+    stream.seek(start)
+    (length,) = struct.unpack("<8xQ", stream.read(16).ljust(16, b"\0"))
+    if length > file_bytes - start:
+        raise InvalidInputError(f"heap at byte {start}: expected it in the file, got {length} bytes")
+    stream.seek(start)
+    heap, at = stream.read(length), 16
+    while at + 16 <= length:
+        index, size = struct.unpack_from("<H6xQ", heap, at)
+        step = size if index == 0 else 16 + -(-size // 8) * 8
+        if not 16 <= step <= length - at:
+            raise InvalidInputError(
+                f"heap at byte {start}: expected entries of 16 bytes and more, got {step}"
+            )
+        at += step
 
 
 def require_held(node: h5py.Dataset) -> None:

@@ -177,9 +177,7 @@ def test_the_same_of_a_sensor(path):
         node.id.write_direct_chunk((0,), zlib.compress(np.arange(17.0).tobytes()))
 
     in_place_of(path, "tracker/time_s", make)
-    with pytest.raises(
-        InvalidInputError, match=r"/tracker/time_s: chunk \(0,\): expected 144 bytes, got 136"
-    ):
+    with pytest.raises(InvalidInputError, match=r"/tracker/time_s: chunk \(0,\): .*144 bytes, got 136"):
         read_sweep(path)
 
 
@@ -225,6 +223,18 @@ def test_a_text_that_claims_four_gigabytes_is_refused_before_room_is_made(tmp_pa
         read_calibration(path)
 
 
+@pytest.mark.parametrize("entry", [bytes(16), b"\x01\0" + bytes(6) + b"\xff" * 8])
+def test_a_heap_that_does_not_go_on_is_refused_before_hdf5_runs_in_circles(tmp_path, entry):
+    path = tmp_path / "c.h5"
+    write_calibration(path, made())
+    content = bytearray(path.read_bytes())
+    heap = content.index(b"GCOL")
+    content[heap + 16 : heap + 32] = entry
+    path.write_bytes(content)
+    with pytest.raises(InvalidInputError, match=rf"c\.h5: heap at byte {heap}"):
+        read_calibration(path)
+
+
 def test_unknown_groups_with_data_elsewhere_are_not_copied(path, tmp_path):
     with h5py.File(path, "r+") as file:
         file.create_dataset("notes/deep/secret", (100,), "u1", external=[("/etc/passwd", 0, 100)])
@@ -261,8 +271,8 @@ def test_what_is_no_file_is_refused_at_once_by_every_reader(tmp_path, name):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
-    readers = (load_config, read_curves, describe, sha256_of, read_header, load_sweep, read_wire_phantom, read_points,
-               read_tum, read_volume, read_calibration, read_sweep, read_log)  # fmt: skip
+    readers = (load_config, read_curves, describe, sha256_of, read_header, load_sweep, read_wire_phantom,
+               read_points, read_tum, read_volume, read_calibration, read_sweep, read_log)  # fmt: skip
     for read in readers:
         with pytest.raises(FileError, match=name):
             read(tmp_path / name)
