@@ -151,8 +151,7 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
-        with naming(str(path)):
-            require_sound_heaps(path)
+        require_sound_heaps(path)
         return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
 
 

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 
@@ -93,7 +93,7 @@ def require_sound_heaps(path: PathLike) -> None:
 
     Raises
     ------
-    InvalidInputError
+    FileError
         Naming the byte.
     """
     with open_regular(path) as stream:
@@ -105,23 +105,22 @@ def require_sound_heaps(path: PathLike) -> None:
             stream.seek(start)
             content, at = stream.read(stop - start), -1
             while (at := content.find(_HEAP_START, at + 1)) >= 0:
-                _require_sound_heap(stream, start + at, size)
+                _require_sound_heap(path, stream, start + at, size)
 
 
-def _require_sound_heap(stream: BufferedReader, start: int, file_bytes: int) -> None:
+def _require_sound_heap(path: PathLike, stream: BufferedReader, start: int, file_bytes: int) -> None:
+    where = f"{path}: heap at byte {start}"
     stream.seek(start)
     (length,) = struct.unpack("<8xQ", stream.read(16).ljust(16, b"\0"))
     if length > file_bytes - start:
-        raise InvalidInputError(f"heap at byte {start}: expected it in the file, got {length} bytes")
+        raise FileError(f"{where}: expected it in the file, got {length} bytes")
     stream.seek(start)
     heap, at = stream.read(length), 16
     while at + 16 <= length:
         index, size = struct.unpack_from("<H6xQ", heap, at)
         step = size if index == 0 else 16 + -(-size // 8) * 8
         if not 16 <= step <= length - at:
-            raise InvalidInputError(
-                f"heap at byte {start}: expected entries of 16 bytes and more, got {step}"
-            )
+            raise FileError(f"{where}: expected entries of 16 bytes or more, got {step}")
         at += step
 
 
