@@ -1,6 +1,7 @@
 """Damage and malice, drawn at random: to bytes, to text, and to what an HDF5 file holds."""
 
 import re
+import zlib
 
 import h5py
 import numpy as np
@@ -19,8 +20,10 @@ NUMBERS = (
     "9" * 5000,
     "0x10",
 )
-WORDS = (*NUMBERS, "", "x", "\x1b[31m\x07", "\u202eevil", "[red]", "{0}", "%s", "a\nb", "/dev/zero", "../../a",
-         "<script>alert(1)</script>", "é", "'", '"', "\x00", "true", "[" * 3000, "LIST", "LOCAL", "=", ":")  # fmt: skip
+WORDS = (
+    *NUMBERS, "", "x", "\x1b[31m\x07", "\u202eevil", "[red]", "{0}", "%s", "a\nb", "/dev/zero", "../../a",
+    "<script>alert(1)</script>", "é", "'", '"', "\x00", "true", "[" * 3000, "LIST", "LOCAL", "=", ":",
+)  # fmt: skip
 VALUES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1.0, 1e300, -1e300, 1e-300, 1e12, 0.5, 2.0)
 TYPES = ("f2", "f4", "f8", ">f8", "i1", "i8", ">i4", "u1", "u8", "?", "c8", "S5", "O", "V3", "compound")
 CONTROLS = b"\x00\x1b\r\n\t =:,;#<>&\"'[]{}\xff\x80"
@@ -249,11 +252,11 @@ def rechunk(rng, file):
     offset = (0,) * values.ndim
     mask, raw = node.id.read_direct_chunk(offset)
     shorter = raw[: int(rng.integers(0, len(raw) + 1))]
-    import zlib
-
     size = int(np.prod(chunks)) * values.itemsize
-    choices = (shorter, of_bytes(rng, raw), zlib.compress(bytes(max(size - 1, 0))), zlib.compress(bytes(size + 1)),
-               zlib.compress(bytes(10**7)), bytes(size), b"\x20\x00" * 10)  # fmt: skip
+    choices = (
+        shorter, of_bytes(rng, raw), zlib.compress(bytes(max(size - 1, 0))), zlib.compress(bytes(size + 1)),
+        zlib.compress(bytes(10**7)), bytes(size), b"\x20\x00" * 10,
+    )  # fmt: skip
     new = choices[int(rng.integers(0, len(choices)))]
     node.id.write_direct_chunk(offset, new, int(rng.integers(0, 4)) if rng.random() < 0.3 else mask)
 

@@ -4,9 +4,9 @@
     python tests/fuzz/run.py --kinds sweep tum --cases 10000   # seeds 0 to 9999 of two kinds
     python tests/fuzz/run.py --case sweep 4711 --keep case     # one again, in this process, its file kept
 
-A case is a whole file, damaged as its seed says. It must be read, or refused by an error of the package in one
-line; without another exception or warning, a crash of the interpreter, a hang, or more memory than twice the file
-and a constant. Cases run in processes of their own; those that fail are kept in --failures with their seeds.
+A case is a whole file, damaged as its seed says. It must be read, or refused by an error of the package in
+one line; without another exception or warning, a crash of the interpreter, a hang, or more memory than twice
+the file and a constant. Cases run in processes of their own; those that fail are kept in --failures.
 """
 
 import argparse
@@ -37,26 +37,27 @@ def prepare(kind, seed, kept, folder):
     from kinds import kinds
 
     rng = np.random.default_rng([*kind.encode(), seed])
-    whole = sorted(kept)
-    path = folder / whole[int(rng.integers(0, len(whole)))]
-    for name in whole:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(kept[name])
+    mains, contents = kept
+    put(contents, folder)
+    path = folder / mains[int(rng.integers(0, len(mains)))]
     kinds()[kind].damage(rng, path)
     return path
 
 
+def put(contents, folder):
+    for name, content in contents.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
 def examples(kind):
-    """Bytes of whole files by name, and names of those that are fuzzed."""
+    """Names of whole files, and the bytes of these and of what lies beside them by name."""
     from kinds import kinds
 
     with tempfile.TemporaryDirectory() as folder:
-        kinds()[kind].write(Path(folder))
-        return {
-            str(path.relative_to(folder)): path.read_bytes()
-            for path in sorted(Path(folder).rglob("*"))
-            if path.is_file()
-        }
+        mains = [str(path.relative_to(folder)) for path in kinds()[kind].write(Path(folder))]
+        files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
+        return sorted(mains), {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def outcome(kind, path):
@@ -69,15 +70,10 @@ def outcome(kind, path):
             kind.read(path)
     except Speckle3DError as error:
         words = str(error)
-        if (
-            not words
-            or len(words.splitlines()) > 1
-            or len(words) > LONGEST_MESSAGE
-            or not words.isprintable()
-        ):
+        if not words or len(words) > LONGEST_MESSAGE or not words.isprintable():
             return "unreadable message", repr(words)[:300]
         return "refused", words
-    except BaseException:
+    except BaseException:  # noqa: BLE001 - whatever it is, it is what is looked for
         return "exception", traceback.format_exc()
     return "read", ""
 
@@ -106,11 +102,12 @@ def work(name, first, count, measured):
     kind, kept = kinds()[name], examples(name)
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "whole"
-        for each, content in kept.items():
-            (whole / each).parent.mkdir(parents=True, exist_ok=True)
-            (whole / each).write_bytes(content)
-            # So that numba's kernels and imports are no one's time or memory.
-            outcome(kind, whole / each)
+        put(kept[1], whole)
+        for each in kept[0]:
+            # So that numba's kernels and imports are no case's time or memory.
+            found, words = outcome(kind, whole / each)
+            if found != "read":
+                raise RuntimeError(f"{name}: {each}: expected a whole file to be read, got {found}: {words}")
         for seed in range(first, first + count):
             print(f"begin {seed}", flush=True)
             place = Path(folder) / "case"
@@ -126,71 +123,67 @@ def work(name, first, count, measured):
             grown = memory_bytes("VmHWM") - before if measured else 0
             if found in GOOD and grown > 2 * size + kind.beside_bytes:
                 found, words = "memory", f"{grown} bytes for a file of {size}"
-            print(
-                f"end {seed} {found.replace(' ', '-')} {words.encode().hex() if found not in GOOD else ''}",
-                flush=True,
-            )
+            said = "" if found in GOOD else words.encode().hex()
+            print(f"end {seed} {found.replace(' ', '-')} {said}", flush=True)
 
 
-def watch(name, first, count, measured, say):
-    """Run seeds in another process; returns how often each outcome came, and failures as (seed, what, words)."""
-    from kinds import kinds
+def lines_of(stream, lines):
+    """Pass lines on as they come; an empty one at the end."""
+    for line in stream:
+        lines.put(line)
+    lines.put("")
 
-    limit = kinds()[name].seconds
+
+def watch(name, first, count, measured):
+    """Run seeds in other processes; returns counts of outcomes, and (seed, what, words) of failures."""
     counts, failures, at = collections.Counter(), [], first
     while at < first + count:
-        command = [
-            sys.executable,
-            __file__,
-            "--work",
-            name,
-            str(at),
-            str(first + count - at),
-            str(int(measured)),
-        ]
+        rest = (str(at), str(first + count - at), str(int(measured)))
+        command = [sys.executable, __file__, "--work", name, *rest]
         with (
             tempfile.TemporaryFile() as errors,
             subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
         ):
-            lines = Queue()
-            reader = threading.Thread(
-                target=lambda: [*map(lines.put, process.stdout), lines.put("")], daemon=True
-            )
-            reader.start()
-            running = None
-            while True:
-                try:
-                    # The first case waits for imports and kernels.
-                    line = lines.get(timeout=limit if running is not None else 300.0)
-                except Empty:
-                    process.kill()
-                    line = "hang"
-                word, *rest = line.split()[:4] or [""]
-                if word == "begin":
-                    running = int(rest[0])
-                    continue
-                if word == "end":
-                    found = rest[1].replace("-", " ")
-                    counts[found] += 1
-                    if found not in GOOD:
-                        failures.append(
-                            (running, found, bytes.fromhex(rest[2]).decode() if len(rest) > 2 else "")
-                        )
-                    at = running + 1
-                    continue
-                break
+            found, at, running = follow(name, process, at)
             process.wait()
+            for seed, what, words in found:
+                counts[what] += 1
+                if what not in GOOD:
+                    failures.append((seed, what, words))
             if at < first + count:
-                what = "hang" if word == "hang" else "crash"
                 errors.seek(0)
                 text = errors.read().decode("utf-8", "replace")
                 if running is None or running < at:
                     raise RuntimeError(f"{name}: the worker died between cases:\n{text}")
+                what = "hang" if process.returncode == -9 else "crash"
                 counts[what] += 1
                 failures.append((running, what, f"exit code {process.returncode}\n{text[:4000]}"))
                 at = running + 1
-        say(failures)
     return counts, failures
+
+
+def follow(name, process, at):
+    """Read what a worker says until it ends or hangs; returns outcomes, the next seed and the last begun."""
+    from kinds import kinds
+
+    limit, lines = kinds()[name].seconds, Queue()
+    threading.Thread(target=lines_of, args=(process.stdout, lines), daemon=True).start()
+    found, running = [], None
+    while True:
+        try:
+            # The first case waits for imports and kernels.
+            word, *rest = lines.get(timeout=limit if running is not None else 300.0).split() or [""]
+        except Empty:
+            process.kill()
+            return found, at, running
+        if word == "begin":
+            running = int(rest[0])
+        elif word == "end":
+            words = bytes.fromhex(rest[2]).decode() if len(rest) > 2 else ""
+            found.append((running, rest[1].replace("-", " "), words))
+            at = running + 1
+        else:
+            return found, at, running
 
 
 def file_failure(folder, name, seed, what, words):
@@ -215,21 +208,17 @@ def fuzz(names, cases, first, seconds, folder, measured):
             if count <= 0 or time.monotonic() >= end:
                 continue
             begin = time.monotonic()
-            counts, failures = watch(name, first + done[name], count, measured, lambda _: None)
+            counts, failures = watch(name, first + done[name], count, measured)
             spent = time.monotonic() - begin
             done[name] += count
             total[name] += counts
             for seed, what, words in failures:
                 seen += 1
-                print(
-                    f"{name} {seed}: {what}: {words.strip().splitlines()[-1][:200] if words.strip() else ''}"
-                )
+                print(f"{name} {seed}: {what}: {' '.join(words.split())[-200:]}")
                 file_failure(folder, name, seed, what, words)
             tally = ", ".join(f"{n} {what}" for what, n in sorted(total[name].items()))
-            print(
-                f"{name}: seeds {first} to {first + done[name] - 1}: {tally} ({spent:.0f} s for the last {count})",
-                flush=True,
-            )
+            seeds = f"seeds {first} to {first + done[name] - 1}"
+            print(f"{name}: {seeds}: {tally} ({spent:.0f} s for the last {count})", flush=True)
     return seen == 0
 
 
