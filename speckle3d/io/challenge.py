@@ -30,6 +30,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
 from speckle3d.io.hdf5 import (
@@ -113,7 +114,9 @@ def read_challenge_scan(path: PathLike) -> Sweep:
     poses = _tool_poses(scan, n)
     tracker = None if poses is None else Tracker(TimedPoses(times, poses), tool_from_image)
     grid = ImageGrid(width, height, scale_mm[0], scale_mm[1])
-    return Sweep(frames, grid, BModeSettings(DYNAMIC_RANGE_DB), times, tracker=tracker, name=scan.stem)
+    return Sweep(
+        frames, grid, BModeSettings(DYNAMIC_RANGE_DB), times, tracker=tracker, name=printable(scan.stem)
+    )
 
 
 def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransform]:

@@ -274,9 +274,10 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
 
 
 def write_attributes(node: Node, values: object, names: Iterable[str]) -> None:
-    """Write attributes of an object under their own names."""
+    """Write attributes of an object by name; of a path that is no Unicode, what can be written."""
     for name in names:
-        node.attrs[name] = getattr(values, name)
+        value = getattr(values, name)
+        node.attrs[name] = value.encode("utf-8", "backslashreplace").decode() if type(value) is str else value
 
 
 def read_attributes(node: Node, kinds: Mapping[str, type]) -> dict[str, Any]:

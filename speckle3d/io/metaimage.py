@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
+from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
@@ -112,7 +113,7 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
         signal=signal,
         frame_time_s=_frame_times(header, settings)[kept],
         tracker=_tracker(header, settings),
-        name=Path(path).name.split(".")[0],
+        name=printable(Path(path).name.split(".")[0]),
     )
 
 

@@ -21,6 +21,7 @@ from speckle3d.core.geometry import (
     rotations_from_quaternions,
     transforms_from_matrices,
 )
+from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import (
     INERTIAL,
@@ -165,7 +166,7 @@ def read_sweep(path: PathLike) -> Sweep:
             orientation=_read_orientation(file),
             tracker=_read_tracker(file),
             truth=_read_truth(file, n),
-            name=Path(path).stem,
+            name=printable(Path(path).stem),
         )
 
 

@@ -1,22 +1,17 @@
 """What is fuzzed: for every kind of file, whole examples of it, how they are damaged, and who reads them."""
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-
-# Before the pipeline, these: they name each other's tests.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import calibration_files
 import challenge_examples
 import image_examples
 import imu_logs
-import mutations
+import numpy as np
 import speckle
 import sweep_examples
+from fuzz import mutations
 
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
@@ -275,6 +270,7 @@ def kinds():
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.io.tum import read_tum
     from speckle3d.io.volumes import read_volume
+    from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
     hdf5, text, raw = mutations.of_hdf5, bytes_of(mutations.of_text), bytes_of(mutations.of_bytes)
@@ -288,7 +284,7 @@ def kinds():
         "toml": Kind(configurations, load_config, text),
         "xml": Kind(texts(".xml", XML), read_wire_phantom, text),
         "points": Kind(texts(".csv", POINTS), lambda path: read_points(path, ("G1", "G2")), text),
-        "log": Kind(texts(".txt", *LOGS), read_log, text),
+        "log": Kind(texts(".txt", *LOGS), lambda path: read_log(path, Hints(rate_hz=100.0)), text),
         "metaimage": Kind(metaimages, read_image, text),
         "nrrd": Kind(nrrds, read_image, text),
         "volume": Kind(volumes, read_volume, text),

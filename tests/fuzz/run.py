@@ -23,9 +23,10 @@ import warnings
 from pathlib import Path
 from queue import Empty, Queue
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 import numpy as np
+
+# The examples are those of the tests.
+sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 BATCH = 2000
 LONGEST_MESSAGE = 2000
@@ -34,7 +35,7 @@ GOOD = ("read", "refused")
 
 def prepare(kind, seed, kept, folder):
     """Write the damaged file of a seed, beside whole ones; returns its path."""
-    from kinds import kinds
+    from fuzz.kinds import kinds
 
     rng = np.random.default_rng([*kind.encode(), seed])
     mains, contents = kept
@@ -52,7 +53,7 @@ def put(contents, folder):
 
 def examples(kind):
     """Names of whole files, and the bytes of these and of what lies beside them by name."""
-    from kinds import kinds
+    from fuzz.kinds import kinds
 
     with tempfile.TemporaryDirectory() as folder:
         mains = [str(path.relative_to(folder)) for path in kinds()[kind].write(Path(folder))]
@@ -96,7 +97,7 @@ def forget_peak():
 
 def work(name, first, count, measured):
     """Run cases and say on stdout how each went, for `watch`."""
-    from kinds import kinds
+    from fuzz.kinds import kinds
 
     faulthandler.enable()
     kind, kept = kinds()[name], examples(name)
@@ -164,7 +165,7 @@ def watch(name, first, count, measured):
 
 def follow(name, process, at):
     """Read what a worker says until it ends or hangs; returns outcomes, the next seed and the last begun."""
-    from kinds import kinds
+    from fuzz.kinds import kinds
 
     limit, lines = kinds()[name].seconds, Queue()
     threading.Thread(target=lines_of, args=(process.stdout, lines), daemon=True).start()
@@ -223,7 +224,7 @@ def fuzz(names, cases, first, seconds, folder, measured):
 
 
 def main():
-    from kinds import kinds
+    from fuzz.kinds import kinds
 
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
