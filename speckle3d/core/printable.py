@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
 
 
@@ -25,6 +26,11 @@ def printable(text: str, kept: str = "") -> str:
     if text.isprintable():
         return text
     return "".join(c if _is_shown(c) or c in kept else _escaped(c) for c in text)
+
+
+def written_path(path: str | os.PathLike[str]) -> str:
+    """Path as text that every file can hold: bytes of a name that are no Unicode are escaped."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def _is_shown(character: str) -> bool:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
@@ -126,7 +127,7 @@ def run_job(
         if SUBSET in drift and tracked.subset is not None:
             poses[SUBSET] = tracked.subset
         poses |= {mode: c.poses for mode, c in corrections.items()}
-        provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
+        provenance = Provenance(written_path(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
     name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
