@@ -7,7 +7,7 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -15,7 +15,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import InsufficientDataError, naming
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
@@ -35,11 +36,20 @@ from speckle3d.matching.chosen import match_again, match_in_order
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
+from speckle3d.matching.texture import doubt_band, speckle_size
 from speckle3d.motion.coherence import Coherence, scale_sigma
+from speckle3d.motion.curve_doubts import (
+    doubt_bend,
+    doubt_depths,
+    doubt_size,
+    doubt_speed,
+    doubt_widths,
+    require,
+)
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
-from speckle3d.motion.phantom import phantom_pairs, phantom_samples
+from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -81,6 +91,8 @@ class Tracked:
         What the images' own yaw and tilt are worth.
     times : StageTimes
         Seconds spent in each stage.
+    doubts : tuple of Doubt
+        What of the recording is used but not quite believed.
     """
 
     image: RigidTransform
@@ -94,6 +106,7 @@ class Tracked:
     coherence: Coherence | None
     slopes: SlopeEvidence
     times: StageTimes
+    doubts: tuple[Doubt, ...] = ()
 
 
 def track(
@@ -133,7 +146,8 @@ def track(
     Raises
     ------
     MismatchError
-        If the curves belong to another probe, frequency, sampling or patch size.
+        If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
+        or by what the images do; see `speckle3d.motion.curve_doubts`.
     InsufficientDataError
         If too many frames have no speckle in common with others.
 
@@ -147,6 +161,7 @@ def track(
     """
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
+    doubts = require([*doubt_depths(curves, matcher.laid, matcher.patches), *doubt_band(sweep)], sweep.name)
     reader = PairReader(
         curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
     )
@@ -159,6 +174,7 @@ def track(
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
+    doubts += _doubts_of_curves(sweep, curves, matcher, found.table, flags, reader, path, coherence, settings)
     flags = _with_unjoined(flags, reader, pairs)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
@@ -205,6 +221,7 @@ def track(
         coherence=coherence,
         slopes=slopes,
         times=times,
+        doubts=doubts,
     )
 
 
@@ -233,6 +250,9 @@ def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> F
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
     matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
     curves.key.require_same(matcher.key)
+    require(doubt_widths(curves), sweep.name)
+    with naming(sweep.name):
+        matcher.keep_depths(curves.depth_mm)
     return matcher
 
 
@@ -256,8 +276,7 @@ def _measured(
 
     Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
     """
-    bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    sound: BoolArray = ~bad[table.first] & ~bad[table.second]
+    sound = _sound(table, flags)
     with times.of(PLANES):
         path = reader.rough_path(table)
     if not config.coherence.adapt:
@@ -271,6 +290,33 @@ def _measured(
             pairs = reader.measure(table, path, sound, coherence)
             path = reader.path(table, pairs, coherence)
     return pairs, coherence, path
+
+
+def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
+    """Pairs of frames that are to be trusted, shape (e,)."""
+    bad = (flags & ~FrameFlag.UNMATCHED) != 0
+    sound: BoolArray = ~bad[table.first] & ~bad[table.second]
+    return sound
+
+
+def _doubts_of_curves(
+    sweep: Sweep,
+    curves: DecorrelationCurves,
+    matcher: FrameMatcher,
+    table: CorrelationTable,
+    flags: IntArray,
+    reader: PairReader,
+    path: FloatArray,
+    coherence: Coherence | None,
+    config: Config,
+) -> tuple[Doubt, ...]:
+    """Doubts that the sweep's own images raise about its curves; none if one of them is refuted."""
+    require(doubt_speed(path, sweep.frame_time_s), sweep.name)
+    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
+    factors = reader.depth_factors(table, path, _sound(table, flags), config.coherence)
+    gain = np.ones(len(matcher.patches)) if coherence is None else coherence.gain.mean(axis=0)
+    found = [*doubt_size(size, curves, matcher.patches, gain), *doubt_bend(factors)]
+    return require(found, sweep.name)
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:
@@ -331,7 +377,7 @@ def calibrate_curves(
     settings = config or Config()
     if not sweeps:
         raise InsufficientDataError("expected at least one phantom sweep, got none")
-    samples, keys = [], []
+    samples, keys, sizes = [], [], []
     total, before = sum(len(sweep) for sweep in sweeps), 0
     for sweep in sweeps:
         matcher = FrameMatcher(
@@ -342,8 +388,10 @@ def calibrate_curves(
         wanted = phantom_pairs(sweep, settings.curves)
         matches = match_in_order(sweep, matcher, wanted, _shifted(progress, before, total))
         samples.append(phantom_samples(sweep, matcher.patches, matches))
+        sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
         before += len(sweep)
-    return fit_curves(keys[0], samples, settings.curves)
+    curves = fit_curves(keys[0], samples, settings.curves)
+    return replace(curves, speckle=phantom_speckle(curves.depth_mm, sizes))
 
 
 def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:

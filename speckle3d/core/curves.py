@@ -66,6 +66,26 @@ class TiltResponse:
 
 
 @dataclass(frozen=True)
+class SpeckleSize:
+    """Width of speckle in the image, by depth, as a probe and its settings make it.
+
+    Attributes
+    ----------
+    lateral_mm, axial_mm : ndarray, shape (r,)
+        Standard deviation of the Gaussian that intensity's correlation between neighbouring samples fits.
+    """
+
+    lateral_mm: FloatArray
+    axial_mm: FloatArray
+
+    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> SpeckleSize:
+        """Sizes at other depths than those known, by linear interpolation."""
+        return SpeckleSize(
+            np.interp(depth_mm, known_mm, self.lateral_mm), np.interp(depth_mm, known_mm, self.axial_mm)
+        )
+
+
+@dataclass(frozen=True)
 class DecorrelationCurves:
     """Correlation of fully developed speckle against elevational distance, by depth.
 
@@ -81,6 +101,8 @@ class DecorrelationCurves:
         Independent speckle cells in a patch; see `speckle3d.kernels.statistics`.
     tilt : TiltResponse or None
         None if the phantom sweeps did not turn.
+    speckle : SpeckleSize or None
+        Of the phantom's images; None in files that older versions wrote.
     """
 
     key: CurveKey
@@ -90,6 +112,7 @@ class DecorrelationCurves:
     cells: FloatArray
     pairs_used: int = 0
     tilt: TiltResponse | None = None
+    speckle: SpeckleSize | None = None
 
     def __post_init__(self) -> None:
         if self.correlation.shape != (self.depth_mm.size, self.distance_mm.size):
@@ -102,9 +125,10 @@ class DecorrelationCurves:
             raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
         if self.cells.shape != self.depth_mm.shape or not (np.isfinite(self.cells) & (self.cells > 0)).all():
             raise InvalidInputError("cells: expected a number above zero for each depth, got others")
-        for name, values in vars(self.tilt).items() if self.tilt is not None else ():
-            if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
-                raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
+        for part in (self.tilt, self.speckle):
+            for name, values in vars(part).items() if part is not None else ():
+                if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
+                    raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
         if not ((self.correlation > 0) & (self.correlation <= 1)).all():
             raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
         if (np.diff(self.correlation, axis=1) > 0).any():
@@ -124,6 +148,7 @@ class DecorrelationCurves:
             np.interp(depth_mm, self.depth_mm, self.cells),
             self.pairs_used,
             None if self.tilt is None else self.tilt.at(np.asarray(depth_mm), self.depth_mm),
+            None if self.speckle is None else self.speckle.at(np.asarray(depth_mm), self.depth_mm),
         )
 
 

@@ -1,0 +1,229 @@
+"""Do the curves belong to the sweep? What its own correlations, patches and clock say.
+
+A factor that all of a curve's distances have in common cannot be told from images: the same frames are then
+seen as far apart, and everything below fits as well as before. What can be told is curves that are wrong by
+another factor at each depth, since all depths of one image move together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import MismatchError
+from speckle3d.matching.patches import PatchGrid
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.coherence import CoherenceSettings, EchoProblem, vertex
+
+FASTEST_MM_S = 300.0
+"""Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
+WIDEST_MM = 8.0
+"""Distance over which no beam keeps half of its correlation: that of an unfocused element 25 mm high, which
+keeps (1 - d / 25)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
+BENT, REFUTED_BEND = 0.12, 0.17
+"""Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.05 in phantom,
+tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too deep 0.21, reversed 0.57."""
+LEAST_EVIDENCE = 20.0
+"""Gain in twice the log-likelihood for a factor at each depth, below which a bend may be chance."""
+RESIZED, REFUTED_SIZE = 0.12, 0.25
+"""Median over depth of the logarithm of speckle sizes, either sign."""
+LEAST_ROWS = 3
+NOISY_GAIN = 0.9
+"""Part of the correlation that noise leaves, below which it makes speckle look finer."""
+TILT_FACTOR = 1.4
+"""Tilt's spread is calculated from the curve's width when curves are measured: to a few per cent the same."""
+_SCALES = np.geomspace(0.3, 3.4, 25)
+_ROW_ERROR = 0.03
+"""Of a row's factor, from the curves and tissue, beside the likelihood's."""
+
+
+def require(doubts: Sequence[Doubt], name: str) -> tuple[Doubt, ...]:
+    """Raise `MismatchError` with the first doubt that is refuted; return the others."""
+    for doubt in doubts:
+        if doubt.refuted:
+            raise MismatchError(f"{name}: {doubt}")
+    return tuple(doubts)
+
+
+def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
+    """Tell that patches were left out because the curves did not measure their depths."""
+    rows, kept = laid.row_depth_mm, used.row_depth_mm
+    if rows.size == kept.size:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "depths",
+            f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to {curves.depth_mm[-1]:.1f} "
+            f"mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {rows.size - kept.size} of {rows.size} rows left out",
+            refuted=False,
+        ),
+    )
+
+
+def doubt_widths(curves: DecorrelationCurves) -> tuple[Doubt, ...]:
+    """Doubt curves that no beam has."""
+    half = np.array([np.interp(-0.5, -row, curves.distance_mm) for row in curves.correlation])
+    found = []
+    if np.median(half) > WIDEST_MM:
+        found.append(
+            Doubt(
+                "curves",
+                "units",
+                f"expected correlation to halve within {WIDEST_MM:g} mm, got {np.median(half):.3g} mm",
+                refuted=True,
+            )
+        )
+    return tuple(found)
+
+
+def doubt_speed(path: FloatArray, time_s: FloatArray) -> tuple[Doubt, ...]:
+    """Doubt distances that no hand travels in the time.
+
+    Parameters
+    ----------
+    path : ndarray, shape (n, 2)
+        Elevational position of each frame's centre, mm, and its slope along x.
+    time_s : ndarray, shape (n,)
+    """
+    speed = float(np.abs(np.diff(path[:, 0])).sum() / (time_s[-1] - time_s[0]))
+    if speed <= FASTEST_MM_S:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "units",
+            f"expected a hand's speed of at most {FASTEST_MM_S:g} mm/s, got {speed:.0f} mm/s by the curves "
+            "and the frame times",
+            refuted=True,
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class DepthFactors:
+    """Distances read at each depth over those of all depths together.
+
+    Attributes
+    ----------
+    depth_mm, logarithm, sigma : ndarray, shape (r,)
+        Of rows of patches; the logarithm of the ratio, whose mean says nothing, and its standard deviation.
+    evidence : float
+        Gain in twice the log-likelihood over one factor for all.
+    """
+
+    depth_mm: FloatArray
+    logarithm: FloatArray
+    sigma: FloatArray
+    evidence: float
+
+    @property
+    def bend(self) -> float:
+        """Standard deviation of the logarithm over depth, beyond what its own errors make."""
+        weight = 1.0 / (self.sigma**2 + _ROW_ERROR**2)
+        off = self.logarithm - np.average(self.logarithm, weights=weight)
+        return float(np.sqrt(max(np.average(off**2 - self.sigma**2, weights=weight), 0.0)))
+
+
+def depth_factors(
+    table: CorrelationTable,
+    sound: BoolArray,
+    path: FloatArray,
+    curves: DecorrelationCurves,
+    patches: PatchGrid,
+    lateral_mm: FloatArray,
+    settings: CoherenceSettings,
+) -> DepthFactors:
+    """Fit a factor for each row of patches, coherent shares and noise granted as `estimate_coherence` does.
+
+    Parameters
+    ----------
+    sound : ndarray of bool, shape (e,)
+        Pairs both of whose frames are to be trusted.
+    path : ndarray, shape (n, 2)
+        Elevational position of each frame's centre and its slope along x.
+    lateral_mm : ndarray, shape (p,)
+        Of the patches, from the image's centre.
+    """
+    problem = EchoProblem(
+        table.first[sound],
+        table.second[sound],
+        table.correlation[sound],
+        curves,
+        patches,
+        lateral_mm,
+        settings,
+    )
+    cost = problem.cost_of_scales(path, _SCALES)
+    rows = patches.rows_of(cost).sum(axis=-1)  # shape (s, r)
+    logs = np.log(_SCALES)
+    best = rows.argmin(axis=0)
+    inner = np.clip(best, 1, _SCALES.size - 2)
+    each = np.arange(best.size)
+    curvature = rows[inner - 1, each] - 2 * rows[inner, each] + rows[inner + 1, each]
+    sigma = np.sqrt(2.0 / np.maximum(curvature / (logs[1] - logs[0]) ** 2, 1.0))
+    factor = np.array([vertex(logs, column) for column in rows.T])
+    return DepthFactors(
+        patches.row_depth_mm, factor, sigma, float(rows.sum(axis=1).min() - rows.min(axis=0).sum())
+    )
+
+
+def doubt_bend(factors: DepthFactors) -> tuple[Doubt, ...]:
+    """Doubt curves by which depths of one image are not as far from the next."""
+    if factors.depth_mm.size < LEAST_ROWS or factors.bend < BENT or factors.evidence < LEAST_EVIDENCE:
+        return ()
+    ratio = np.exp(np.ptp(factors.logarithm))
+    return (
+        Doubt(
+            "curves",
+            "curves of another probe, lens or depth",
+            f"expected all depths to tell the same distance, got distances at {factors.depth_mm[0]:.0f} to "
+            f"{factors.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} "
+            f"({100 * factors.bend:.0f} % rms, at most {100 * BENT:.0f} expected)",
+            refuted=factors.bend > REFUTED_BEND,
+        ),
+    )
+
+
+def doubt_size(
+    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
+) -> tuple[Doubt, ...]:
+    """Doubt a sweep whose speckle is not as large as the curves' phantom's at the same depths.
+
+    Parameters
+    ----------
+    seen : SpeckleSize
+        Of the rows of patches; NaN where they hold no speckle.
+    gain : ndarray, shape (p,)
+        Part of the patches' correlation that noise leaves.
+    """
+    if curves.speckle is None:
+        return ()
+    known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
+    left = np.median(patches.rows_of(gain), axis=-1)
+    found = []
+    for name in ("lateral_mm", "axial_mm"):
+        here, there = getattr(seen, name), getattr(known, name)
+        fair = np.isfinite(here)
+        if fair.sum() < LEAST_ROWS:
+            continue
+        ratio = np.log(here[fair] / there[fair])
+        # Noise differs from sample to sample, so that speckle under it looks finer.
+        off = float(np.median(np.where(left[fair] < NOISY_GAIN, np.maximum(ratio, 0.0), np.abs(ratio))))
+        if off > RESIZED:
+            found.append(
+                Doubt(
+                    "curves",
+                    "another probe, depth or sampling rate",
+                    f"expected {name.removesuffix('_mm')} speckle of {np.median(there[fair]):.3f} mm, as in "
+                    f"the curves' phantom, got {np.median(here[fair]):.3f} mm ({100 * off:.0f} % off at the "
+                    "median depth)",
+                    refuted=off > REFUTED_SIZE,
+                )
+            )
+    return tuple(found)
