@@ -41,6 +41,7 @@ from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import (
     doubt_bend,
     doubt_depths,
+    doubt_noise,
     doubt_size,
     doubt_speed,
     doubt_widths,
@@ -315,7 +316,11 @@ def _doubts_of_curves(
     size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
     factors = reader.depth_factors(table, path, _sound(table, flags), config.coherence)
     gain = np.ones(len(matcher.patches)) if coherence is None else coherence.gain.mean(axis=0)
-    found = [*doubt_size(size, curves, matcher.patches, gain), *doubt_bend(factors)]
+    found = [
+        *doubt_size(size, curves, matcher.patches, gain),
+        *doubt_noise(size, curves, matcher.patches, gain),
+        *doubt_bend(factors),
+    ]
     return require(found, sweep.name)
 
 

@@ -12,12 +12,22 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
 PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
-"""Numbers in a `CurveKey` beside those of the signal."""
+"""Numbers in a `CurveKey` beside those of the signal, in every file of curves."""
+EDGE_FRACTION = 0.1
+"""Of `CurveKey.edge_fraction` in files that do not give it: all that versions before wrote by default."""
 
 
 @dataclass(frozen=True)
 class CurveKey:
-    """Signal and patches that curves were measured with; a sweep with another key needs other curves."""
+    """Signal and patches that curves were measured with; a sweep with another key needs other curves.
+
+    Attributes
+    ----------
+    edge_fraction : float
+        Width of the band's edges over its width.
+    probe : str
+        Name of probe and preset as the recording has it; empty if it has none, and then not compared.
+    """
 
     signal: RFSettings | BModeSettings
     vector_pitch_mm: float
@@ -25,6 +35,8 @@ class CurveKey:
     patch_height_mm: float
     equalise_mm: float
     correlation_of: str = "intensity"
+    edge_fraction: float = EDGE_FRACTION
+    probe: str = ""
 
     def __post_init__(self) -> None:
         if self.correlation_of not in ("echo", "intensity"):
@@ -35,6 +47,8 @@ class CurveKey:
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         others = _settings(other)
+        if self.probe and other.probe and self.probe != other.probe:
+            raise MismatchError(f"{what}: probe is {self.probe!r} and {other.probe!r}")
         for name, mine in _settings(self).items():
             theirs = others[name]
             exact = isinstance(mine, str)
@@ -154,5 +168,5 @@ class DecorrelationCurves:
 
 def _settings(key: CurveKey) -> dict[str, Any]:
     kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
-    numbers = {name: getattr(key, name) for name in PATCH_NUMBERS}
+    numbers = {name: getattr(key, name) for name in (*PATCH_NUMBERS, "edge_fraction")}
     return {"signal": kind, "correlation_of": key.correlation_of} | vars(key.signal) | numbers

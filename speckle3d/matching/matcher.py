@@ -94,6 +94,8 @@ class FrameMatcher:
             patches.height_mm,
             intensity.equalise_mm,
             "echo" if self.of_echo else "intensity",
+            intensity.edge_fraction,
+            sweep.probe,
         )
 
     @property

@@ -29,7 +29,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
 from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.motion.distances import EchoModel
+from speckle3d.motion.distances import WELL_FALLEN, EchoModel
 
 COARSE_SCALES = np.geomspace(0.4, 3.0, 16)
 FINE_SCALES = np.geomspace(0.85, 1.18, 7)
@@ -201,6 +201,8 @@ class EchoProblem:
             here.cells,
             curves.key.correlation_of == "echo",
         )
+        ends = here.correlation[:, -1].max() > WELL_FALLEN
+        self._reach_mm = float(curves.distance_mm[-1]) if ends else np.inf
         frames = int(second.max()) + 1
         half = settings.block_frames / 2
         count = max(1, round(frames / half) - 1)
@@ -223,7 +225,7 @@ class EchoProblem:
         cost, found = np.empty(shape), np.empty((*shape, 2))
         bins = np.empty((patches, _EDGES_MM.size - 1, 4))
         for block, centre in enumerate(self.centres):
-            inside = np.abs(middle - centre) <= self._half
+            inside = (np.abs(middle - centre) <= self._half) & (np.abs(moved[:, 0]) <= self._reach_mm)
             offset, slope = moved[inside].T.copy()
             bin_by_distance(self._rho[inside], offset, slope, self._lateral, _EDGES_MM, bins)
             fit_echo_models(

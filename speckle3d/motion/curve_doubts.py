@@ -16,6 +16,8 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.sweep import RFSettings
+from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import CoherenceSettings, EchoProblem, vertex
@@ -35,8 +37,10 @@ RESIZED, REFUTED_SIZE = 0.12, 0.25
 LEAST_ROWS = 3
 NOISY_GAIN = 0.9
 """Part of the correlation that noise leaves, below which it makes speckle look finer."""
+UNSEEN_NOISE, REFUTED_NOISE = 1.6, 2.5
+"""Correlation of neighbouring vectors over what is left of it under the noise that distances were read with."""
 TILT_FACTOR = 1.4
-"""Tilt's spread is calculated from the curve's width when curves are measured: to a few per cent the same."""
+"""Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
 _SCALES = np.geomspace(0.3, 3.4, 25)
 _ROW_ERROR = 0.03
 """Of a row's factor, from the curves and tissue, beside the likelihood's."""
@@ -59,8 +63,9 @@ def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) 
         Doubt(
             "curves",
             "depths",
-            f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to {curves.depth_mm[-1]:.1f} "
-            f"mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {rows.size - kept.size} of {rows.size} rows left out",
+            f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to "
+            f"{curves.depth_mm[-1]:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: "
+            f"{rows.size - kept.size} of {rows.size} rows left out",
             refuted=False,
         ),
     )
@@ -70,6 +75,18 @@ def doubt_widths(curves: DecorrelationCurves) -> tuple[Doubt, ...]:
     """Doubt curves that no beam has."""
     half = np.array([np.interp(-0.5, -row, curves.distance_mm) for row in curves.correlation])
     found = []
+    if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
+        width = np.array([np.interp(0.5, -np.log(row), curves.distance_mm) for row in curves.correlation])
+        ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
+        if abs(np.log(ratio)) > np.log(TILT_FACTOR):
+            found.append(
+                Doubt(
+                    "curves",
+                    "distances changed after the curves were measured",
+                    f"expected tilt to spread echoes as the curves' width has it, got {ratio:.2f} times that",
+                    refuted=True,
+                )
+            )
     if np.median(half) > WIDEST_MM:
         found.append(
             Doubt(
@@ -227,3 +244,39 @@ def doubt_size(
                 )
             )
     return tuple(found)
+
+
+def doubt_noise(
+    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
+) -> tuple[Doubt, ...]:
+    """Doubt distances read with noise that the images do not show.
+
+    Noise takes as much from the correlation of neighbouring vectors as from that of frames. Where frames lack
+    correlation that vectors have, it was not noise that took it, and the curves are read at wrong distances.
+
+    Parameters
+    ----------
+    seen, gain
+        As for `doubt_size`.
+    """
+    if curves.speckle is None:
+        return ()
+    known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
+    fair = np.isfinite(seen.lateral_mm)
+    if fair.sum() < LEAST_ROWS:
+        return ()
+    pitch = patches.spacing_mm[0]
+    here, there = (np.exp(-0.5 * (pitch / size.lateral_mm[fair]) ** 2) for size in (seen, known))
+    left = np.median(patches.rows_of(gain), axis=-1)[fair]
+    excess = float(np.median(here / (there * left)))
+    if excess < UNSEEN_NOISE:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "curves of another probe, lens or depth",
+            f"expected the noise that distances were read with, {100 * (1 - np.median(left)):.0f} % of the "
+            f"correlation, between vectors too, got {excess:.1f} times the correlation that it leaves there",
+            refuted=excess > REFUTED_NOISE,
+        ),
+    )
