@@ -17,7 +17,7 @@ from speckle3d.matching.patches import PatchGrid
 
 FRAMES, SPECTRA = 12, 3
 """Frames looked at for speckle and for the spectrum, evenly spread over the sweep."""
-CONTRAST = (0.75, 1.25)
+CONTRAST = (0.75, 1.15)
 """Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
 cells. Coherent structure is above; its patches look coarser than speckle."""
 LEAST_PATCHES = 8
