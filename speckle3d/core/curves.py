@@ -143,6 +143,10 @@ class DecorrelationCurves:
             for name, values in vars(part).items() if part is not None else ():
                 if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
                     raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
+        sizes = vars(self.speckle).items() if self.speckle is not None else ()
+        for name, values in sizes:
+            if (values <= 0).any():
+                raise InvalidInputError(f"{name}: expected speckle sizes above zero, got others")
         if not ((self.correlation > 0) & (self.correlation <= 1)).all():
             raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
         if (np.diff(self.correlation, axis=1) > 0).any():
