@@ -38,15 +38,7 @@ from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import doubt_band, speckle_size
 from speckle3d.motion.coherence import Coherence, scale_sigma
-from speckle3d.motion.curve_doubts import (
-    doubt_bend,
-    doubt_depths,
-    doubt_noise,
-    doubt_size,
-    doubt_speed,
-    doubt_widths,
-    require,
-)
+from speckle3d.motion.curve_doubts import doubt_curves, doubt_depths, doubt_speed, doubt_widths, require
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
@@ -175,7 +167,11 @@ def track(
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
-    doubts += _doubts_of_curves(sweep, curves, matcher, found.table, flags, reader, path, coherence, settings)
+    doubts += require(doubt_speed(path, sweep.frame_time_s), sweep.name)
+    with times.of("checks of the curves"):
+        size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
+        factors = reader.depth_factors(found.table, path, _sound(found.table, flags), settings.coherence)
+    doubts += require(doubt_curves(size, factors, curves, matcher.patches, coherence), sweep.name)
     flags = _with_unjoined(flags, reader, pairs)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
@@ -298,30 +294,6 @@ def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     sound: BoolArray = ~bad[table.first] & ~bad[table.second]
     return sound
-
-
-def _doubts_of_curves(
-    sweep: Sweep,
-    curves: DecorrelationCurves,
-    matcher: FrameMatcher,
-    table: CorrelationTable,
-    flags: IntArray,
-    reader: PairReader,
-    path: FloatArray,
-    coherence: Coherence | None,
-    config: Config,
-) -> tuple[Doubt, ...]:
-    """Doubts that the sweep's own images raise about its curves; none if one of them is refuted."""
-    require(doubt_speed(path, sweep.frame_time_s), sweep.name)
-    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
-    factors = reader.depth_factors(table, path, _sound(table, flags), config.coherence)
-    gain = np.ones(len(matcher.patches)) if coherence is None else coherence.gain.mean(axis=0)
-    found = [
-        *doubt_size(size, curves, matcher.patches, gain),
-        *doubt_noise(size, curves, matcher.patches, gain),
-        *doubt_bend(factors),
-    ]
-    return require(found, sweep.name)
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:

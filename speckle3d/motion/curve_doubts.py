@@ -20,7 +20,7 @@ from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import CoherenceSettings, EchoProblem, vertex
+from speckle3d.motion.coherence import Coherence, CoherenceSettings, EchoProblem, vertex
 
 FASTEST_MM_S = 300.0
 """Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
@@ -56,6 +56,22 @@ def require(doubts: Sequence[Doubt], name: str) -> tuple[Doubt, ...]:
         if doubt.refuted:
             raise MismatchError(f"{name}: {doubt}")
     return tuple(doubts)
+
+
+def doubt_curves(
+    seen: SpeckleSize,
+    factors: DepthFactors,
+    curves: DecorrelationCurves,
+    patches: PatchGrid,
+    coherence: Coherence | None,
+) -> tuple[Doubt, ...]:
+    """Doubts that a sweep's own speckle raises; see `doubt_size`, `doubt_noise` and `doubt_bend`."""
+    gain = np.ones(len(patches)) if coherence is None else coherence.gain.mean(axis=0)
+    return (
+        *doubt_size(seen, curves, patches, gain),
+        *doubt_noise(seen, curves, patches, gain),
+        *doubt_bend(factors),
+    )
 
 
 def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
