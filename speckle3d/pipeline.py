@@ -171,7 +171,8 @@ def track(
     with times.of("checks of the curves"):
         size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
         factors = reader.depth_factors(found.table, path, _sound(found.table, flags), settings.coherence)
-    doubts += require(doubt_curves(size, factors, curves, matcher.patches, coherence), sweep.name)
+    ratios = reader.sum_ratios(pairs)
+    doubts += require(doubt_curves(size, factors, ratios, curves, matcher.patches, coherence), sweep.name)
     flags = _with_unjoined(flags, reader, pairs)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows

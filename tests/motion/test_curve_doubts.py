@@ -19,8 +19,10 @@ from speckle3d.motion.curve_doubts import (
     doubt_noise,
     doubt_size,
     doubt_speed,
+    doubt_sums,
     doubt_widths,
     require,
+    sum_ratios,
 )
 
 PATCHES = lay_patches(ImageGrid(vectors=48, samples=500, vector_pitch_mm=0.3, sample_spacing_mm=0.06))
@@ -97,6 +99,47 @@ def test_a_bend_is_what_exceeds_the_factors_own_errors():
 )
 def test_depths_that_disagree_doubt_the_curves(factors, refuted):
     assert [d.refuted for d in doubt_bend(factors)] == refuted
+
+
+def pairs_of(path, reach, read=lambda d: d):
+    """All pairs of frames within reach, and the signed distances read between them."""
+    first, second = np.triu_indices(len(path), 1)
+    near = np.abs(path[second] - path[first]) < reach
+    apart = (path[second] - path[first])[near]
+    return first[near], second[near], np.sign(apart) * read(np.abs(apart))
+
+
+THERE_AND_BACK = np.concatenate([np.linspace(0, 2, 21), np.linspace(1.93, 0, 21)])
+
+
+@pytest.mark.parametrize("path", [THERE_AND_BACK, -THERE_AND_BACK, np.cumsum(np.tile([0.05, 0.15], 20))])
+def test_two_steps_are_as_long_as_the_one_that_spans_them(path):
+    ratios = sum_ratios(*pairs_of(path, 0.6), 0.08)
+    assert ratios.size > 50
+    np.testing.assert_allclose(ratios, 1.0)
+    assert doubt_sums(ratios) == ()
+
+
+def test_no_sums_over_a_turn_and_none_of_hardly_any_distance():
+    first, second = np.array([0, 0, 1, 0, 2]), np.array([1, 2, 2, 3, 3])
+    # Forward, back past the start, and a last step too short to be told.
+    assert sum_ratios(first, second, np.array([0.3, -0.2, -0.5, -0.21, -0.01]), 0.05).size == 0
+    assert sum_ratios(first, second, np.array([0.3, 0.5, 0.2, 0.51, 0.01]), 0.05).tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("read", "refuted"),
+    [
+        (lambda d: 1.5 * d, []),
+        (lambda d: np.maximum(d - 0.15, 1e-3), [True]),
+        (lambda d: np.hypot(d, 0.25), [False]),
+    ],
+    ids=["scaled: cannot be told", "noise taken away", "noise left"],
+)
+def test_sums_tell_curves_of_another_shape(read, refuted):
+    ratios = sum_ratios(*pairs_of(THERE_AND_BACK, 0.5, read), 0.01)
+    assert [d.refuted for d in doubt_sums(ratios)] == refuted
+    assert doubt_sums(ratios[:5]) == ()
 
 
 def scaled(lateral=1.0, axial=1.0):
