@@ -10,7 +10,7 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.matching.blocks import Block
 from speckle3d.pipeline import match_ahead, track
 
-FRAMES = 40
+FRAMES = 32
 
 
 class First:

@@ -42,8 +42,8 @@ LEAST_ROWS, ENOUGH_ROWS = 3, 4
 NOISY_GAIN = 0.9
 """Part of the correlation that noise leaves, below which it makes speckle look finer."""
 UNSEEN_NOISE, REFUTED_NOISE = 1.8, 2.5
-"""Correlation of neighbouring vectors over what the noise taken from distances would leave of it. Simulated: up
-to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
+"""Correlation of neighbouring vectors over what the noise taken from distances would leave of it. Simulated:
+up to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
 UNEVEN, REFUTED_SUM = 0.32, 0.5
 """Median logarithm of two steps' sum over the one step that spans both, either sign. Simulated: below 0.02 in
 half of 64 good sweeps, 0.24 in the worst; with a fifth of the curves' correlation missing 0.38."""
