@@ -8,7 +8,7 @@ another factor at each depth, since all depths of one image move together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,14 +73,16 @@ def doubt_curves(
     patches: PatchGrid,
     coherence: Coherence | None,
 ) -> tuple[Doubt, ...]:
-    """Doubts that a sweep's own speckle raises: by its size, noise, depths that disagree, and steps' sums."""
+    """Doubts that a sweep's own speckle raises: by its size, noise, depths that disagree, and steps' sums.
+
+    Size, depths and sums say so independently of each other: two of them at once refute the curves.
+    """
     gain = np.ones(len(patches)) if coherence is None else coherence.gain.mean(axis=0)
-    return (
-        *doubt_size(seen, curves, patches, gain),
-        *doubt_noise(seen, curves, patches, gain),
-        *doubt_bend(factors),
-        *doubt_sums(ratios),
-    )
+    kinds = doubt_size(seen, curves, patches, gain), doubt_bend(factors), doubt_sums(ratios)
+    found = tuple(doubt for kind in kinds for doubt in kind)
+    if sum(map(bool, kinds)) > 1:
+        found = tuple(replace(doubt, refuted=True) for doubt in found)
+    return (*found, *doubt_noise(seen, curves, patches, gain))
 
 
 def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:

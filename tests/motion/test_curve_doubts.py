@@ -15,6 +15,7 @@ from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.curve_doubts import (
     DepthFactors,
     doubt_bend,
+    doubt_curves,
     doubt_depths,
     doubt_noise,
     doubt_size,
@@ -195,3 +196,20 @@ def test_noise_that_the_images_show_is_believed(gain):
 @pytest.mark.parametrize(("gain", "refuted"), [(0.75, []), (0.5, [False]), (0.25, [True])])
 def test_noise_that_the_images_do_not_show_is_not(gain, refuted):
     assert [d.refuted for d in doubt_noise(noisy(1.0), CURVES, PATCHES, gain * CLEAR)] == refuted
+
+
+@pytest.mark.parametrize(
+    ("lateral", "by", "ratio", "refuted"),
+    [
+        (1.0, 0.0, 1.0, []),
+        (1.16, 0.0, 1.0, [False]),
+        (1.0, 0.25, 1.0, [False]),
+        (1.0, 0.0, 1.5, [False]),
+        (1.16, 0.25, 1.0, [True, True]),
+        (1.16, 0.0, 0.7, [True, True]),
+        (1.0, 0.25, 1.5, [True, True]),
+    ],
+)
+def test_two_independent_doubts_at_once_refute(lateral, by, ratio, refuted):
+    found = doubt_curves(scaled(lateral), bent(by), np.full(20, ratio), CURVES, PATCHES, None)
+    assert [d.refuted for d in found] == refuted
