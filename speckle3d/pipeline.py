@@ -21,7 +21,8 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import correct_mode, require_modes
+from speckle3d.correction.modes import correct_mode, require_modes, sensor_of
+from speckle3d.correction.trust import believed, cleaned_readings, examine_sensors, require_believed
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -85,7 +86,7 @@ class Tracked:
     times : StageTimes
         Seconds spent in each stage.
     doubts : tuple of Doubt
-        What of the recording is used but not quite believed.
+        What of the recording contradicts the images or itself; what rests on refuted parts was not used.
     """
 
     image: RigidTransform
@@ -198,11 +199,15 @@ def track(
             slopes,
             0.0 if coherence is None else float(coherence.share.mean()),
         )
-        direction, source = settle_direction(sweep, trajectory.poses, settings.sensors)
+
+    # -> sensors that images and their own readings do not contradict -> sign of the motion
+    with times.of("sensors"):
+        trusted, sensed, confirmed = _examined(sweep, trajectory.poses, covariance, settings)
+        direction, source = settle_direction(trusted, trajectory.poses, settings.sensors, confirmed)
 
     # -> orientation-consistent subset -> its own trajectory
     with times.of(PLANES):
-        subset, used = _consistent(sweep, table, pairs, direction, reader, settings)
+        subset, used = _consistent(trusted, table, pairs, direction, reader, settings)
 
     if sink:
         for rows in reader.rows(table, pairs, edges, used, direction, scale_sigma(coherence)):
@@ -219,7 +224,7 @@ def track(
         coherence=coherence,
         slopes=slopes,
         times=times,
-        doubts=doubts,
+        doubts=(*doubts, *sensed),
     )
 
 
@@ -323,6 +328,21 @@ def _consistent(
     return reader.solve(reader.edges(table, pairs, planes)).poses, [plane.used for plane in planes]
 
 
+def _examined(
+    sweep: Sweep, image: RigidTransform, covariance: FloatArray, config: Config
+) -> tuple[Sweep, tuple[Doubt, ...], bool]:
+    """The sweep with what may be used of its sensors, doubts, and whether its sensed turns are confirmed."""
+    if not config.sensors.examine:
+        return sweep, (), True
+    cleaned, doubts = cleaned_readings(sweep)
+    trusted = believed(cleaned, doubts)
+    z_mm = image.apply(sweep.grid.centre_mm)[:, 2]
+    farthest = int(np.argmax(np.abs(z_mm)))
+    sigma = float(np.sqrt(covariance[farthest, 2, 2])) / max(abs(float(z_mm[farthest])), 1e-9)
+    trust = examine_sensors(trusted, image, sigma)
+    return believed(trusted, trust.doubts), (*doubts, *trust.doubts), trust.turn_confirmed
+
+
 def _rejected_share(pairs: Sequence[SignedPair], used: Sequence[BoolArray]) -> float:
     rejected = sum(int((pair.plane.used & ~u).sum()) for pair, u in zip(pairs, used, strict=True))
     return rejected / sum(int(pair.plane.used.sum()) for pair in pairs)
@@ -401,6 +421,8 @@ def correct(
         If a mode is unknown.
     InsufficientDataError
         If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
+    MismatchError
+        If the images, or its own readings, refute a mode's sensor; see `Tracked.doubts`.
 
     References
     ----------
@@ -417,6 +439,10 @@ def correct(
     """
     settings = config or Config()
     require_modes(sweep, modes)
+    for mode in modes:
+        require_believed(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
+    if settings.sensors.examine:
+        sweep, _ = cleaned_readings(sweep)
     # What wander the sensed orientation shows, cubics need not make up for.
     start = tracked.subset if tracked.subset is not None else tracked.image
     return {mode: correct_mode(mode, start, sweep, settings.drift) for mode in modes}

@@ -38,6 +38,8 @@ def small_study(folder, sweeps):
             {"name": "torn", "path": "torn.h5", "sha256": "", "key": "", "status": "failed", "reason": REASON,
              "folder": "sweeps/torn-0c", "seconds": 0.1},
         ],
+        "doubts": [{"sweep": "forward", "about": "tracker", "suspect": "units <in> metres",
+                    "evidence": "expected 3 mm, got 0.003", "refuted": True}],
         "rows": rows,
         "drift": [{"sweep": "forward", "mode": "image", "FDR": 0.1234, "GPE_mm": 0.5, "EA_deg": None}],
         "intervals": [{"mode": "pose", "quantity": "length_error_percent", "sweeps": 2, "mean": 0.987,

@@ -19,7 +19,7 @@ from speckle3d.cli.common import (
     progress_bar,
 )
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 
 if TYPE_CHECKING:
     from speckle3d.study.job import JobResult
@@ -76,10 +76,14 @@ def reconstruct(
         )
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
-        return
-    emit(result.table)
+        for line in result.summary.doubt_lines:
+            note(line)
+    else:
+        emit(result.table)
     _tell(result)
     note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+    for reason in result.summary.left_out.values():
+        raise MismatchError(f"{reason}; the other modes' results are in {result.directory}")
 
 
 def _tell(result: JobResult) -> None:

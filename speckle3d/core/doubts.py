@@ -28,3 +28,8 @@ class Doubt:
 
     def __str__(self) -> str:
         return f"{self.about}: {self.evidence} (suspect: {self.suspect})"
+
+    @property
+    def consequence(self) -> str:
+        """The doubt as a line, which says so where what is doubted is not used."""
+        return f"{self}; refused" if self.refuted else str(self)

@@ -38,6 +38,11 @@ def require_modes(sweep: Sweep, modes: Sequence[str]) -> None:
             raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
 
 
+def sensor_of(sweep: Sweep, mode: str) -> OrientationSensor | Tracker | None:
+    """The sensor that a drift mode uses."""
+    return sweep.tracker if mode == "pose" else sweep.orientation_source
+
+
 def correct_mode(
     mode: str, world_from_image: RigidTransform, sweep: Sweep, settings: DriftSettings
 ) -> DriftCorrection:
@@ -50,7 +55,7 @@ def correct_mode(
     world_from_image : RigidTransform, length n
         Of every frame of `sweep`.
     """
-    sensor = sweep.tracker if mode == "pose" else sweep.orientation_source
+    sensor = sensor_of(sweep, mode)
     assert sensor is not None
     covered = sensor.covers(sweep.frame_time_s)
     times = sweep.frame_time_s[covered]

@@ -19,6 +19,10 @@ class SensorSettings(BaseModel):
     consistent_subset: bool = Field(
         True, description="In mode `orientation`, drop distances that the sensed orientation contradicts."
     )
+    examine: bool = Field(
+        True,
+        description="Hold sensors against the images and themselves, and refuse those that are contradicted.",
+    )
     smooth_s: float = Field(
         0.2,
         ge=0,
@@ -54,8 +58,16 @@ def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) ->
     return mean * Rotation.from_rotvec(gaussian_filter1d(vectors, sigma, axis=0, mode="nearest"))
 
 
-def settle_direction(sweep: Sweep, image: RigidTransform, settings: SensorSettings) -> tuple[int, str]:
-    """Sign of the elevational motion, which images alone cannot tell, and its source."""
+def settle_direction(
+    sweep: Sweep, image: RigidTransform, settings: SensorSettings, turn_confirmed: bool = True
+) -> tuple[int, str]:
+    """Sign of the elevational motion, which images alone cannot tell, and its source.
+
+    Parameters
+    ----------
+    turn_confirmed : bool
+        Whether roll or a gyroscope confirm the orientation sensor's turns; it is not asked otherwise.
+    """
     if settings.direction:
         return settings.direction, "setting"
     centre = sweep.grid.centre_mm
@@ -65,7 +77,8 @@ def settle_direction(sweep: Sweep, image: RigidTransform, settings: SensorSettin
             measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
             agreement = float(np.sum(_travel(measured, centre) * _travel(image[covered], centre)))
             return (1 if agreement >= 0 else -1), "tracker"
-    if sweep.orientation is not None and sweep.orientation.sensor_from_image is not None:
+    calibrated = sweep.orientation is not None and sweep.orientation.sensor_from_image is not None
+    if calibrated and turn_confirmed:
         turned = _turn_agreement(sweep, image)
         if turned is not None:
             return turned, "orientation sensor"

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
@@ -52,6 +53,8 @@ class StudyData(BaseModel, frozen=True):
         In the study's order.
     sweeps : list of dict
         Entries of all sweeps, with and without results.
+    doubts : list of dict
+        What of the recordings is in doubt, by sweep.
     rows : list of dict
         Errors by sweep, part and mode.
     drift, intervals, paired : list of dict
@@ -61,6 +64,7 @@ class StudyData(BaseModel, frozen=True):
     format: Literal["speckle3d.study"]
     version: Literal[1]
     sweeps: list[dict[str, Any]]
+    doubts: list[dict[str, Any]] = []
     modes: list[str] = []
     rows: list[dict[str, Any]] = []
     drift: list[dict[str, Any]] = []
@@ -173,7 +177,8 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     folder = directory / str(entry["folder"])
     found = read_reconstruction(folder / "reconstruction.h5")
     details = _read_details(folder)
-    notes: list[str] = []
+    notes = [Doubt(**each).consequence for each in details.get("doubts", ())]
+    notes += [f"Mode {mode} is left out." for mode in details.get("left_out", ())]
     sweep = _open_sweep(directory, entry, found, notes)
     reference = None
     if sweep is not None and details.get("reference") != "none":

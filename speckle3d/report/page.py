@@ -128,6 +128,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     return environment.get_template("page.html").render(
         shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
         lead=lead + [f"{line}." for line in copy_lines(study.copies)],
+        doubts=tables.records_table([_said(each) for each in study.doubts], anchors),
         broken=tables.records_table(study.broken, columns=("name", "status", "reason")),
         modes=tables.records_table(
             found.means, styles=["best" if row["mode"] == best else "" for row in found.means]
@@ -145,6 +146,12 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
         scripts=[Markup(text) for text in scripts],
         script_hashes=" ".join(_hash(text) for text in scripts),
     )
+
+
+def _said(doubt: Record) -> dict[str, str]:
+    """A doubt as a line of the page's table."""
+    fate = "refused" if doubt.get("refuted") else "used"
+    return {name: str(doubt[name]) for name in ("sweep", "about", "suspect", "evidence")} | {"it is": fate}
 
 
 def _clear_figures(folder: Path, stems: Collection[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +15,12 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import require_modes
+from speckle3d.correction.modes import require_modes, sensor_of
+from speckle3d.correction.trust import believed, cleaned_readings, name_of, require_believed
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
 from speckle3d.io.reconstructions import ReconstructionWriter
@@ -31,7 +32,7 @@ from speckle3d.scoring.references import Reference, SweepCurves, find_reference,
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_plane
-from speckle3d.study.results import Summary, rows_of, table_text, write_summary
+from speckle3d.study.results import Summary, summary_text, write_summary
 
 SUBSET = "image+subset"
 """Mode of the images alone with the patches that contradict the sensed orientation left out."""
@@ -106,7 +107,8 @@ def run_job(
     Raises
     ------
     InvalidInputError, InsufficientDataError
-        If the sweep lacks what a mode or the reference needs.
+        If the sweep lacks what a mode or the reference needs. A mode whose sensor the images or its own
+        readings refute is left out of the results instead; `Summary.left_out` says why.
     FileError
         If the folder cannot be written.
     """
@@ -121,22 +123,27 @@ def run_job(
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
         held = None if blocks is None else partial(blocks.read, strip=strip)
         tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep, held)
-        corrections = correct(tracked, sweep, fitted, settings)
+        corrections, left_out = _corrected(tracked, sweep, fitted, settings)
         poses = {"image": tracked.image}
-        if SUBSET in drift and tracked.subset is not None:
+        if tracked.subset is not None and SUBSET in drift:
             poses[SUBSET] = tracked.subset
+        elif SUBSET in drift:
+            left_out[SUBSET] = _refusal_of_subset(sweep, tracked)
         poses |= {mode: c.poses for mode, c in corrections.items()}
         provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
+    if reference is None and compared is not None and compared.name == "tracker":
+        compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
     name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
     rows = _errors(sweep, poses, moved, compared)
     details = _details(tracked, corrections, moved, provenance)
-    summary = Summary(sweep.name, name, len(sweep), share, rows, details)
+    doubted = _doubted(sweep, poses, tracked)
+    summary = Summary(sweep.name, name, len(sweep), share, rows, details, tracked.doubts, doubted, left_out)
     files = [path, *write_summary(directory, summary)]
-    files += [save_figure(figure_drift(moved, sweep.name), directory / "drift.png")]
+    files += [save_figure(figure_drift(moved, _title(summary)), directory / "drift.png")]
     files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
-    table, seconds = table_text(rows_of([summary])), time.perf_counter() - began
+    table, seconds = summary_text(summary), time.perf_counter() - began
     return JobResult(directory, summary, table, tuple(files), seconds)
 
 
@@ -156,7 +163,7 @@ def require_possible(
             f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
             "sensors.consistent_subset, got none"
         )
-    return find_reference(sweep, reference)
+    return find_reference(cleaned_readings(sweep)[0] if config.sensors.examine else sweep, reference)
 
 
 def available_modes(sweep: Sweep, config: Config) -> list[str]:
@@ -167,6 +174,50 @@ def available_modes(sweep: Sweep, config: Config) -> list[str]:
             require_possible(sweep, [mode], None, config)
             found.append(mode)
     return found
+
+
+def _corrected(
+    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config
+) -> tuple[dict[str, DriftCorrection], dict[str, str]]:
+    """Corrections by mode, and why modes whose sensors are refuted are left out."""
+    corrections: dict[str, DriftCorrection] = {}
+    left_out: dict[str, str] = {}
+    for mode in modes:
+        try:
+            corrections |= correct(tracked, sweep, [mode], config)
+        except MismatchError as error:
+            left_out[mode] = str(error)
+    return corrections, left_out
+
+
+def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:
+    """Why there are no poses from the consistent subset, though there is a sensor for them."""
+    try:
+        require_believed(tracked.doubts, sweep.orientation_source, f"{sweep.name}: mode {SUBSET}")
+    except MismatchError as error:
+        return str(error)
+    return (
+        f"{sweep.name}: mode {SUBSET}: expected readings over every frame, got gaps where some are left out"
+    )
+
+
+def _doubted(sweep: Sweep, modes: Collection[str], tracked: Tracked) -> dict[str, str]:
+    """What is suspected of the sensor that each mode rests on; images are under all of them."""
+    found = {}
+    for mode in modes:
+        sensor = None if mode == "image" else sensor_of(sweep, mode)
+        about = {"images", "curves", "" if sensor is None else name_of(sensor)}
+        suspected = dict.fromkeys(doubt.suspect for doubt in tracked.doubts if doubt.about in about)
+        if suspected:
+            found[mode] = ", ".join(suspected)
+    return found
+
+
+def _title(summary: Summary) -> str:
+    """Name of the sweep, and below it the modes in doubt, for figures."""
+    doubted = [f"{mode} in doubt: {why}" for mode, why in summary.doubted.items()]
+    left_out = [f"{mode} left out" for mode in summary.left_out]
+    return "\n".join([summary.sweep, "; ".join(doubted + left_out)]).strip()
 
 
 def _errors(

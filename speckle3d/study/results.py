@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.tables import text_table
 from speckle3d.io.hdf5 import atomic_path, make_folder
@@ -41,12 +42,6 @@ _COLUMNS = (
     ("remark", "remark", "{}"),
 )
 _TO_THE_LEFT = (0, 1, 2, 3, 11)
-_UNLIKE = (0.5, 2.0)
-"""Ratios of the tracker's travel to that of the images beyond which its unit is doubted: a wrong unit is a
-factor of ten."""
-
-_TRAVEL_MM = 1.0
-"""Travel below which jitter may be larger than what was travelled."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +55,12 @@ class Summary:
     coverage : float
         Share of the frames that have a reference.
     rows : sequence of ModeError
+    doubts : sequence of Doubt
+        About the recording.
+    doubted : mapping of str to str
+        Modes that rest on a sensor in doubt, and what is suspected.
+    left_out : mapping of str to str
+        Modes that were asked for and refused, and why.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -70,6 +71,15 @@ class Summary:
     coverage: float
     rows: Sequence[ModeError]
     details: dict[str, Any] = field(default_factory=dict)
+    doubts: Sequence[Doubt] = ()
+    doubted: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def doubt_lines(self) -> list[str]:
+        """What a reader must know of the recording, a line each."""
+        lines = [f"{self.sweep}: {doubt.consequence}" for doubt in self.doubts]
+        return lines + [f"{self.sweep}: mode {mode} is left out" for mode in self.left_out]
 
 
 @dataclass(frozen=True)
@@ -115,8 +125,13 @@ def write_summary(directory: Path, summary: Summary) -> list[Path]:
         If the directory cannot be written.
     """
     rows = rows_of([summary])
-    texts = {"summary.json": json_text({"sweeps": [summary]}), "table.txt": table_text(rows)}
+    texts = {"summary.json": json_text({"sweeps": [summary]}), "table.txt": summary_text(summary)}
     return write_texts(directory, texts | {"table.csv": csv_text(rows)})
+
+
+def summary_text(summary: Summary) -> str:
+    """Table of one sweep, and below it what is in doubt."""
+    return table_text(rows_of([summary])) + "".join(f"{line}\n" for line in summary.doubt_lines)
 
 
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
@@ -143,6 +158,7 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
     overall = overall_text(intervals, paired, shared, references)
     failed = [each for each in outcomes if each.status == "failed"]
     remarks = [f"{each.name}  failed: {each.reason}" for each in failed] + copy_lines(copies)
+    remarks += [line for each in summaries for line in each.doubt_lines]
     table = table_text(rows) + "".join(f"{line}\n" for line in remarks)
     table += f"\n{overall}" if overall else ""
     contents = {
@@ -156,6 +172,7 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
             for each in outcomes
         ],
         "rows": rows,
+        "doubts": [{"sweep": each.sweep, **asdict(doubt)} for each in summaries for doubt in each.doubts],
         "drift": drift,
         "intervals": intervals,
         "shared": shared,
@@ -181,15 +198,11 @@ def rows_of(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
 def remark_on(summary: Summary, row: ModeError) -> str:
     """What a reader of a row must know beside its numbers; empty for nothing."""
     words = []
-    images = next((r for r in summary.rows if r.mode == "image" and r.part == row.part), None)
-    fitted = any(each.mode == "pose" for each in summary.rows)
     if row.mode == "pose" and summary.reference == "tracker":
         words.append("fitted to this tracker")
-    if row.mode == "pose" and images is not None:
-        words.append(_doubt_of_unit(row.estimate_mm, images.estimate_mm))
-    elif row.mode == "image" and summary.reference == "tracker" and not fitted:
-        words.append(_doubt_of_unit(row.reference_mm, row.estimate_mm))
-    return "; ".join(each for each in words if each)
+    if row.mode in summary.doubted:
+        words.append(f"in doubt: {summary.doubted[row.mode]}")
+    return "; ".join(words)
 
 
 def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -240,14 +253,6 @@ def copy_lines(copies: Mapping[str, str]) -> list[str]:
     return [f"{name} is a copy of {first}: counted once" for name, first in copies.items()]
 
 
-def _doubt_of_unit(tracker_mm: float, images_mm: float) -> str:
-    if not (abs(images_mm) >= _TRAVEL_MM and math.isfinite(tracker_mm)):
-        return ""
-    share = abs(tracker_mm / images_mm)
-    low, high = _UNLIKE
-    return "" if low <= share <= high else f"tracker travels {share:.2g} of what the images do: its unit?"
-
-
 def _read_summary(folder: Path, name: str) -> Summary:
     """Read a sweep's rows back; a number that was not finite is NaN again."""
     held: dict[str, Any]
@@ -255,7 +260,9 @@ def _read_summary(folder: Path, name: str) -> Summary:
     names = [f.name for f in fields(ModeError)]
     rows: list[list[Any]] = [[math.nan if row[n] is None else row[n] for n in names] for row in held["rows"]]
     summary = held["reference"], held["frames"], held["coverage"]
-    return Summary(name, *summary, [ModeError(*values) for values in rows])
+    doubts = [Doubt(**each) for each in held.get("doubts", ())]
+    told = {key: held.get(key, {}) for key in ("doubted", "left_out")}
+    return Summary(name, *summary, [ModeError(*values) for values in rows], doubts=doubts, **told)
 
 
 def _cell(value: Any, form: str) -> str:

@@ -19,7 +19,7 @@ _SIMULATOR = ("simulation/*.py", "kernels/scatter.py", "kernels/field.py", "core
 
 def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
     """The sweep of `settings` as a file, simulated once; streamed, so that its size does not matter."""
-    path = folder / f"{settings.preset}-{settings.seed}-{_key(settings.model_dump_json())}.h5"
+    path = folder / f"{settings.preset}-{settings.seed}-{key_of(settings.model_dump_json())}.h5"
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         write_sweep(path, simulate(settings)[0].sweep)
@@ -28,7 +28,7 @@ def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
 
 def simulated_pair(settings: SimulationSettings, folder: Path = DEFAULT) -> tuple[Path, Path]:
     """The two sweeps of a ``crossed`` preset as files."""
-    stem = f"{settings.preset}-{settings.seed}-{_key(settings.model_dump_json())}"
+    stem = f"{settings.preset}-{settings.seed}-{key_of(settings.model_dump_json())}"
     paths = folder / f"{stem}.h5", folder / f"{stem}-crossing.h5"
     if not all(path.is_file() for path in paths):
         folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +65,8 @@ def _sensors(sweep: Sweep, index: np.ndarray) -> tuple[Tracker, OrientationSenso
     )
 
 
-def _key(settings: str) -> str:
+def key_of(settings: str) -> str:
+    """Digest of some settings and of the simulator."""
     package = Path(speckle3d.__file__).parent
     digest = hashlib.sha256(settings.encode())
     for pattern in _SIMULATOR:

@@ -122,6 +122,25 @@ def test_without_a_sensor_the_sign_is_said_to_be_assumed(run, changed, tmp_path)
     assert "taken as positive" in err
 
 
+def test_a_mode_whose_sensor_the_images_refute_is_left_out_and_the_others_are_kept(run, changed, tmp_path):
+    def in_metres(file):
+        file["tracker/world_from_sensor"][:, :3, 3] *= 1e-3
+
+    out = tmp_path / "o"
+    code, table, err = run(
+        "reconstruct", changed(in_metres), "-o", out, "--drift", "pose", "--drift", "orientation"
+    )
+    assert code == 2
+    (line,) = [line for line in err.splitlines() if "drift mode pose" in line]
+    assert "tracker" in line
+    assert "metres" in line
+    assert "mode pose is left out" in table
+    assert set(read_reconstruction(out / "reconstruction.h5").poses) == {"image", "orientation"}
+    summary = json.loads((out / "summary.json").read_text())["sweeps"][0]
+    assert [doubt["about"] for doubt in summary["doubts"]] == ["tracker"]
+    assert {row["mode"] for row in summary["rows"]} == {"image", "orientation"}
+
+
 @pytest.mark.parametrize("name", ["v.nrrd", "v.mha", "v.nii.gz"])
 def test_volume(run, reconstructed, tmp_path, name):
     options = ("--mode", "pose", "--voxel-mm", "0.5")

@@ -46,6 +46,15 @@ def text(report_study):
     return (report_study / "report.html").read_text(encoding="utf-8")
 
 
+def test_what_is_in_doubt_stands_at_the_top(text):
+    place = text.index('id="doubts"')
+    assert place < text.index('id="modes"')
+    row = text[place : text.index("</table>", place)]
+    assert "units &lt;in&gt; metres" in row
+    assert "expected 3 mm, got 0.003" in row
+    assert "refused" in row
+
+
 class Page(HTMLParser):
     """The page without its scripts: tags, addresses and words."""
 

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.results import (
     Summary,
+    SweepOutcome,
     csv_text,
     json_text,
     remark_on,
     rows_of,
     table_text,
+    write_study,
     write_summary,
 )
 
@@ -65,35 +68,50 @@ def test_table_is_aligned_and_signed_says_the_reference_and_a_name_may_end_in_na
     assert lines[-1].split()[-3] == "-"
 
 
-UNIT = "tracker travels 0.1 of what the images do: its unit?"
+METRES = Doubt("tracker", "units", "expected 23 mm, got 0.023", True)
+SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False)
 
 
 @pytest.mark.parametrize(
-    ("reference", "mode", "travel_mm", "words"),
+    ("reference", "mode", "doubted", "words"),
     [
-        ("tracker", "pose", 20.0, "fitted to this tracker"),
-        ("truth", "pose", 20.0, ""),
-        # A tracker in centimetres, read as millimetres.
-        ("truth", "pose", 2.3, UNIT),
-        ("tracker", "pose", 2.3, f"fitted to this tracker; {UNIT}"),
-        ("tracker", "orientation", 23.0, ""),
+        ("tracker", "pose", {}, "fitted to this tracker"),
+        ("truth", "pose", {}, ""),
+        ("truth", "orientation", {"orientation": "spikes"}, "in doubt: spikes"),
+        ("tracker", "pose", {"pose": "clock"}, "fitted to this tracker; in doubt: clock"),
+        ("tracker", "orientation", {"pose": "clock"}, ""),
     ],
 )  # fmt: skip
-def test_a_row_says_what_its_numbers_do_not(reference, mode, travel_mm, words):
-    rows = [row(), row(mode, estimate_mm=travel_mm)]
-    summary = Summary("s", reference, 100, 1.0, rows)
+def test_a_row_says_what_its_numbers_do_not(reference, mode, doubted, words):
+    rows = [row(), row(mode)]
+    summary = Summary("s", reference, 100, 1.0, rows, doubted=doubted)
     assert remark_on(summary, rows[1]) == words
     assert (words in table_text(rows_of([summary])).splitlines()[3]) is True
     (line,) = [x for x in csv.DictReader(io.StringIO(csv_text(rows_of([summary])))) if x["mode"] == mode]
     assert line["remark"] == words
 
 
-def test_without_a_pose_mode_the_tracker_is_held_against_the_images():
-    rows = [row(reference_mm=230.0, estimate_mm=23.0)]
-    assert remark_on(Summary("s", "tracker", 9, 1.0, rows), rows[0]).startswith("tracker travels 10 of what")
-    # A probe at rest: jitter against jitter tells nothing of units.
-    still = [row(reference_mm=0.01, estimate_mm=0.3)]
-    assert remark_on(Summary("s", "tracker", 9, 1.0, still), still[0]) == ""
+def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(tmp_path):
+    left_out = {"pose": "s: drift mode pose: tracker: ..."}
+    summary = Summary("s", "truth", 100, 1.0, [row()], {}, [METRES, SPIKES], {"image": "x"}, left_out)
+    write_summary(tmp_path, summary)
+    lines = (tmp_path / "table.txt").read_text().splitlines()[-3:]
+    assert [line.split(":")[1].strip() for line in lines] == [
+        "tracker",
+        "orientation sensor",
+        "mode pose is left out",
+    ]
+    assert "units" in lines[0]
+    assert "refused" in lines[0]
+    assert "refused" not in lines[1]
+    (tmp_path / "drift.json").write_text("[]")
+    outcome = SweepOutcome("s", tmp_path, "done", folder=".")
+    study = write_study(tmp_path, [outcome], "")
+    assert list(study.summaries[0].doubts) == [METRES, SPIKES]
+    assert study.summaries[0].left_out == left_out
+    held = json.loads((tmp_path / "study.json").read_text())["doubts"]
+    assert [(each["sweep"], each["suspect"]) for each in held] == [("s", "units"), ("s", "spikes")]
+    assert all(line in study.table for line in lines)
 
 
 def test_three_files_appear_and_nothing_else(tmp_path):

@@ -1,0 +1,120 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from faults import FAULTS_BY_NAME, ORIENTATION, TRACKER
+
+from speckle3d.config import Config
+from speckle3d.core.errors import MismatchError
+from speckle3d.correction.trust import believed, cleaned_readings, examine_sensors
+from speckle3d.motion.direction import settle_direction
+from speckle3d.pipeline import correct
+
+LENGTH_SIGMA = 0.0085
+"""Claimed of the shipped sweep's length."""
+
+# What 96 frames of a straight sweep, whose probe turns by 2 degrees, do not tell.
+UNTOLD = {
+    "tracker z of the other sign",
+    "tracker mount turned by 20 deg about z",
+    "tracker clock off by -0.25 s",
+    *(f"orientation clock off by {late} s" for late in (0.25, -0.25, 0.5, 1.0)),
+    *(f"orientation mount turned by 20 deg about {axis}" for axis in "xyz"),
+}
+FAULTS = [fault for fault in (*TRACKER, *ORIENTATION) if fault.name not in UNTOLD and fault.honest != "stand"]
+
+
+def examined(sweep, tracked):
+    cleaned, doubts = cleaned_readings(sweep)
+    trust = examine_sensors(believed(cleaned, doubts), tracked.image, LENGTH_SIGMA)
+    return (*doubts, *trust.doubts), trust
+
+
+def test_good_sensors_are_not_doubted(sweep, tracked):
+    assert tracked.doubts == ()
+    assert tracked.direction_from == "tracker"
+    doubts, trust = examined(replace(sweep, tracker=None), tracked)
+    assert doubts == ()
+    assert trust.turn_confirmed
+
+
+@pytest.mark.slow  # 0.2 s each
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_a_fault_is_seen_and_the_right_sensor_named(fault, sweep, tracked):
+    doubts, _ = examined(fault.into(sweep), tracked)
+    assert doubts, "nothing was said"
+    assert {doubt.about for doubt in doubts} == {fault.about}
+    # A clock that is off by seconds, or another sweep's stream, may pass for the other.
+    if fault.honest == "refuse" and "another" not in fault.name:
+        assert any(doubt.refuted for doubt in doubts)
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("tracker in metres", "metres"),
+        ("tracker in inches", "inches"),
+        ("tracker frozen", "frozen"),
+        ("tracker mirrored", "handedness"),
+        ("tracker matrices inverted", "inverted"),
+        ("tracker mount turned by 20 deg about y", "mounting"),
+        ("tracker clock off by 0.5 s", "clock"),
+        ("orientation stored xyzw", "xyzw"),
+        ("orientation inverted", "inverted"),
+        ("orientation mirrored", "handedness"),
+        ("orientation constant", "frozen"),
+    ],
+)
+def test_the_suspect_is_named(name, word, sweep, tracked):
+    fault = FAULTS_BY_NAME[name]
+    alone = replace(sweep, tracker=None) if fault.about == "orientation sensor" else sweep
+    doubts, _ = examined(fault.into(alone), tracked)
+    assert word in doubts[0].suspect
+
+
+def test_a_refuted_sensor_gives_neither_a_sign_nor_a_mode(sweep, tracked):
+    bad = FAULTS_BY_NAME["tracker in metres"].into(sweep)
+    doubts, trust = examined(bad, tracked)
+    assert settle_direction(believed(bad, doubts), tracked.image, Config().sensors, trust.turn_confirmed) == (
+        tracked.direction,
+        "orientation sensor",
+    )
+    with pytest.raises(MismatchError, match=r"pose.*tracker.*metres"):
+        correct(replace(tracked, doubts=doubts), bad, ["pose"])
+
+
+@pytest.mark.parametrize("name", ["orientation stored xyzw", "orientation inverted", "orientation random"])
+def test_no_sign_is_taken_from_turns_that_the_images_do_not_show(name, sweep, tracked):
+    alone = replace(sweep, tracker=None, truth=None)
+    bad = FAULTS_BY_NAME[name].into(alone)
+    # Without what it measures beside its orientation, only the images are left to say so.
+    bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
+    for recorded in (bad, bare):
+        doubts, trust = examined(recorded, tracked)
+        sign = settle_direction(
+            believed(recorded, doubts), tracked.image, Config().sensors, trust.turn_confirmed
+        )
+        assert sign == (1, "assumed")
+
+
+def test_spikes_are_left_out_and_counted(sweep, tracked):
+    bad = FAULTS_BY_NAME["tracker spikes of 30 mm"].into(sweep)
+    cleaned, (doubt,) = cleaned_readings(bad)
+    spiked = np.linalg.norm(
+        bad.tracker.readings.world_from_sensor.translation
+        - sweep.tracker.readings.world_from_sensor.translation,
+        axis=1,
+    )
+    assert len(bad.tracker.readings) - len(cleaned.tracker.readings) >= (spiked > 10.0).sum()
+    assert str(len(bad.tracker.readings) - len(cleaned.tracker.readings)) in doubt.evidence
+    good = correct(tracked, sweep, ["pose"])["pose"].poses
+    mended = correct(tracked, bad, ["pose"])["pose"].poses
+    ends = [(p[0].inv() * p[-1]).apply(sweep.grid.centre_mm)[2] for p in (good, mended)]
+    # A tenth of the readings less: their jitter of 0.15 mm over some 20 that tell an end.
+    assert ends[1] == pytest.approx(ends[0], abs=0.05)
+
+
+def test_what_is_refuted_can_be_used_all_the_same(sweep, tracked):
+    bad = FAULTS_BY_NAME["tracker in metres"].into(sweep)
+    config = Config(sensors={"examine": False})
+    assert len(correct(tracked, bad, ["pose"], config)["pose"].poses) == len(sweep)
