@@ -25,6 +25,8 @@ SUFFIXES = (".nrrd", ".mha", ".nii.gz")
 _PIECE_BYTES = 2**20
 _GZIP_SIGNATURE = b"\x1f\x8b"
 _STDERR = 2
+_HEADER_BYTES = 4096
+"""More than the header of an NRRD file that ITK writes."""
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -102,10 +104,17 @@ def _silence() -> Iterator[None]:
 
 
 def _holds(path: Path, volume: Volume) -> bool:
-    """Whether a file that was just written has all voxels."""
+    """Whether a file that was just written has all voxels, and the check sum behind them."""
     try:
         held = read_volume(path).voxels
-    except (FileError, InvalidInputError):
+        with open(path, "rb") as stream:
+            header = stream.read(_HEADER_BYTES).partition(b"\n\n")[0]
+            if path.name.lower().endswith(".gz") or b"\nencoding: gz" in header:
+                stream.seek(0 if header.startswith(_GZIP_SIGNATURE) else len(header) + 2)
+                with gzip.open(stream) as unpacked:
+                    while unpacked.read(_PIECE_BYTES):
+                        pass
+    except (FileError, InvalidInputError, EOFError, zlib.error, gzip.BadGzipFile):
         return False
     return np.array_equal(held, volume.voxels.astype(held.dtype), equal_nan=True)
 
@@ -136,24 +145,19 @@ def _from_image(image: Any, voxels: npt.NDArray[Any]) -> Volume:
 def _require_whole(path: PathLike) -> None:
     """Refuse damaged files, which ITK fills with zeros or reports without naming them."""
     with reading(path), open(path, "rb") as stream:
-        start = stream.read(4096)
+        start = stream.read(512)
     if is_metaimage(start):
         read_header(path)
     elif start.startswith(_GZIP_SIGNATURE):
         _unpack(path)
     elif not is_nrrd(start):
         raise InvalidInputError(f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz), got something else")
-    elif _GZIP_SIGNATURE in start and b"\n\n" in start:
-        header, _, data = start.partition(b"\n\n")
-        if data.startswith(_GZIP_SIGNATURE):
-            _unpack(path, len(header) + 2)
 
 
-def _unpack(path: PathLike, offset: int = 0) -> None:
-    """Read what is packed from an offset on to its end, where gzip keeps its check sum."""
+def _unpack(path: PathLike) -> None:
+    """Read a gzip file to its end, where it keeps its check sum."""
     try:
-        with reading(path), open(path, "rb") as packed, gzip.open(packed) as unpacked:
-            packed.seek(offset)
+        with reading(path), gzip.open(path) as unpacked:
             while unpacked.read(_PIECE_BYTES):
                 pass
     except (EOFError, zlib.error) as error:
