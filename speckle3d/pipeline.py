@@ -36,12 +36,14 @@ from speckle3d.matching.blocks import (
 from speckle3d.matching.chosen import match_again, match_in_order
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples
+from speckle3d.motion.plausibility import far_apart, folded, interleaved, severed, standing, undetermined
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -140,7 +142,8 @@ def track(
     MismatchError
         If the curves belong to another probe, frequency, sampling or patch size.
     InsufficientDataError
-        If too many frames have no speckle in common with others.
+        If too many frames have no speckle in common with others, if the images do not determine the length,
+        or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
 
     Examples
     --------
@@ -161,10 +164,14 @@ def track(
         sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
     )
     flags = _flagged(sweep, found, settings)
+    _believed(sweep, interleaved(found.table, len(sweep), settings.trajectory.least_correlation))
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
     flags = _with_unjoined(flags, reader, pairs)
+    _require_placed(sweep, flags)
+    with times.of("standing echoes"):
+        doubts = _believed(sweep, _standing(sweep, matcher, curves, path, flags))
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -189,10 +196,14 @@ def track(
             slopes,
             0.0 if coherence is None else float(coherence.share.mean()),
         )
+    doubts += _believed(sweep, _undetermined(trajectory.poses, covariance, matcher, curves))
+    ends = [pair.first for pair in pairs], [pair.second for pair in pairs]
+    doubts += _believed(sweep, severed(*ends, flags == 0))
+    doubts += _believed(sweep, folded(found.table, trajectory.poses, matcher.patches.centre_mm, flags == 0))
 
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
-        trusted, doubts, confirmed = _examined(sweep, trajectory.poses, covariance, settings)
+        trusted, sensed, confirmed = _examined(sweep, trajectory.poses, covariance, settings)
         direction, source = settle_direction(trusted, trajectory.poses, settings.sensors, confirmed)
 
     # -> orientation-consistent subset -> its own trajectory
@@ -214,7 +225,7 @@ def track(
         coherence=coherence,
         slopes=slopes,
         times=times,
-        doubts=doubts,
+        doubts=(*doubts, *sensed),
     )
 
 
@@ -250,13 +261,18 @@ def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
     """Flags of all frames, if few enough have one."""
     flags = flag_frames(found.features, config.quality)
     flags[found.table.unmatched(len(sweep), config.trajectory.least_correlation)] |= FrameFlag.UNMATCHED
+    _require_placed(sweep, flags)
+    return flags
+
+
+def _require_placed(sweep: Sweep, flags: IntArray) -> None:
+    """Raise if too many frames have a flag."""
     lost = int((flags != 0).sum())
     if lost > MOST_LOST * len(sweep):
         raise InsufficientDataError(
             f"{sweep.name}: expected frames with speckle in common, got {lost} of {len(sweep)} that cannot "
             f"be placed: {'; '.join(describe(flags))}"
         )
-    return flags
 
 
 def _measured(
@@ -281,6 +297,31 @@ def _measured(
             pairs = reader.measure(table, path, sound, coherence)
             path = reader.path(table, pairs, coherence)
     return pairs, coherence, path
+
+
+def _believed(sweep: Sweep, doubt: Doubt | None) -> tuple[Doubt, ...]:
+    """Refuse what is refuted; anything else is used and flagged."""
+    if doubt is not None and doubt.refuted:
+        raise InsufficientDataError(f"{sweep.name}: {doubt}")
+    return () if doubt is None else (doubt,)
+
+
+def _standing(
+    sweep: Sweep, matcher: FrameMatcher, curves: DecorrelationCurves, path: FloatArray, flags: IntArray
+) -> Doubt | None:
+    frames = far_apart(path[:, 0], flags == 0, curves)
+    if len(frames) < 2:
+        return None
+    share = standing_share(sweep, matcher, frames.tolist())
+    return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+
+
+def _undetermined(
+    poses: RigidTransform, covariance: FloatArray, matcher: FrameMatcher, curves: DecorrelationCurves
+) -> Doubt | None:
+    return undetermined(
+        poses.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])
+    )
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:

@@ -29,7 +29,7 @@ from speckle3d.cli import (  # noqa: F401
     reconstruction,
     trajectory,
 )
-from speckle3d.cli.common import app
+from speckle3d.cli.common import app, note
 from speckle3d.core.errors import NoSpaceError, Speckle3DError
 
 __all__ = ["app", "main"]
@@ -112,5 +112,5 @@ def _stoppable() -> Iterator[list[int]]:
 
 
 def _fail(message: str, code: int = 2) -> None:
-    sys.stderr.write(f"speckle3d: {' '.join(message.split())}\n")
+    note(f"speckle3d: {' '.join(message.split())}")
     sys.exit(code)

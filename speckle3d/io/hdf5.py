@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,18 +17,29 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
+from speckle3d.core.files import PathLike as PathLike
+from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
+from speckle3d.io.hdf5_guard import follow, require_held, require_readable, require_sound_heaps, require_texts
 
-PathLike = str | os.PathLike[str]
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
 
-_READ_FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
-"""What h5py raises, by place, when the bytes of a file do not make sense."""
+_READ_FAILURES = (
+    OSError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    TypeError,
+    MemoryError,
+    OverflowError,
+    zlib.error,
+)
+"""What h5py and zlib raise, by place, when the bytes of a file do not make sense."""
 
 _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Stored kinds that may become the kind asked for."""
@@ -150,6 +162,7 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
+        require_sound_heaps(path)
         return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
 
 
@@ -221,26 +234,34 @@ def read_checked(
     if not _fits(node.shape, shape):
         expected = ", ".join(str(n) for n in shape) + ("," if len(shape) == 1 else "")
         raise InvalidInputError(f"{where}: expected shape ({expected}), got {node.shape}")
-    with reading(where):
+    with reading(where), naming(where):
+        require_readable(node)
         return np.asarray(node[()], dtype=wanted)
 
 
 def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return a data set of `group`, or raise `InvalidInputError` naming what is there instead."""
-    node = _member(group, name)
+    """Return a data set of `group` that the file holds whole, or raise `InvalidInputError`."""
+    node, where = find_member(group, name), locate(group, name)
     if not isinstance(node, h5py.Dataset):
-        raise InvalidInputError(f"{locate(group, name)}: expected a data set, got {_kind_of(node)}")
+        raise InvalidInputError(f"{where}: expected a data set, got {_kind_of(node)}")
+    with reading(where), naming(where):
+        require_held(node)
     return node
+
+
+def has_member(group: h5py.Group, name: str) -> bool:
+    """Whether a group holds a name; a link to nothing, or out of the file, is an error and not absence."""
+    return find_member(group, name) is not None
 
 
 def find_group(group: h5py.Group, name: str) -> h5py.Group | None:
     """Return a group inside `group`, None if there is none of that name."""
-    return None if _member(group, name) is None else require_group(group, name)
+    return None if find_member(group, name) is None else require_group(group, name)
 
 
 def require_group(group: h5py.Group, name: str) -> h5py.Group:
     """Return a group inside `group`, or raise `InvalidInputError` naming what is there instead."""
-    node = _member(group, name)
+    node = find_member(group, name)
     if not isinstance(node, h5py.Group):
         raise InvalidInputError(f"{locate(group, name)}: expected a group, got {_kind_of(node)}")
     return node
@@ -257,13 +278,17 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
     if h5py.check_string_dtype(node.dtype) is None or node.shape != shape:
         where = locate(group, name)
         raise InvalidInputError(f"{where}: expected texts of shape {shape}, got {node.shape} {node.dtype}")
-    return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
+    with reading(locate(group, name)), naming(locate(group, name)):
+        require_readable(node)
+        require_texts(node)
+        return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 
 def write_attributes(node: Node, values: object, names: Iterable[str]) -> None:
-    """Write attributes of an object under their own names."""
+    """Write attributes of an object by name; of a path that is no Unicode, what can be written."""
     for name in names:
-        node.attrs[name] = getattr(values, name)
+        value = getattr(values, name)
+        node.attrs[name] = value.encode("utf-8", "backslashreplace").decode() if type(value) is str else value
 
 
 def read_attributes(node: Node, kinds: Mapping[str, type]) -> dict[str, Any]:
@@ -306,7 +331,7 @@ def read_text(node: Node, name: str) -> str:
 
 def sha256_of(path: PathLike) -> str:
     """SHA-256 of a file's bytes, read in pieces, as 64 hexadecimal digits."""
-    with reading(path), open(path, "rb") as stream:
+    with reading(path), open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -316,9 +341,11 @@ def one_line(error: BaseException) -> str:
     return (text.strip() or type(error).__name__).splitlines()[0]
 
 
-def _member(group: h5py.Group, name: str) -> Any:
-    with reading(locate(group, name)):
-        return group.get(name)
+def find_member(group: h5py.Group, name: str) -> Any:
+    """Return what `group` holds under a name, None if there is none; never of another file."""
+    where = locate(group, name)
+    with reading(where), naming(where):
+        return follow(group, name)
 
 
 def _fits(shape: tuple[int, ...] | None, expected: tuple[int | str, ...]) -> bool:

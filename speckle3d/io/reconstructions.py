@@ -24,6 +24,7 @@ from speckle3d.io.hdf5 import (
     HDF5Writer,
     PathLike,
     find_group,
+    has_member,
     locate,
     opened,
     read_attributes,
@@ -204,11 +205,11 @@ def _read_provenance(file: h5py.File) -> Provenance:
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
     group = require_group(file, "poses")
-    return {mode: read_transforms(group, mode, frames) for mode in MODES if mode in group}
+    return {mode: read_transforms(group, mode, frames) for mode in MODES if has_member(group, mode)}
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
-    if "pose_covariance" not in file or "frame_flags" not in file:
+    if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
         return None
     covariance = read_checked(file, "pose_covariance/image", (frames, 6, 6))
     require_finite(covariance, locate(file, "pose_covariance/image"))

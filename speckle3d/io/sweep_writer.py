@@ -24,7 +24,8 @@ from speckle3d.core.sweep import (
     Sweep,
     Tracker,
 )
-from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
+from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
+from speckle3d.io.hdf5_guard import require_own
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None
@@ -120,10 +121,10 @@ class SweepWriter(HDF5Writer):
 
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
-        with open_hdf5(source) as other:
+        with reading(source), naming(str(source)), open_hdf5(source) as other:
             for name in other:
                 if name not in KNOWN and name not in self._file:
-                    other.copy(other[name], self._file, name)
+                    other.copy(require_own(other, name), self._file, name)
             for name, value in other.attrs.items():
                 if name not in self._file.attrs:
                     self._file.attrs[name] = value
@@ -209,7 +210,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
         If it is no sweep file.
     """
     with opened(path, FORMAT, VERSION) as file:
-        held = "orientation" in file
+        held = has_member(file, "orientation")
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
         with DiskFile(part, keep=True) as disk, h5py.File(disk, "r+") as file:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
@@ -159,7 +160,7 @@ def write_results(
         elif SUBSET in drift:
             left_out[SUBSET] = _refusal_of_subset(sweep, tracked)
         poses |= {mode: c.poses for mode, c in corrections.items()}
-        provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
+        provenance = Provenance(written_path(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     if reference is None and compared is not None and compared.name == "tracker":
         compared = compared if believed(sweep, tracked.doubts).tracker is not None else None

@@ -19,6 +19,7 @@ from pydantic_core import to_json
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.printable import printable
 from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
@@ -262,15 +263,19 @@ def csv_text(rows: Sequence[Mapping[str, Any]], *more: str) -> str:
 def json_text(value: Any) -> str:
     """Dataclasses, arrays and numbers as strict JSON: a value that is not finite becomes null.
 
+    Characters that could drive a terminal are escaped.
+
     Raises
     ------
     InvalidInputError
         If there is anything else in it.
     """
     try:
-        return to_json(value, indent=2, inf_nan_mode="null", fallback=_listed).decode() + "\n"
+        text = to_json(value, indent=2, inf_nan_mode="null", fallback=_listed).decode()
     except ValueError as error:
         raise InvalidInputError(f"summary: expected what JSON can hold: {error}") from error
+    plain = (c if c == "\n" or printable(c) == c else json.dumps(c)[1:-1] for c in text)
+    return f"{text if text.isascii() else ''.join(plain)}\n"
 
 
 def copies_among(outcomes: Sequence[SweepOutcome]) -> dict[str, str]:
