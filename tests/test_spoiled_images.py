@@ -90,7 +90,7 @@ def test_what_can_be_measured_is_and_holds(narrow, curves, case):
 
 @pytest.mark.slow
 def test_a_little_clutter_is_told(narrow, curves, pattern):
-    found = track(spoil.cluttered(narrow, pattern, -17.0), curves)
+    found = track(spoil.cluttered(narrow, pattern, -14.0), curves)
     assert ["static clutter" in doubt.suspect for doubt in found.doubts] == [True]
 
 
