@@ -10,6 +10,7 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.files import open_regular
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
@@ -21,6 +22,9 @@ from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.planes import PlaneSettings
+
+_MOST_BYTES = 2**20
+"""A hundred times what every setting takes."""
 
 
 class Config(BaseModel):
@@ -71,7 +75,10 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
     """
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise InvalidInputError(f"{where}: expected TOML, got brackets within brackets without end") from None
+    # Of TOML, and of numbers with thousands of digits.
+    except ValueError as error:
         raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
     return _validated(values, where)
 
@@ -101,9 +108,11 @@ def load_config(path: Path) -> Config:
         Naming the setting that is unknown or out of range.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{path}: {error.strerror}") from error
+        with open_regular(path) as stream:
+            content = stream.read(_MOST_BYTES + 1)
+        text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
+    if len(content) > _MOST_BYTES:
+        raise FileError(f"{path}: expected at most {_MOST_BYTES} bytes of TOML, got more")
     return config_from_toml(text, str(path))

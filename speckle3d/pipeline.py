@@ -36,6 +36,7 @@ from speckle3d.matching.blocks import (
 from speckle3d.matching.chosen import match_again, match_in_order
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import doubt_band, speckle_size
 from speckle3d.motion.coherence import Coherence, scale_sigma
@@ -44,6 +45,7 @@ from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
+from speckle3d.motion.plausibility import far_apart, folded, interleaved, severed, standing, undetermined
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -143,7 +145,8 @@ def track(
         If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
         or by what the images do; see `speckle3d.motion.curve_doubts`.
     InsufficientDataError
-        If too many frames have no speckle in common with others.
+        If too many frames have no speckle in common with others, if the images do not determine the length,
+        or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
 
     Examples
     --------
@@ -165,16 +168,21 @@ def track(
         sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
     )
     flags = _flagged(sweep, found, settings)
+    _believed(sweep, interleaved(found.table, len(sweep), settings.trajectory.least_correlation))
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
-    doubts += require(doubt_speed(path, sweep.frame_time_s), sweep.name)
-    with times.of("checks of the curves"):
-        size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
-        factors = reader.depth_factors(found.table, path, _sound(found.table, flags), settings.coherence)
-    ratios = reader.sum_ratios(pairs)
-    doubts += require(doubt_curves(size, factors, ratios, curves, matcher.patches, coherence), sweep.name)
+    sound, ratios = _sound(found.table, flags), reader.sum_ratios(pairs)
     flags = _with_unjoined(flags, reader, pairs)
+    _require_placed(sweep, flags)
+    with times.of("standing echoes"):
+        doubts += _believed(sweep, _standing(sweep, matcher, curves, path, flags))
+    with times.of("checks of the curves"):
+        require(doubt_speed(path, sweep.frame_time_s), sweep.name)
+        size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
+        factors = reader.depth_factors(found.table, path, sound, settings.coherence)
+        misfits = doubt_curves(size, factors, ratios, curves, matcher.patches, coherence)
+        doubts += require(misfits, sweep.name)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -199,6 +207,10 @@ def track(
             slopes,
             0.0 if coherence is None else float(coherence.share.mean()),
         )
+    doubts += _believed(sweep, _undetermined(trajectory.poses, covariance, matcher, curves))
+    ends = [pair.first for pair in pairs], [pair.second for pair in pairs]
+    doubts += _believed(sweep, severed(*ends, flags == 0))
+    doubts += _believed(sweep, folded(found.table, trajectory.poses, matcher.patches.centre_mm, flags == 0))
 
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
@@ -263,13 +275,18 @@ def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
     """Flags of all frames, if few enough have one."""
     flags = flag_frames(found.features, config.quality)
     flags[found.table.unmatched(len(sweep), config.trajectory.least_correlation)] |= FrameFlag.UNMATCHED
+    _require_placed(sweep, flags)
+    return flags
+
+
+def _require_placed(sweep: Sweep, flags: IntArray) -> None:
+    """Raise if too many frames have a flag."""
     lost = int((flags != 0).sum())
     if lost > MOST_LOST * len(sweep):
         raise InsufficientDataError(
             f"{sweep.name}: expected frames with speckle in common, got {lost} of {len(sweep)} that cannot "
             f"be placed: {'; '.join(describe(flags))}"
         )
-    return flags
 
 
 def _measured(
@@ -300,6 +317,31 @@ def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     sound: BoolArray = ~bad[table.first] & ~bad[table.second]
     return sound
+
+
+def _believed(sweep: Sweep, doubt: Doubt | None) -> tuple[Doubt, ...]:
+    """Refuse what is refuted; anything else is used and flagged."""
+    if doubt is not None and doubt.refuted:
+        raise InsufficientDataError(f"{sweep.name}: {doubt}")
+    return () if doubt is None else (doubt,)
+
+
+def _standing(
+    sweep: Sweep, matcher: FrameMatcher, curves: DecorrelationCurves, path: FloatArray, flags: IntArray
+) -> Doubt | None:
+    frames = far_apart(path[:, 0], flags == 0, curves)
+    if len(frames) < 2:
+        return None
+    share = standing_share(sweep, matcher, frames.tolist())
+    return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+
+
+def _undetermined(
+    poses: RigidTransform, covariance: FloatArray, matcher: FrameMatcher, curves: DecorrelationCurves
+) -> Doubt | None:
+    return undetermined(
+        poses.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])
+    )
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:

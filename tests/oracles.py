@@ -343,3 +343,23 @@ def elevational_width_mm(beam, level_db=-6.0):
     inner, outer = (power[np.arange(len(power)), last + k] for k in (0, 1))
     part = (inner - level) / (inner - outer)
     return 2.0 * (beam.elevation_mm[last] + part * beam.elevation_mm[1])
+
+
+def lzf_length(packed):
+    """Twin of `speckle3d.kernels.packing.lzf_length`: unpacks, by the format's description."""
+    ahead, unpacked = list(packed), []
+    try:
+        while ahead:
+            control = ahead.pop(0)
+            if control < 32:
+                unpacked += [ahead.pop(0) for _ in range(control + 1)]
+                continue
+            length = control // 32
+            if length == 7:
+                length += ahead.pop(0)
+            start = len(unpacked) - 1 - (control % 32 * 256 + ahead.pop(0))
+            for i in range(length + 2):
+                unpacked.append(unpacked[start + i])
+    except IndexError:
+        return -1
+    return len(unpacked)

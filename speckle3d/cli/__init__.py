@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 # Small factorisations lose far more to a team of threads than they gain; set before NumPy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,23 +29,40 @@ from speckle3d.cli import (  # noqa: F401
     reconstruction,
     trajectory,
 )
-from speckle3d.cli.common import app
-from speckle3d.core.errors import Speckle3DError
+from speckle3d.cli.common import app, note
+from speckle3d.core.errors import NoSpaceError, Speckle3DError
 
 __all__ = ["app", "main"]
 
-_STOPPED = 130
+_STOPS = ("SIGINT", "SIGTERM", "SIGHUP")
+"""Ctrl-C, what `kill` and batch systems send, and what a terminal sends when it is closed."""
+
+_CLEANING_S = 3.0
+"""Time after the first of these signals in which others are not heard: temporary files are removed in it.
+
+A closed terminal sends two at once."""
+
+_STOPPED = 128 + signal.SIGINT
 """Exit code after Ctrl-C, as shells have it."""
 
 
 def main() -> None:
-    """Run the command line: a wrong input is one line on stderr and exit code 2."""
+    """Run the command line.
+
+    A wrong input is one line on stderr and exit code 2, a full disk one and exit code 1. Signals that ask for
+    the end stop the command as Ctrl-C does, with exit code 128 and their number.
+    """
+    with _stoppable() as heard:
+        _run(heard)
+
+
+def _run(heard: list[int]) -> None:
     try:
         code = app(standalone_mode=False)
     except Speckle3DError as error:
-        _fail(str(error))
+        _fail(str(error), 1 if isinstance(error, NoSpaceError) else 2)
     except (KeyboardInterrupt, typer.Abort):
-        _fail("stopped", _STOPPED)
+        _fail("stopped", 128 + heard[0] if heard else _STOPPED)
     except typer.Exit as leave:
         sys.exit(leave.exit_code)
     except Exception as error:
@@ -50,12 +73,44 @@ def main() -> None:
         if not error.format_message().strip():
             sys.exit(2)
         _fail(error.format_message())
-    # Typer turns Ctrl-C into this exit code without a word.
-    if code == _STOPPED:
-        _fail("stopped", _STOPPED)
+    # Typer turns Ctrl-C into this exit code without a word; a recording ends with it and is whole.
+    if code == _STOPPED or (heard and heard[0] != signal.SIGINT):
+        _fail("stopped", 128 + heard[0] if heard else _STOPPED)
     sys.exit(code if isinstance(code, int) else 0)
 
 
+@contextmanager
+def _stoppable() -> Iterator[list[int]]:
+    """Turn signals that ask for the end into `KeyboardInterrupt`; yields a list with the first one's number.
+
+    A signal that the process was started to ignore, as SIGHUP by nohup, stays ignored.
+    """
+    heard: list[int] = []
+    first_s = 0.0
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        nonlocal first_s
+        if not heard:
+            first_s = time.monotonic()
+            heard.append(number)
+        elif time.monotonic() - first_s < _CLEANING_S:
+            return
+        raise KeyboardInterrupt
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
+        numbers = [getattr(signal, name) for name in _STOPS if hasattr(signal, name)]
+        before = {each: signal.getsignal(each) for each in numbers}
+        before = {each: was for each, was in before.items() if was not in (signal.SIG_IGN, None)}
+        for each in before:
+            signal.signal(each, stop)
+    try:
+        yield heard
+    finally:
+        for each, was in before.items():
+            signal.signal(each, was)
+
+
 def _fail(message: str, code: int = 2) -> None:
-    sys.stderr.write(f"speckle3d: {' '.join(message.split())}\n")
+    note(f"speckle3d: {' '.join(message.split())}")
     sys.exit(code)

@@ -213,8 +213,10 @@ def _calibrate(
     if validation is not None:
         other, other_seen, _ = scan(validation, None)
         notes += _validated(outcome, other, other_seen, validation)
-    if not seen.are_lines:
-        write_points(out.with_suffix(".csv"), PickedPoints(seen.frame, seen.pixels, seen.wire), wire_names)
+
+    def write_dots(path: Path) -> None:
+        write_points(path, PickedPoints(seen.frame, seen.pixels, seen.wire), wire_names)
+
     write_with_report(
         outcome.calibration,
         [images],
@@ -223,6 +225,7 @@ def _calibrate(
         notes,
         outcome.beam,
         as_json,
+        None if seen.are_lines else write_dots,
     )
 
 

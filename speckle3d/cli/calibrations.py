@@ -59,8 +59,9 @@ def write_with_report(
     notes: Sequence[str],
     beam: Sequence[BeamBias] = (),
     as_json: bool = False,
+    dots: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write a calibration, its table and its pictures, and print the table.
+    """Write a calibration, its table and its pictures, together, and print the table.
 
     Parameters
     ----------
@@ -70,23 +71,30 @@ def write_with_report(
         Draws the pictures of the calibration as it was written.
     notes : sequence of str
         What else the table says.
+    dots : callable, optional
+        Writes the dots that the calibration was made from into a CSV.
     """
     from importlib.metadata import version
 
     from calibration.report import json_report, text_report
     from speckle3d.core.calibration import Source
     from speckle3d.io.calibrations import write_calibration
+    from speckle3d.io.fileset import FileSet
     from speckle3d.io.hdf5 import atomic_path, sha256_of
     from speckle3d.study.figures import save_figure
 
     names, hashes = (" ".join(map(of, inputs)) for of in (str, sha256_of))
     named = replace(calibration, source=Source(names, hashes, version("speckle3d")))
     table = text_report(named, beam, notes)
-    write_calibration(out, named)
-    text, pictures = out.with_suffix(".txt"), out.with_suffix(".png")
-    with atomic_path(text) as part:
-        part.write_text(table, encoding="utf-8")
-    save_figure(figure(named), pictures)
+    text, pictures, points = (out.with_suffix(suffix) for suffix in _BESIDE)
+    written = FileSet(out.name, (text.name, pictures.name, *([points.name] if dots else [])))
+    with written.replaced(out.parent) as part:
+        write_calibration(part / out.name, named)
+        with atomic_path(part / text.name) as path:
+            path.write_text(table, encoding="utf-8")
+        save_figure(figure(named), part / pictures.name)
+        if dots:
+            dots(part / points.name)
     if as_json:
         emit_json(json_report(named, beam) | {"notes": list(notes)})
     else:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.printable import printable
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -75,23 +76,32 @@ def bar_on_stderr(what: str, *columns: Any) -> Iterator[Any]:
     console = Console(stderr=True)
     # In a log a bar is noise, and an error must stay one line.
     hidden = not console.is_terminal
-    shown = (TextColumn(what), BarColumn(), *columns)
+    # The name of a file is neither markup nor a template.
+    name = printable(what).replace("{", "{{").replace("}", "}}")
+    shown = (TextColumn(name, markup=False), BarColumn(), *columns)
     with Progress(*shown, console=console, transient=True, disable=hidden) as bar:
         yield bar
 
 
 def note(text: str) -> None:
-    """Print a remark on stderr, apart from the results."""
-    sys.stderr.write(text + "\n")
+    """Print a remark of one line on stderr, apart from the results; what it quotes is shown escaped."""
+    sys.stderr.write(f"{_encodable(printable(text), sys.stderr.encoding)}\n")
 
 
 def emit(text: str) -> None:
-    """Print results on stdout."""
+    """Print results on stdout; but for line breaks, characters that drive a terminal are shown escaped."""
+    shown = _encodable(printable(text, kept="\n"), sys.stdout.encoding)
     try:
-        sys.stdout.write(text if text.endswith("\n") else text + "\n")
+        sys.stdout.write(shown if shown.endswith("\n") else shown + "\n")
         sys.stdout.flush()
     except OSError as error:
         raise FileError(f"standard output: cannot be written: {error.strerror}") from error
+
+
+def _encodable(text: str, encoding: str | None) -> str:
+    """Escape what a terminal of another encoding than Unicode cannot show."""
+    name = encoding or "utf-8"
+    return text.encode(name, "backslashreplace").decode(name)
 
 
 def emit_json(values: Any) -> None:

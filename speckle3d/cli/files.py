@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from speckle3d.cli.calibrations import fitted_pixels, mount, resize
 from speckle3d.cli.common import CalibrationFiles, Json, app, emit, emit_rows, from_options, progress_bar
 from speckle3d.cli.outputs import require_own_place
+
+if TYPE_CHECKING:
+    from speckle3d.simulation.settings import SimulatedSweep
 
 
 @app.command()
@@ -70,7 +73,7 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.fileset import FileSet
     from speckle3d.simulation.presets import SimulationSettings
     from speckle3d.simulation.presets import simulate as prepare
 
@@ -79,9 +82,20 @@ def simulate(
     paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(prepared)]
     for path in paths:
         require_own_place(path, "simulation")
-    for path, simulated in zip(paths, prepared, strict=True):
-        with progress_bar(f"simulating {path.name}") as progress:
-            write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
+    if len(paths) == 1:
+        _write(out, prepared[0])
+        return
+    # A pair is replaced together: two sweeps of different simulations do not cross.
+    with FileSet(out.name, (paths[1].name,)).replaced(out.parent) as part:
+        for path, simulated in zip(paths, prepared, strict=True):
+            _write(part / path.name, simulated)
+
+
+def _write(path: Path, simulated: SimulatedSweep) -> None:
+    from speckle3d.io.sweep_writer import write_sweep
+
+    with progress_bar(f"simulating {path.name}") as progress:
+        write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
 
 
 @app.command()

@@ -5,9 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from speckle3d.core.printable import printable
+
+_LONGEST = 1200
+"""Letters of a message; a path alone may have hundreds."""
+
 
 class Speckle3DError(Exception):
-    """Root of every error the package raises on purpose."""
+    """Root of every error the package raises on purpose.
+
+    Its words may quote a file: they are shown escaped, in one line, and cut if longer than a screen.
+    """
+
+    def __init__(self, *words: object) -> None:
+        super().__init__(*(_quotable(each) if isinstance(each, str) else each for each in words))
 
 
 class InvalidInputError(Speckle3DError, ValueError):
@@ -26,12 +37,23 @@ class FileError(Speckle3DError, OSError):
     """A file cannot be opened, read or written."""
 
 
+class NoSpaceError(FileError):
+    """There is no room left to write a file: the disk is full, or a limit on files is reached."""
+
+
+def _quotable(words: str) -> str:
+    shown = printable(words)
+    if len(shown) <= _LONGEST:
+        return shown
+    return f"{shown[: _LONGEST // 2]} ... {shown[-_LONGEST // 4 :]}"
+
+
 @contextmanager
 def naming(where: str) -> Iterator[None]:
     """Put `where` before the message of an error about data raised in the block, unless it is there."""
     try:
         yield
     except (InvalidInputError, InsufficientDataError) as error:
-        if str(error).startswith(where):
+        if str(error).startswith(printable(where)):
             raise
         raise type(error)(f"{where}: {error}") from error

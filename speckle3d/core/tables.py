@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 from collections.abc import Collection, Sequence
 
+from speckle3d.core.printable import printable
+
 
 def text_table(lines: Sequence[Sequence[str]], left: Collection[int] = (0,), heading: bool = True) -> str:
     """Align columns of text.
@@ -12,7 +14,7 @@ def text_table(lines: Sequence[Sequence[str]], left: Collection[int] = (0,), hea
     Parameters
     ----------
     lines : sequence of sequence of str
-        Cells; the first line is the heading, if there is one.
+        Cells, shown escaped (`printable`); the first line is the heading, if there is one.
     left : collection of int
         Columns aligned to the left; the others to the right.
     heading : bool
@@ -30,11 +32,11 @@ def text_table(lines: Sequence[Sequence[str]], left: Collection[int] = (0,), hea
 
     if not lines:
         return ""
-    widths = [max(cell_len(cell) for cell in column) for column in zip(*lines, strict=True)]
+    body = [[printable(cell) for cell in line] for line in lines]
+    widths = [max(cell_len(cell) for cell in column) for column in zip(*body, strict=True)]
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     for k, width in enumerate(widths):
         table.add_column(justify="left" if k in left else "right", width=width, no_wrap=True)
-    body = [list(line) for line in lines]
     if heading:
         body.insert(1, ["-" * width for width in widths])
     for line in body:

@@ -25,6 +25,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
+    has_member,
     locate,
     opened,
     read_attribute,
@@ -105,7 +106,7 @@ def read_calibration(path: PathLike) -> Calibration:
             **read_attributes(file, _ATTRIBUTES),
             rotation=rotation,
             translation_mm=translation,
-            pixel_mm=read_checked(file, "pixel_mm", (2,)) if "pixel_mm" in file else None,
+            pixel_mm=read_checked(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
             covariance=_read_covariance(file, 3 if translation is None else 6),
             parameters=_read_parameters(require_group(file, "parameters")),
             condition_number=_read_condition(file),
@@ -161,7 +162,7 @@ def _read_frames(group: h5py.Group) -> FramesUsed:
 
 
 def _read_pose(file: h5py.File) -> tuple[Rotation, FloatArray | None]:
-    if "sensor_from_image" in file:
+    if has_member(file, "sensor_from_image"):
         matrix = read_checked(file, "sensor_from_image", (4, 4))
         pose: RigidTransform = transforms_from_matrices(matrix[None], "/sensor_from_image")[0]
         return pose.rotation, np.asarray(pose.translation)

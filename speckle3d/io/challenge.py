@@ -30,10 +30,13 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
 from speckle3d.io.hdf5 import (
     PathLike,
+    find_member,
+    has_member,
     locate,
     open_hdf5,
     read_checked,
@@ -88,7 +91,7 @@ class ScanFrames(HDF5Frames):
 
 def is_challenge_scan(file: h5py.File) -> bool:
     """Whether an open file is a scan: it has frames, and no format of this package's family."""
-    return "format" not in file.attrs and isinstance(file.get("frames"), h5py.Dataset)
+    return "format" not in file.attrs and isinstance(find_member(file, "frames"), h5py.Dataset)
 
 
 def read_challenge_scan(path: PathLike) -> Sweep:
@@ -111,7 +114,9 @@ def read_challenge_scan(path: PathLike) -> Sweep:
     poses = _tool_poses(scan, n)
     tracker = None if poses is None else Tracker(TimedPoses(times, poses), tool_from_image)
     grid = ImageGrid(width, height, scale_mm[0], scale_mm[1])
-    return Sweep(frames, grid, BModeSettings(DYNAMIC_RANGE_DB), times, tracker=tracker, name=scan.stem)
+    return Sweep(
+        frames, grid, BModeSettings(DYNAMIC_RANGE_DB), times, tracker=tracker, name=printable(scan.stem)
+    )
 
 
 def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransform]:
@@ -144,7 +149,7 @@ def read_landmarks(path: PathLike) -> Landmarks | None:
         return None
     size, _ = read_challenge_calibration(_require_calibration(scan))
     with reading(found), open_hdf5(found) as file:
-        if scan.stem not in file:
+        if not has_member(file, scan.stem):
             return None
         rows = read_checked(file, scan.stem, ("landmark", 3))
         where = locate(file, scan.stem)
@@ -174,7 +179,7 @@ def _frames(scan: Path) -> ScanFrames:
 def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:
     source = _transforms_file(scan) or scan
     with reading(source), open_hdf5(source) as file:
-        if source == scan and "tforms" not in file:
+        if source == scan and not has_member(file, "tforms"):
             return None
         return read_transforms(file, "tforms", frames)
 

@@ -18,6 +18,7 @@ from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
+    has_member,
     opened,
     read_attribute,
     read_attributes,
@@ -74,6 +75,7 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         if not depth.size or (np.diff(depth) <= 0).any():
             raise InvalidInputError("/depth_mm: expected depths that increase, got others")
         distance = read_checked(file, "distance_mm", ("k",))
+        require_finite(distance, "/distance_mm")
         correlation = read_checked(file, "correlation", (depth.size, distance.size))
         cells = read_checked(file, "cells", (depth.size,))
         numbers = read_attributes(file, dict.fromkeys(PATCH_NUMBERS, float))
@@ -86,10 +88,10 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of, edge_fraction=edge, probe=probe)
         pairs = int(read_attribute(file, "pairs_used", 0))
         tilt = speckle = None
-        if "tilt" in file:
+        if has_member(file, "tilt"):
             names = ("tilt/pivot_mm", "tilt/spread_mm")
             tilt = TiltResponse(*(read_checked(file, name, (depth.size,)) for name in names))
-        if "speckle" in file:
+        if has_member(file, "speckle"):
             names = ("speckle/lateral_mm", "speckle/axial_mm")
             speckle = SpeckleSize(*(read_checked(file, name, (depth.size,)) for name in names))
         return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt, speckle)

@@ -17,7 +17,7 @@ from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.hdf5 import Node, PathLike, open_hdf5, reading
+from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
 from speckle3d.io.headers import read_header
 from speckle3d.io.load import IMAGE, kind_of
 from speckle3d.io.metaimage import image_orientation, image_type
@@ -166,18 +166,17 @@ def _listed(values: FloatArray) -> str:
 def _describe_curves(path: PathLike) -> list[Row]:
     """Attributes, but for the format, and lengths of data sets as they are."""
     rows: list[Row] = []
-
-    def visit(name: str, node: Node) -> None:
-        if isinstance(node, h5py.Dataset):
-            shape = " x ".join(str(n) for n in node.shape)
-            rows.append((_spoken(name)[0], shape, "values"))
-
+    curves.read_curves(path)
     with reading(path), open_hdf5(path) as file:
         for name, value in file.attrs.items():
             if name != "format":
                 spoken, unit = _spoken(name)
                 rows.append((spoken, str(value), unit))
-        file.visititems(visit)
+        groups = [name for name in file if isinstance(find_member(file, name), h5py.Group)]
+        below = [f"{name}/{inner}" for name in groups for inner in require_group(file, name)]
+        for name in sorted({*file, *below} - {*groups}):
+            shape = " x ".join(str(n) for n in require_dataset(file, name).shape)
+            rows.append((_spoken(name)[0], shape, "values"))
     return rows
 
 

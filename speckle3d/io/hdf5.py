@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import secrets
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -17,17 +17,29 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
+from speckle3d.core.files import PathLike as PathLike
+from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
+from speckle3d.io.hdf5_guard import follow, require_held, require_readable, require_sound_heaps, require_texts
 
-PathLike = str | os.PathLike[str]
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
 
-_READ_FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
-"""What h5py raises, by place, when the bytes of a file do not make sense."""
+_READ_FAILURES = (
+    OSError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    TypeError,
+    MemoryError,
+    OverflowError,
+    zlib.error,
+)
+"""What h5py and zlib raise, by place, when the bytes of a file do not make sense."""
 
 _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Stored kinds that may become the kind asked for."""
@@ -37,7 +49,8 @@ _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 def atomic_path(path: PathLike) -> Iterator[Path]:
     """Yield a temporary sibling that becomes `path` when the block succeeds and vanishes when it does not.
 
-    The sibling keeps the suffix, by which some writers choose their format.
+    The sibling keeps the suffix, by which some writers choose their format. Siblings that killed processes
+    left are removed.
 
     Raises
     ------
@@ -45,14 +58,16 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         If the folder does not exist, `path` is not an ordinary file, or the system refuses to write.
     """
     target = require_target(path)
-    part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
+    clear_parts(target)
+    part = part_beside(target)
     try:
-        yield part
-        os.replace(part, target)
+        with marked(part):
+            yield part
+            os.replace(part, target)
     except Speckle3DError:
         raise
     except OSError as error:
-        raise FileError(f"{path}: cannot be written: {one_line(error)}") from error
+        raise cannot_write(path, error) from error
     finally:
         part.unlink(missing_ok=True)
 
@@ -84,13 +99,13 @@ def make_folder(path: PathLike) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(f"{path}: cannot be made a folder: {one_line(error)}") from error
+        raise cannot_write(path, error, "cannot be made a folder") from error
 
 
 @contextmanager
 def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
     """Open an HDF5 file of the family for writing; `path` appears whole or not at all (`atomic_path`)."""
-    with atomic_path(path) as part, h5py.File(part, "w") as file:
+    with atomic_path(path) as part, DiskFile(part) as disk, h5py.File(disk, "w") as file:
         file.attrs["format"] = format_name
         file.attrs["version"] = version
         yield file
@@ -105,7 +120,11 @@ class HDF5Writer:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._file: h5py.File = stack.enter_context(atomic_hdf5(self._path, *self._format))
+            part = stack.enter_context(atomic_path(self._path))
+            self._disk = stack.enter_context(DiskFile(part))
+            self._file = stack.enter_context(h5py.File(self._disk, "w"))
+            for name, value in zip(("format", "version"), self._format, strict=True):
+                self._file.attrs[name] = value
             stack.push(self._finish_unless)
             self._begin()
             self._stack = stack.pop_all()
@@ -115,6 +134,10 @@ class HDF5Writer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.__exit__(kind, error, trace)
+
+    def _require_room(self) -> None:
+        """Raise if what was written so far does not fit on the disk; to be called after every piece."""
+        self._disk.check()
 
     def _begin(self) -> None:
         """Write what is known before the block."""
@@ -139,6 +162,7 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
+        require_sound_heaps(path)
         return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
 
 
@@ -210,26 +234,34 @@ def read_checked(
     if not _fits(node.shape, shape):
         expected = ", ".join(str(n) for n in shape) + ("," if len(shape) == 1 else "")
         raise InvalidInputError(f"{where}: expected shape ({expected}), got {node.shape}")
-    with reading(where):
+    with reading(where), naming(where):
+        require_readable(node)
         return np.asarray(node[()], dtype=wanted)
 
 
 def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return a data set of `group`, or raise `InvalidInputError` naming what is there instead."""
-    node = _member(group, name)
+    """Return a data set of `group` that the file holds whole, or raise `InvalidInputError`."""
+    node, where = find_member(group, name), locate(group, name)
     if not isinstance(node, h5py.Dataset):
-        raise InvalidInputError(f"{locate(group, name)}: expected a data set, got {_kind_of(node)}")
+        raise InvalidInputError(f"{where}: expected a data set, got {_kind_of(node)}")
+    with reading(where), naming(where):
+        require_held(node)
     return node
+
+
+def has_member(group: h5py.Group, name: str) -> bool:
+    """Whether a group holds a name; a link to nothing, or out of the file, is an error and not absence."""
+    return find_member(group, name) is not None
 
 
 def find_group(group: h5py.Group, name: str) -> h5py.Group | None:
     """Return a group inside `group`, None if there is none of that name."""
-    return None if _member(group, name) is None else require_group(group, name)
+    return None if find_member(group, name) is None else require_group(group, name)
 
 
 def require_group(group: h5py.Group, name: str) -> h5py.Group:
     """Return a group inside `group`, or raise `InvalidInputError` naming what is there instead."""
-    node = _member(group, name)
+    node = find_member(group, name)
     if not isinstance(node, h5py.Group):
         raise InvalidInputError(f"{locate(group, name)}: expected a group, got {_kind_of(node)}")
     return node
@@ -246,13 +278,17 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
     if h5py.check_string_dtype(node.dtype) is None or node.shape != shape:
         where = locate(group, name)
         raise InvalidInputError(f"{where}: expected texts of shape {shape}, got {node.shape} {node.dtype}")
-    return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
+    with reading(locate(group, name)), naming(locate(group, name)):
+        require_readable(node)
+        require_texts(node)
+        return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 
 def write_attributes(node: Node, values: object, names: Iterable[str]) -> None:
-    """Write attributes of an object under their own names."""
+    """Write attributes of an object by name; of a path that is no Unicode, what can be written."""
     for name in names:
-        node.attrs[name] = getattr(values, name)
+        value = getattr(values, name)
+        node.attrs[name] = value.encode("utf-8", "backslashreplace").decode() if type(value) is str else value
 
 
 def read_attributes(node: Node, kinds: Mapping[str, type]) -> dict[str, Any]:
@@ -295,7 +331,7 @@ def read_text(node: Node, name: str) -> str:
 
 def sha256_of(path: PathLike) -> str:
     """SHA-256 of a file's bytes, read in pieces, as 64 hexadecimal digits."""
-    with reading(path), open(path, "rb") as stream:
+    with reading(path), open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -305,9 +341,11 @@ def one_line(error: BaseException) -> str:
     return (text.strip() or type(error).__name__).splitlines()[0]
 
 
-def _member(group: h5py.Group, name: str) -> Any:
-    with reading(locate(group, name)):
-        return group.get(name)
+def find_member(group: h5py.Group, name: str) -> Any:
+    """Return what `group` holds under a name, None if there is none; never of another file."""
+    where = locate(group, name)
+    with reading(where), naming(where):
+        return follow(group, name)
 
 
 def _fits(shape: tuple[int, ...] | None, expected: tuple[int | str, ...]) -> bool:

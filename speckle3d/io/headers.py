@@ -12,7 +12,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.io.hdf5 import PathLike, reading
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.io.hdf5 import reading
+from speckle3d.io.pixels import Pixels, meta_pixels, nrrd_pixels
 from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
@@ -23,9 +25,6 @@ _NRRD_NAMES = {
     "ultrasound image orientation": "UltrasoundImageOrientation",
     "ultrasound image type": "UltrasoundImageType",
 }
-
-_ELEMENT_BYTES = {"MET_CHAR": 1, "MET_SHORT": 2, "MET_INT": 4, "MET_FLOAT": 4, "MET_DOUBLE": 8}
-"""By type; those without a sign have a U before the name, as MET_UCHAR."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,8 @@ class SequenceHeader:
         Fields of the whole file.
     frames : tuple of dict
         Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
+    pixels : Pixels
+        Where they lie; there may be none, as in recordings of a tracker alone.
     """
 
     path: str
@@ -49,6 +50,7 @@ class SequenceHeader:
     spacing_mm: tuple[float, float] | None
     fields: dict[str, str]
     frames: tuple[dict[str, str], ...]
+    pixels: Pixels
 
     @property
     def frame_count(self) -> int:
@@ -95,19 +97,17 @@ def read_header(path: PathLike) -> SequenceHeader:
     Raises
     ------
     FileError
-        If the file cannot be read, or a MetaImage holds fewer bytes than its header announces.
+        If the file cannot be read, or holds fewer bytes of pixels than its header announces.
     InvalidInputError
-        If it is neither, or the header does not make sense.
+        If it is neither, the header does not make sense, or its pixels lie outside its folder.
     """
-    with reading(path), open(path, "rb") as stream:
+    with reading(path), open_regular(path) as stream:
         start = stream.read(512)
         stream.seek(0)
         if is_nrrd(start):
-            return _nrrd_header(path, dict(_nrrd_lines(stream)))
+            return _nrrd_header(path, dict(_nrrd_lines(path, stream)), stream)
         if is_metaimage(start):
-            header = _meta_header(path, dict(_meta_lines(path, stream)))
-            _require_pixels(path, stream, header)
-            return header
+            return _meta_header(path, dict(_meta_lines(path, stream)), stream)
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
 
 
@@ -122,14 +122,24 @@ def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
     raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
 
 
-def _nrrd_lines(stream: BinaryIO) -> Iterator[tuple[str, str]]:
+def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
+    is_apart = False
     for line in _lines(stream):
         if not line.strip():
             return
         if line.startswith(("#", "NRRD")):
             continue
-        name, _, value = line.partition(":=") if ":=" in line else line.partition(":")
-        yield _NRRD_NAMES.get(name.strip(), name.strip()), value.strip()
+        if ":=" in line:
+            name, _, value = line.partition(":=")
+            yield _NRRD_NAMES.get(name.strip(), name.strip()), value.strip()
+        else:
+            # Fields of the format itself, unlike those of its users, may be in letters of any size.
+            name, _, value = line.partition(":")
+            name = name.strip().lower()
+            is_apart = is_apart or name in ("data file", "datafile")
+            yield name, value.strip()
+    if not is_apart:
+        raise FileError(f"{path}: expected an NRRD header up to an empty line, got a truncated one")
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
@@ -137,25 +147,29 @@ def _lines(stream: BinaryIO) -> Iterator[str]:
         yield line.decode("latin-1").rstrip("\r\n")
 
 
-def _meta_header(path: PathLike, lines: dict[str, str]) -> SequenceHeader:
+def _meta_header(path: PathLike, lines: dict[str, str], stream: BinaryIO) -> SequenceHeader:
     size = _sizes(path, lines, "DimSize")
     spacing = lines.get("ElementSpacing") or lines.get("ElementSize")
     known = numbers(spacing, len(size), f"{path}: ElementSpacing") if spacing else None
-    return _header(path, size, known, lines)
+    return _header(path, size, known, lines, meta_pixels(Path(path), lines, size, stream.tell()))
 
 
-def _nrrd_header(path: PathLike, lines: dict[str, str]) -> SequenceHeader:
+def _nrrd_header(path: PathLike, lines: dict[str, str], stream: BinaryIO) -> SequenceHeader:
     size = _sizes(path, lines, "sizes")
     if "spacings" in lines:
         first_two = lines["spacings"].lower().replace("nan", "1").split()[:2]
         known: tuple[float, ...] | None = numbers(" ".join(first_two), 2, f"{path}: spacings")
     else:
         known = _direction_lengths(path, lines.get("space directions", ""))
-    return _header(path, size, known, lines)
+    return _header(path, size, known, lines, nrrd_pixels(Path(path), lines, size, stream.tell()))
 
 
 def _header(
-    path: PathLike, size: tuple[int, ...], spacing: tuple[float, ...] | None, lines: dict[str, str]
+    path: PathLike,
+    size: tuple[int, ...],
+    spacing: tuple[float, ...] | None,
+    lines: dict[str, str],
+    pixels: Pixels,
 ) -> SequenceHeader:
     frames: dict[int, dict[str, str]] = {}
     fields = {}
@@ -169,7 +183,8 @@ def _header(
         raise InvalidInputError(f"{path}: expected fields Seq_Frame{gap:04d}_..., got none for frame {gap}")
     # PLUS and ITK write 1 where nobody told them; no ultrasound image has millimetre samples.
     known = None if spacing is None or spacing[:2] == (1.0, 1.0) else (spacing[0], spacing[1])
-    return SequenceHeader(str(path), size, known, fields, tuple(frames[i] for i in range(len(frames))))
+    ordered = tuple(frames[i] for i in range(len(frames)))
+    return SequenceHeader(str(path), size, known, fields, ordered, pixels)
 
 
 def _sizes(path: PathLike, lines: dict[str, str], name: str) -> tuple[int, ...]:
@@ -185,24 +200,3 @@ def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
         return None
     where = f"{path}: space directions"
     return tuple(float(np.linalg.norm(numbers(v.replace(",", " "), None, where))) for v in vectors)
-
-
-def _require_pixels(path: PathLike, stream: BinaryIO, header: SequenceHeader) -> None:
-    """Refuse a truncated file with a message that names it; the image library's does not."""
-    name = header.fields["ElementDataFile"]
-    if name.upper() != "LOCAL":
-        data = Path(path).parent / name
-        if not name or not data.is_file():
-            raise FileError(f"{path}: ElementDataFile: expected LOCAL or a file beside it, got {name!r}")
-        found = data.stat().st_size
-    else:
-        found = Path(path).stat().st_size - stream.tell()
-    if header.fields.get("CompressedData", "False").lower() == "true":
-        announced = header.fields.get("CompressedDataSize", "0")
-        expected = int(numbers(announced, 1, f"{path}: CompressedDataSize")[0])
-    else:
-        element = _ELEMENT_BYTES.get(header.fields.get("ElementType", "").replace("_U", "_"), 1)
-        channels = int(numbers(header.fields.get("ElementNumberOfChannels", "1"), 1, f"{path}: channels")[0])
-        expected = int(np.prod(header.size, dtype=object)) * element * channels
-    if found < expected:
-        raise FileError(f"{path}: expected {expected} bytes of pixels, got {found}: the file is truncated")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.files import open_regular
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
@@ -100,7 +101,7 @@ def sniff(path: PathLike) -> str:
         If it is neither.
     """
     require_file(path)
-    with reading(path), open(path, "rb") as stream:
+    with reading(path), open_regular(path) as stream:
         start = stream.read(_SNIFFED_BYTES)
     if start.startswith(_HDF5_SIGNATURE):
         return "hdf5"

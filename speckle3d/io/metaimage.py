@@ -6,6 +6,7 @@ orientations such as ``MF`` (x towards the marked side, y far from the probe).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -17,10 +18,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
+from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.headers import SequenceHeader, image_library, read_header
+from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.pixels import read_pixels
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -101,7 +104,8 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
     if 0 in header.size:
         raise InvalidInputError(f"{path}: expected pixels, got an image of size {header.size}")
     kept = _frames_kept(header)
-    frames = _to_samples(header, _read_pixels(header)[kept])
+    pixels = _read_pixels(header)
+    frames = _to_samples(header, pixels if kept.all() else pixels[kept])
     grid, signal = _geometry(header, settings, frames)
     return Sweep(
         frames=cast(Frames, frames),
@@ -109,7 +113,7 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
         signal=signal,
         frame_time_s=_frame_times(header, settings)[kept],
         tracker=_tracker(header, settings),
-        name=Path(path).name.split(".")[0],
+        name=printable(Path(path).name.split(".")[0]),
     )
 
 
@@ -245,7 +249,8 @@ def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> R
 def _squared(matrices: FloatArray) -> FloatArray:
     """Make rounded rotations exact; matrices farther off stay, for `transforms_from_matrices` to refuse."""
     r = matrices[:, :3, :3]
-    rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
     rounded[rounded] = np.linalg.det(r[rounded]) > 0
     squared = matrices.copy()
     squared[rounded, :3, :3] = nearest_rotation(r[rounded])
@@ -288,16 +293,12 @@ def image_orientation(header: SequenceHeader) -> str:
 
 def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
     """Pixels as (frame, second axis, first axis)."""
-    with image_library(header.path, "read") as itk:
-        # The reader is named, because the library otherwise chooses it by the suffix.
-        image = itk.ReadImage(header.path, imageIO=f"{header.file_format}IO")
-    pixels: npt.NDArray[Any] = itk.GetArrayFromImage(image)
     expected = (header.frame_count, header.size[1], header.size[0])
-    if "list" in header.fields.get("kinds", "") and pixels.shape == (*expected[1:], expected[0]):
-        pixels = np.moveaxis(pixels, -1, 0)  # an NRRD list of frames arrives as one image of many components
-    if pixels.shape not in (expected, expected[1:]):
-        raise InvalidInputError(f"{header.path}: expected grey pixels {expected}, got {pixels.shape}")
-    return pixels.reshape(expected)
+    if header.pixels.count != math.prod(expected):
+        raise InvalidInputError(
+            f"{header.path}: expected grey pixels {expected}, got {header.pixels.count} numbers"
+        )
+    return read_pixels(header.pixels).reshape(expected)
 
 
 def _to_samples(header: SequenceHeader, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -351,8 +352,9 @@ def _analytic(path: str, pixels: npt.NDArray[Any], orientation: str, kind: str) 
         axis = 3 - axis
     if pixels.shape[axis] % 2:
         raise InvalidInputError(f"{path}: expected I and Q in pairs, got {pixels.shape[axis]}")
-    in_phase, quadrature = np.moveaxis(pixels, axis, 0)[0::2], np.moveaxis(pixels, axis, 0)[1::2]
-    analytic = (in_phase + 1j * quadrature).astype(np.complex64)
+    turned = np.moveaxis(pixels, axis, 0)
+    analytic = np.empty(turned[0::2].shape, dtype=np.complex64)
+    analytic.real, analytic.imag = turned[0::2], turned[1::2]
     return np.moveaxis(analytic, 0, axis)
 
 

@@ -21,16 +21,17 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.hdf5 import PathLike, one_line, reading
+from speckle3d.io.hdf5 import one_line, reading
 from speckle3d.io.text import numbers
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 """How many wires a pattern of each type has."""
 
-_SIZE_LIMIT_BYTES = 2**26
-"""A thousand times the size of a device set; beyond it the file is none."""
+_SIZE_LIMIT_BYTES = 2**22
+"""Five hundred times the size of a device set; in memory a document takes many times its length."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def _clip_px(segmentation: Element) -> FloatArray | None:
 
 
 def _read_xml(path: PathLike) -> Element:
-    with reading(path), open(path, "rb") as stream:
+    with reading(path), open_regular(path) as stream:
         text = stream.read(_SIZE_LIMIT_BYTES + 1)
     if len(text) > _SIZE_LIMIT_BYTES:
         raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")

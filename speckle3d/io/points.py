@@ -161,7 +161,7 @@ def _row(text: str, columns: list[str], wire_names: Sequence[str], where: str) -
 def _wire(word: str, names: Sequence[str], where: str) -> int:
     if word in names:
         return list(names).index(word)
-    if word.isascii() and word.isdigit() and int(word) < len(names):
+    if word.isascii() and word.isdigit() and len(word) <= len(str(len(names))) and int(word) < len(names):
         return int(word)
     known = f"one of {', '.join(names)} or its number from 0" if names else "no wire, the phantom having none"
     raise InvalidInputError(f"{where}: expected {known}, got {word!r}")

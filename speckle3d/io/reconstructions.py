@@ -24,6 +24,7 @@ from speckle3d.io.hdf5 import (
     HDF5Writer,
     PathLike,
     find_group,
+    has_member,
     locate,
     opened,
     read_attributes,
@@ -103,6 +104,7 @@ class ReconstructionWriter(HDF5Writer):
         for name in _PAIR_FIELDS:
             group[name].resize(start + len(pairs), axis=0)
             group[name][start:] = getattr(pairs, name)
+        self._require_room()
 
     def finish(
         self,
@@ -203,11 +205,11 @@ def _read_provenance(file: h5py.File) -> Provenance:
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
     group = require_group(file, "poses")
-    return {mode: read_transforms(group, mode, frames) for mode in MODES if mode in group}
+    return {mode: read_transforms(group, mode, frames) for mode in MODES if has_member(group, mode)}
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
-    if "pose_covariance" not in file or "frame_flags" not in file:
+    if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
         return None
     covariance = read_checked(file, "pose_covariance/image", (frames, 6, 6))
     require_finite(covariance, locate(file, "pose_covariance/image"))

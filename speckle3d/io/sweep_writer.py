@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
+from speckle3d.core.parts import DiskFile
 from speckle3d.core.sweep import (
     INERTIAL,
     BModeSettings,
@@ -23,7 +24,8 @@ from speckle3d.core.sweep import (
     Sweep,
     Tracker,
 )
-from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, open_hdf5, opened
+from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
+from speckle3d.io.hdf5_guard import require_own
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None
@@ -99,6 +101,7 @@ class SweepWriter(HDF5Writer):
         if frame.dtype.kind == "f":
             require_finite(frame, where)
         self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
+        self._require_room()
         self._time_s.append(float(time_s))
 
     def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
@@ -122,10 +125,10 @@ class SweepWriter(HDF5Writer):
 
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
-        with open_hdf5(source) as other:
+        with reading(source), naming(str(source)), open_hdf5(source) as other:
             for name in other:
                 if name not in KNOWN and name not in self._file:
-                    other.copy(other[name], self._file, name)
+                    other.copy(require_own(other, name), self._file, name)
             for name, value in other.attrs.items():
                 if name not in self._file.attrs:
                     self._file.attrs[name] = value
@@ -213,10 +216,10 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
         If it is no sweep file.
     """
     with opened(path, FORMAT, VERSION) as file:
-        held = "orientation" in file
+        held = has_member(file, "orientation")
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
-        with h5py.File(part, "r+") as file:
+        with DiskFile(part, keep=True) as disk, h5py.File(disk, "r+") as file:
             if held:
                 del file["orientation"]
             _write_sensor(file, sensor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 import threading
 from pathlib import Path
@@ -20,6 +21,7 @@ from speckle3d.core.geometry import (
     rotations_from_quaternions,
     transforms_from_matrices,
 )
+from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import (
     INERTIAL,
@@ -33,6 +35,7 @@ from speckle3d.core.sweep import (
 from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
+    has_member,
     locate,
     open_hdf5,
     opened,
@@ -44,6 +47,7 @@ from speckle3d.io.hdf5 import (
     reading,
     require_dataset,
 )
+from speckle3d.io.hdf5_guard import is_only_deflated, require_whole_chunk, unpacked
 
 FORMAT = "speckle3d.sweep"
 VERSION = 1
@@ -82,12 +86,13 @@ class HDF5Frames:
         if not -len(self) <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
         i %= len(self)
-        with self._lock, reading(f"{self.path}: /{self.name}[{i}]"):
+        where = f"{self.path}: /{self.name}[{i}]"
+        with self._lock, reading(where), naming(where):
             if self._open is None:
                 self._open = _OpenFrames(self)
             frame = self._open.read(i)
         if frame.dtype.kind == "f":
-            require_finite(frame, f"{self.path}: /{self.name}[{i}]")
+            require_finite(frame, where)
         return frame
 
     def close(self) -> None:
@@ -111,16 +116,33 @@ class _OpenFrames:
     def __init__(self, frames: HDF5Frames) -> None:
         self.file = open_hdf5(frames.path)
         self._frame_shape, self._dtype = frames.stored_shape[1:], frames.dtype
-        self._node = self.file[frames.name].id
+        self._data = require_dataset(self.file, frames.name)
+        if self._data.shape != frames.stored_shape:
+            raise InvalidInputError(f"expected shape {frames.stored_shape}, got {self._data.shape}")
+        self._node = self._data.id
         self._on_disk = self._node.get_space()
         self._in_memory = h5py.h5s.create_simple(self._frame_shape)
         self._kind = h5py.h5t.py_create(self._dtype)
+        self._unpacks = self._data.chunks == (1, *self._frame_shape) and is_only_deflated(self._data)
+        self._checked: set[tuple[int, ...]] = set()
 
     def read(self, i: int) -> npt.NDArray[Any]:
+        if self._unpacks:
+            frame: npt.NDArray[Any] = unpacked(self._data, (i, 0, 0))[0]
+            return frame
+        if self._data.chunks is not None:
+            self._check_chunks(i, self._data.chunks)
         frame = np.empty(self._frame_shape, self._dtype)
         self._on_disk.select_hyperslab((i, 0, 0), (1, *self._frame_shape))
         self._node.read(self._in_memory, self._on_disk, frame, self._kind)
         return frame
+
+    def _check_chunks(self, i: int, chunks: tuple[int, int, int]) -> None:
+        starts = (range(0, n, step) for n, step in zip(self._frame_shape, chunks[1:], strict=True))
+        for offset in itertools.product([i // chunks[0] * chunks[0]], *starts):
+            if offset not in self._checked:
+                require_whole_chunk(self._data, offset)
+                self._checked.add(offset)
 
 
 def read_sweep(path: PathLike) -> Sweep:
@@ -145,14 +167,14 @@ def read_sweep(path: PathLike) -> Sweep:
             orientation=_read_orientation(file),
             tracker=_read_tracker(file),
             truth=_read_truth(file, n),
-            name=Path(path).stem,
+            name=printable(Path(path).stem),
             probe=read_text(file, "probe") if "probe" in file.attrs else "",
         )
 
 
 def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
-    name = "rf" if "rf" in file else "bmode"
-    if name not in file:
+    name = "rf" if has_member(file, "rf") else "bmode"
+    if not has_member(file, name):
         raise InvalidInputError(f"{locate(file)}: expected a data set rf or bmode, got neither")
     node = require_dataset(file, name)
     where = locate(file, name)
@@ -199,7 +221,7 @@ def _read_orientation(file: h5py.File) -> OrientationSensor | None:
     time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
     quaternions = read_checked(group, "quaternion_wxyz", (time_s.size, 4))
     rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
-    vectors = {name: _read_vectors(group, name, time_s.size) for name in INERTIAL if name in group}
+    vectors = {name: _read_vectors(group, name, time_s.size) for name in INERTIAL if has_member(group, name)}
     mounting, name = None, "sensor_from_image_wxyz"
     if name in group.attrs:
         wxyz = read_vector_attribute(group, name, 4)
@@ -240,7 +262,7 @@ def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
 
 
 def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
-    if "valid" not in group:
+    if not has_member(group, "valid"):
         return np.ones(samples, dtype=bool)
     valid = read_checked(group, "valid", (samples,), np.bool_)
     if samples and not valid.any():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.hdf5 import PathLike, reading
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.io.hdf5 import reading
 
 
 def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
@@ -20,7 +22,7 @@ def text_lines(path: PathLike) -> Iterator[tuple[int, str]]:
     InvalidInputError
         If its bytes are not UTF-8; a byte order mark, with which editors on Windows begin, is left out.
     """
-    with reading(path), open(path, encoding="utf-8-sig") as stream:
+    with reading(path), io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as stream:
         try:
             for number, line in enumerate(stream, start=1):
                 if text := line.strip():

@@ -6,7 +6,7 @@ otherwise; poses in memory are in mm.
 
 from __future__ import annotations
 
-from itertools import takewhile
+from array import array
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, naming
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.text import numbers, text_lines
@@ -66,23 +67,27 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         If a line is not eight finite numbers, a quaternion is not of unit length, or times do not increase;
         or the file says another unit.
     """
-    lines = list(text_lines(path))
+    values, said = array("d"), None
     # Line by line, so that an error names the line: 17 us each, where `np.loadtxt` takes 4.
-    rows = np.array(
-        [numbers(text, _COLUMNS, f"{path}: line {n}") for n, text in lines if not _is_comment(text)]
-    )
+    for n, text in text_lines(path):
+        if not _is_comment(text):
+            values.extend(numbers(text, _COLUMNS, f"{path}: line {n}"))
+        elif not values:
+            said = said or _unit_of(text)
+    rows = np.frombuffer(values).reshape(-1, _COLUMNS)
     if not rows.size:
         raise InvalidInputError(f"{path}: expected lines of eight numbers, got none")
-    heading = [text for _, text in takewhile(lambda line: _is_comment(line[1]), lines)]
-    said = _unit_of(heading)
     if length_unit is not None and said is not None and said != length_unit:
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
     mm_per_unit = _mm_per(length_unit or said or "m")
-    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(rows[:, 4:], axis=1)
+        places_mm = rows[:, 1:4] * mm_per_unit
     if (wrong := np.flatnonzero(np.abs(norms - 1.0) > _UNIT_TOLERANCE)).size:
         where = f"{path}: pose {wrong[0]}"
         raise InvalidInputError(f"{where}: expected a unit quaternion, got norm {norms[wrong[0]]:.4g}")
-    poses = RigidTransform.from_components(rows[:, 1:4] * mm_per_unit, Rotation.from_quat(rows[:, 4:]))
+    require_finite(places_mm, f"{path}: x, y, z in mm")
+    poses = RigidTransform.from_components(places_mm, Rotation.from_quat(rows[:, 4:]))
     with naming(str(path)):
         return TimedPoses(rows[:, 0].copy(), poses)
 
@@ -101,9 +106,9 @@ def _is_comment(line: str) -> bool:
     return line.startswith("#")
 
 
-def _unit_of(heading: list[str]) -> LengthUnit | None:
-    """Return the length unit that comments like the one of `write_tum` name."""
-    words = {word for line in heading for word in line.split()}
+def _unit_of(comment: str) -> LengthUnit | None:
+    """Return the length unit that a comment like the one of `write_tum` names."""
+    words = set(comment.split())
     return next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in words), None)
 
 

@@ -86,12 +86,14 @@ class DistanceEstimator:
         At the patches.
     end_amplitude : ndarray, shape (p,)
         At the curve's last distance, beyond which nothing is read; 0 if the curve has levelled out by then.
+    reach_mm : float
+        Up to where the curves were measured.
     """
 
     def __init__(self, curves: DecorrelationCurves, patches: PatchGrid) -> None:
         here = curves.at(patches.centre_mm[:, 1])
         self.cells, self.of_echo = here.cells, curves.key.correlation_of == "echo"
-        self.step_mm = float(curves.distance_mm[1])
+        self.step_mm, self.reach_mm = float(curves.distance_mm[1]), float(curves.distance_mm[-1])
         self.amplitude = np.ascontiguousarray(np.sqrt(here.correlation))
         self.tilt = here.tilt
         self._grid = curves.distance_mm

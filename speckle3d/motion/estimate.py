@@ -10,13 +10,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, CoherenceSettings, estimate_coherence, scale_sigma
 from speckle3d.motion.curve_doubts import FLAT, DepthFactors, depth_factors, sum_ratios
-from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
+from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, EchoModel, PatchDistances
 from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings, consistent_subset
 from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, SignResolver, pair_signs
 from speckle3d.motion.trajectory import (
@@ -116,6 +117,11 @@ class PairReader:
             Pairs both of whose frames are to be trusted.
         coherence : Coherence or None
             With which correlations are read; None for a phantom's curves as they are.
+
+        Raises
+        ------
+        InsufficientDataError
+            If no pair determines a plane.
         """
         chosen = self._choose(table, path[:, 0], sound)
         first, second = table.first[chosen], table.second[chosen]
@@ -129,6 +135,12 @@ class PairReader:
             plane = self.fitter.fit(rho, table.moved_mm(row), model, start_mm=abs(float(d)))
             if plane is not None:
                 found.append(SignedPair(int(row), int(i), int(j), model, plane))
+        if not found:
+            patches = table.correlation.shape[1]
+            raise InsufficientDataError(
+                f"expected frame pairs whose patches determine a plane, got none in {chosen.size} pairs of "
+                f"{patches} patches: is the image wide enough, and do the curves fit it?"
+            )
         signs = self._signs(found, PLAIN_ERROR if coherence is None else ADAPTED_ERROR)
         return [replace(pair, sign=float(sign)) for pair, sign in zip(found, signs, strict=True)]
 
@@ -274,7 +286,8 @@ class PairReader:
         near |= (left >= self._settings.least_correlation) & sound & (pairs[table.second] < ENOUGH_PAIRS)
         for frame in np.setdiff1d(table.second[sound], table.second[near]):
             rows = np.flatnonzero((table.second == frame) & sound)
-            near[rows[np.argmax(left[rows])]] = True
+            best = rows[np.argmax(left[rows])]
+            near[best] = table.median[best] >= LEAST_CORRELATION
         return np.flatnonzero(near)
 
     def _signs(self, pairs: Sequence[SignedPair], relative_error: float) -> FloatArray:

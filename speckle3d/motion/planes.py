@@ -135,7 +135,10 @@ class PlaneFitter:
         start_mm: float | None = None,
         either_side: bool = True,
     ) -> PairPlane | None:
-        """Robust maximum likelihood; None if fewer than six patches can take part.
+        """Robust maximum likelihood.
+
+        None if fewer than six patches can take part, or if the image's centre comes to lie farther away than
+        the curves were measured, or might.
 
         Parameters
         ----------
@@ -176,6 +179,10 @@ class PlaneFitter:
                 break
         covariance = np.linalg.inv(normal) * max(1.0, total / max(int(used.sum()) - 3, 1))
         covariance[0, 0] += self.settings.bias_mm**2
+        # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
+        reach = self._estimator.reach_mm * max(1.0, float(np.median(model.stretch)))
+        if not (abs(best[0]) <= reach and covariance[0, 0] <= reach**2):
+            return None
         if best[0] < 0 and slopes is None:
             best = -best
         return PairPlane(

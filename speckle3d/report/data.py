@@ -155,7 +155,7 @@ def read_study(directory: Path) -> StudyData:
         first = error.errors()[0]
         name, got = ".".join(map(str, first["loc"])), repr(first["input"])[:60]
         raise InvalidInputError(f"{path}: {name}: {first['msg']}, got {got}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"{path}: expected JSON, got an error: {error}") from error
 
 
@@ -174,7 +174,7 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     Speckle3DError
         If its reconstruction cannot be read.
     """
-    folder = directory / str(entry["folder"])
+    folder = _inside(directory, str(entry["folder"]))
     found = read_reconstruction(folder / "reconstruction.h5")
     details = _read_details(folder)
     notes = [Doubt(**each).consequence for each in details.get("doubts", ())]
@@ -204,6 +204,14 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     )
 
 
+def _inside(directory: Path, name: str) -> Path:
+    """Folder of a sweep's results, which is nowhere but in the study's."""
+    folder = directory / name
+    if not folder.resolve().is_relative_to(directory.resolve()):
+        raise InvalidInputError(f"{directory}: expected a folder in the study's own, got {name!r}")
+    return folder
+
+
 def rejected_patches(pairs: FramePairs, frames: int) -> RejectedPatches:
     """Count how often each patch, and each frame's patches, were left out though a distance was there."""
     measured = np.isfinite(pairs.distance_mm)
@@ -222,7 +230,7 @@ def _read_details(folder: Path) -> Record:
     """Read the sweep's summary as a mapping; empty where it is missing or cannot be read."""
     try:
         (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
     return summary if isinstance(summary, dict) else {}
 

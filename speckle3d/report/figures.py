@@ -5,6 +5,7 @@ matplotlib's are PNG, SVG and JPEG files; plotly's can be turned, enlarged and r
 
 from __future__ import annotations
 
+import html
 import io
 import re
 from collections.abc import Mapping, Sequence
@@ -327,7 +328,7 @@ def _traces(panel: Panel, named: bool) -> list[go.Scatter]:
         if each.style == "points":
             unit = panel.axes[0].rpartition(" / ")[2]
             trace.update(
-                marker_color=each.colour, text=list(each.words),
+                marker_color=each.colour, text=[html.escape(word, quote=False) for word in each.words],
                 hovertemplate="%{text}: %{x:.2f} " + unit + "<extra></extra>",
             )  # fmt: skip
         elif each.style == "bar":

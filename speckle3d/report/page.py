@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
 from speckle3d.report import tables
@@ -122,6 +123,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
         loader=jinja2.PackageLoader("speckle3d", "report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -152,6 +154,11 @@ def _said(doubt: Record) -> dict[str, str]:
     """A doubt as a line of the page's table."""
     fate = "refused" if doubt.get("refuted") else "used"
     return {name: str(doubt[name]) for name in ("sweep", "about", "suspect", "evidence")} | {"it is": fate}
+
+
+def _shown(value: Any) -> Any:
+    """Escape characters that would change how a reader sees the text around; markup of our own is left."""
+    return printable(value, kept="\n\t") if type(value) is str else value
 
 
 def _clear_figures(folder: Path, stems: Collection[str]) -> None:

@@ -25,7 +25,7 @@ from speckle3d.scoring.references import require_reference
 from speckle3d.study import sweepjob
 from speckle3d.study.folder import named, only_run
 from speckle3d.study.job import SUBSET
-from speckle3d.study.results import Study, SweepOutcome, write_study
+from speckle3d.study.results import Study, SweepOutcome, require_own_study, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler
 from speckle3d.study.sweepjob import BlockOutcome, SweepJob
 
@@ -112,6 +112,7 @@ def compare_sweeps(
         if mode not in KNOWN_MODES:
             raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
     require_reference(reference)
+    require_own_study(directory)
     if curves is not None:
         read_curves(curves)
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
@@ -139,17 +140,27 @@ def _run(
 ) -> dict[str, SweepOutcome]:
     """Do all jobs; outcomes by name."""
     outcomes: dict[str, SweepOutcome] = {}
-    make_folder(directory / "sweeps")
+    folders = directory / "sweeps"
+    make_folder(folders)
+    # This process holds the study: none but a killed run has left these.
+    for part in folders.glob(".part-*"):
+        shutil.rmtree(part, ignore_errors=True)
     by_name = {job.name: job for job in jobs}
     tasks, after = _tasks(jobs)
     so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
     tell = progress or (lambda at: None)
     tell(so_far)
-    for _, outcome in where.run(sweepjob.run_task, tasks, sweepjob.lost_task, after):
-        if isinstance(outcome, SweepOutcome):
-            outcome = outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
-        so_far.add(outcome, where.workers)
-        tell(so_far)
+    try:
+        for _, outcome in where.run(sweepjob.run_task, tasks, sweepjob.lost_task, after):
+            if isinstance(outcome, SweepOutcome):
+                outcome = outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
+            so_far.add(outcome, where.workers)
+            tell(so_far)
+    except BaseException:
+        _clear(jobs)
+        with suppress(OSError):  # it holds finished sweeps
+            folders.rmdir()
+        raise
     _clear(jobs)
     return outcomes
 

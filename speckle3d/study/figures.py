@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.printable import printable
 from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import REFERENCES, SweepCurves
@@ -171,8 +172,13 @@ def curve_panels(
 def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
     """Draw accumulated length and tilt over the frames, for every mode and the reference."""
     figure = figure_panels(curve_panels(curves, 2), 2, (10.0, 4.2))
-    figure.suptitle(title)
+    _name(figure, title)
     return figure
+
+
+def _name(figure: Figure, title: str) -> None:
+    """Put a name over a figure as it is: a dollar in the name of a file begins no formula."""
+    figure.suptitle(printable(title), parse_math=False)
 
 
 def figure_panels(panels: Sequence[Panel], columns: int, size_in: tuple[float, float]) -> Figure:
@@ -245,7 +251,7 @@ def figure_reslice(
         panel.set_title(name, fontsize="medium", color=colour_of(mode, list(cuts_db)))
         panel.set_xlabel(axis_labels[0])
     panels[0].set_ylabel(axis_labels[1])
-    figure.suptitle(title)
+    _name(figure, title)
     return figure
 
 

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.errors import FileError
+from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path, make_folder, one_line
 from speckle3d.matching.blocks import Block, MatchedBlock, MatchedFrame
 from speckle3d.matching.inplane import InPlaneMotion
@@ -51,6 +52,7 @@ def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
         [*path.parts[1:-1], path.stem if stems[path.with_suffix("")] == 1 else path.name.replace(".", "-")]
         for path in files
     ]
+    words = [[_folder_word(word) for word in each] for each in words]
     depth = [1] * len(files)
     names = _joined(words, depth)
     while alike := [i for i, n in enumerate(names) if names.count(n) > 1 and depth[i] < len(words[i])]:
@@ -58,7 +60,7 @@ def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
             depth[i] += 1
         names = _joined(words, depth)
     # Folders joined may still be alike: a-b/c and a/b-c.
-    marks = [hashlib.sha256(str(path).encode()).hexdigest()[:6] for path in files]
+    marks = [hashlib.sha256(os.fsencode(path)).hexdigest()[:6] for path in files]
     unique = [n if names.count(n) == 1 else f"{n}-{mark}" for n, mark in zip(names, marks, strict=True)]
     return list(zip(unique, files, strict=True))
 
@@ -68,7 +70,8 @@ def only_run(directory: Path) -> Iterator[None]:
     """Hold a study's folder, which is made if need be, during the block.
 
     The operating system releases the lock when the process ends, however it ends; the lock file's text only
-    tells the reader of an error who holds it.
+    tells the reader of an error who holds it. A folder that was made, and in which nothing came to be, is
+    removed again.
 
     Raises
     ------
@@ -79,6 +82,7 @@ def only_run(directory: Path) -> Iterator[None]:
     if folder in _HELD.get():
         yield
         return
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
     try:
         file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
@@ -92,7 +96,17 @@ def only_run(directory: Path) -> Iterator[None]:
     finally:
         if token is not None:
             _HELD.reset(token)
+            if made and os.listdir(folder) == [LOCK]:
+                (folder / LOCK).unlink()
+                for each in made:
+                    each.rmdir()
         os.close(file)
+
+
+def _folder_word(word: str) -> str:
+    """Escape what a terminal would obey in the name of a folder, with % in place of the backslash."""
+    shown = printable(word)
+    return shown if shown == word else shown.replace("\\", "%")
 
 
 def _joined(words: Sequence[Sequence[str]], depth: Sequence[int]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -15,14 +15,18 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import require_modes, sensor_of
 from speckle3d.correction.trust import believed, cleaned_readings, name_of, require_believed
 from speckle3d.io.calibrations import apply_calibrations
-from speckle3d.io.hdf5 import PathLike, make_folder, sha256_of
+from speckle3d.io.fileset import FileSet
+from speckle3d.io.hdf5 import PathLike, sha256_of
+from speckle3d.io.load import kind_of
+from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.matching.quality import describe
 from speckle3d.motion.direction import sensed_orientation
@@ -32,7 +36,7 @@ from speckle3d.scoring.references import Reference, SweepCurves, find_reference,
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_plane
-from speckle3d.study.results import Summary, summary_text, write_summary
+from speckle3d.study.results import Summary, is_study, summary_text, write_summary
 
 SUBSET = "image+subset"
 """Mode of the images alone with the patches that contradict the sensed orientation left out."""
@@ -63,6 +67,10 @@ class JobResult:
     seconds: float
 
 
+RESULTS = FileSet("reconstruction.h5", ("summary.json", "table.txt", "table.csv", "drift.png", "reslice.png"))
+"""What a job writes."""
+
+
 def run_job(
     sweep: Sweep,
     source: Path,
@@ -75,10 +83,11 @@ def run_job(
     calibrations: Sequence[PathLike] = (),
     blocks: BlockFiles | None = None,
 ) -> JobResult:
-    """Reconstruct a sweep and write everything that belongs to it into `directory`.
+    """Reconstruct a sweep and put everything that belongs to it into `directory`.
 
     Written: ``reconstruction.h5``, ``summary.json``, ``table.txt``, ``table.csv``, ``drift.png`` and
-    ``reslice.png``; each appears whole or not at all.
+    ``reslice.png``. A new folder appears whole; in one that is there, all six take the place of earlier
+    results together, and other files stay.
 
     Parameters
     ----------
@@ -107,19 +116,40 @@ def run_job(
     Raises
     ------
     InvalidInputError, InsufficientDataError
-        If the sweep lacks what a mode or the reference needs. A mode whose sensor the images or its own
-        readings refute is left out of the results instead; `Summary.left_out` says why.
+        If the sweep lacks what a mode or the reference needs, or the folder holds other files of these
+        names. A mode whose sensor the images or its own readings refute is left out of the results
+        instead; `Summary.left_out` says why.
     FileError
-        If the folder cannot be written.
+        If the folder cannot be written, or another run is at work in it.
     """
+    require_own_results(directory)
+    with RESULTS.replaced(directory) as part:
+        made = write_results(
+            sweep, source, curves, part, drift, reference, config, progress, calibrations, blocks
+        )
+    return replace(made, directory=directory, files=tuple(directory / each.name for each in made.files))
+
+
+def write_results(
+    sweep: Sweep,
+    source: Path,
+    curves: DecorrelationCurves,
+    directory: Path,
+    drift: Sequence[str] = (),
+    reference: str | None = None,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    calibrations: Sequence[PathLike] = (),
+    blocks: BlockFiles | None = None,
+) -> JobResult:
+    """Reconstruct a sweep into a folder that is there and that nobody reads yet; otherwise as `run_job`."""
     settings = config or Config()
     began = time.perf_counter()
     sweep, mounted = apply_calibrations(sweep, calibrations)
     compared = require_possible(sweep, drift, reference, settings)
     fitted = [mode for mode in drift if mode != SUBSET]
-    make_folder(directory)
     strip = Strip(sweep, settings)
-    path = directory / "reconstruction.h5"
+    path = directory / RESULTS.primary
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
         held = None if blocks is None else partial(blocks.read, strip=strip)
         tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep, held)
@@ -130,7 +160,7 @@ def run_job(
         elif SUBSET in drift:
             left_out[SUBSET] = _refusal_of_subset(sweep, tracked)
         poses |= {mode: c.poses for mode, c in corrections.items()}
-        provenance = Provenance(str(source), sha256_of(source), version("speckle3d"), mounted)
+        provenance = Provenance(written_path(source), sha256_of(source), version("speckle3d"), mounted)
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     if reference is None and compared is not None and compared.name == "tracker":
         compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
@@ -164,6 +194,31 @@ def require_possible(
             "sensors.consistent_subset, got none"
         )
     return find_reference(cleaned_readings(sweep)[0] if config.sensors.examine else sweep, reference)
+
+
+def require_own_results(directory: Path) -> None:
+    """Refuse a folder in which a job's names stand for something else.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first such file.
+    """
+    primary = directory / RESULTS.primary
+    held = [name for name in RESULTS.names if (directory / name).exists()]
+    if not held or (primary.is_file() and not is_study(directory) and _is_reconstruction(primary)):
+        return
+    raise InvalidInputError(
+        f"{directory / held[0]}: expected a new folder or the results of `reconstruct` to replace, "
+        "got a file of another origin"
+    )
+
+
+def _is_reconstruction(path: Path) -> bool:
+    try:
+        return kind_of(path) == RECONSTRUCTION
+    except (FileError, InvalidInputError):
+        return False
 
 
 def available_modes(sweep: Sweep, config: Config) -> list[str]:

@@ -19,13 +19,22 @@ from pydantic_core import to_json
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.printable import printable
 from speckle3d.core.tables import text_table
+from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.overall import over_sweeps, overall_text, shared_means
 
 FORMAT = "speckle3d.study"
 VERSION = 1
+
+FILES = FileSet(
+    "study.json",
+    ("table.txt", "table.csv"),
+    ("report.html", "figures/overview.png", "figures/overview.svg", "paper.txt", "paper.json"),
+)
+"""What a study writes, and what is made from it afterwards."""
 
 _COLUMNS = (
     ("sweep", "sweep", "{}"),
@@ -137,6 +146,8 @@ def summary_text(summary: Summary) -> str:
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
     """Gather what is in the sweeps' folders, and write ``study.json``, ``table.txt`` and ``table.csv``.
 
+    They replace those of an earlier study together; its report is removed.
+
     Raises
     ------
     FileError
@@ -182,8 +193,33 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
     lines = [row | {"path": paths[row["sweep"]], "copy_of": copies.get(row["sweep"], "")} for row in rows]
     lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in failed]
     texts = {"study.json": json_text(contents), "table.txt": table}
-    write_texts(directory, texts | {"table.csv": csv_text(lines, "path", "copy_of", "reason")})
+    with FILES.replaced(directory) as part:
+        write_texts(part, texts | {"table.csv": csv_text(lines, "path", "copy_of", "reason")})
     return Study(directory, outcomes, summaries, drift, table, copies)
+
+
+def is_study(directory: Path) -> bool:
+    """Whether a folder holds a study; a file of that name and other content is none."""
+    try:
+        return bool(json.loads((directory / FILES.primary).read_text(encoding="utf-8"))["format"] == FORMAT)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def require_own_study(directory: Path) -> None:
+    """Refuse a folder in which a study's names stand for something else.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first such file.
+    """
+    held = [name for name in FILES.names if (directory / name).exists()]
+    if held and not is_study(directory):
+        raise InvalidInputError(
+            f"{directory / held[0]}: expected a new folder or a study to go on with or to replace, "
+            "got a file of another origin"
+        )
 
 
 def rows_of(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
@@ -227,15 +263,19 @@ def csv_text(rows: Sequence[Mapping[str, Any]], *more: str) -> str:
 def json_text(value: Any) -> str:
     """Dataclasses, arrays and numbers as strict JSON: a value that is not finite becomes null.
 
+    Characters that could drive a terminal are escaped.
+
     Raises
     ------
     InvalidInputError
         If there is anything else in it.
     """
     try:
-        return to_json(value, indent=2, inf_nan_mode="null", fallback=_listed).decode() + "\n"
+        text = to_json(value, indent=2, inf_nan_mode="null", fallback=_listed).decode()
     except ValueError as error:
         raise InvalidInputError(f"summary: expected what JSON can hold: {error}") from error
+    plain = (c if c == "\n" or printable(c) == c else json.dumps(c)[1:-1] for c in text)
+    return f"{text if text.isascii() else ''.join(plain)}\n"
 
 
 def copies_among(outcomes: Sequence[SweepOutcome]) -> dict[str, str]:

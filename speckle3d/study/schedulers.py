@@ -33,6 +33,13 @@ CONNECT_S = 20
 DESERTED_S = 60
 """How long a cluster may be without any worker; a killed one is started again within seconds."""
 
+_PAGES = (
+    "distributed.scheduler.http.routes",
+    "distributed.worker.http.routes",
+    "distributed.nanny.http.routes",
+)
+"""Dask's settings of what its processes show on the network."""
+
 _DESERTED = "the cluster has had no worker for a minute"
 _KILLED = "every worker that tried it died: killed, crashed or out of memory"
 
@@ -172,14 +179,23 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Any]:
-    """Client of a cluster of single-threaded worker processes on this machine; both end with the block."""
+    """Client of a cluster of single-threaded worker processes on this machine; both end with the block.
+
+    Who can talk to a scheduler can run code as its user, and its port is open to every user of the machine.
+    So all talk is encrypted, with a key that is made for this cluster, is never on disk, and without which a
+    connection is refused; and none of Dask's pages are served.
+    """
     # A worker has one thread: more threads in the kernels would only compete with the other workers.
     env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    with _without_interrupts():
+    security = _fresh_key()
+    silent = importlib.import_module("dask").config.set({key: [] for key in _PAGES})
+    with _without_interrupts(), silent:
         cluster = _dask().LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
+            protocol="tls://",
+            security=security,
             dashboard_address=None,
             # Without a dashboard it still opens its port, the same for every cluster; 0 is a free one.
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
@@ -189,6 +205,17 @@ def local_cluster(workers: int) -> Iterator[Any]:
         )
     with cluster, _dask().Client(cluster) as client:
         yield client
+
+
+def _fresh_key() -> Any:
+    """Key and certificate that only this process and those it starts know."""
+    try:
+        return _dask().Security.temporary()
+    except ImportError as error:
+        raise InvalidInputError(
+            "--workers needs cryptography, which keeps other users of this machine out: "
+            "pip install 'speckle3d[cluster]', got none installed"
+        ) from error
 
 
 @contextmanager

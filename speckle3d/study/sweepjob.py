@@ -23,7 +23,7 @@ from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
-from speckle3d.io.hdf5 import one_line, sha256_of
+from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
 from speckle3d.io.load import companion_files, load_landmarks, load_sweep, sniff
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.blocks import Block, blocks_of
@@ -32,7 +32,7 @@ from speckle3d.scoring.displacements import drift_rows
 from speckle3d.scoring.references import find_reference
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip
-from speckle3d.study.job import available_modes, require_possible, run_job
+from speckle3d.study.job import available_modes, require_possible, write_results
 from speckle3d.study.results import SweepOutcome, json_text
 
 DONE = "job.json"
@@ -197,7 +197,10 @@ def _reconstruct(job: SweepJob, part: Path, files: BlockFiles) -> None:
     settings, sweep = config_from_toml(job.settings_toml), load_sweep(job.path)
     mounted, _ = apply_calibrations(sweep, job.calibrations)
     curves, modes = read_curves(job.curves), _modes(job, mounted, settings)
-    run_job(sweep, job.path, curves, part, modes, job.reference, settings, None, job.calibrations, files)
+    make_folder(part)
+    write_results(
+        sweep, job.path, curves, part, modes, job.reference, settings, None, job.calibrations, files
+    )
     reference = find_reference(mounted, job.reference)
     rows = []
     if reference is not None:

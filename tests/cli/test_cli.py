@@ -1,17 +1,14 @@
 """The command line from end to end, on a sweep of 24 small frames."""
 
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
-import time
 
 import h5py
 import numpy as np
 import pytest
-from commands import SMALL, command
+from commands import SMALL
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
@@ -280,40 +277,3 @@ def test_a_volume_of_a_sweep_that_is_gone_or_another(refused, reconstructed, ben
     assert "got 'crossed'" in refused("volume", path, "-o", out, "--mode", "crossed")
     both = ("--lateral-mm", "2", "--depth-mm", "3")
     assert "--depth-mm" in refused("reslice", path, "-o", tmp_path / "r.png", *both)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
-def test_ctrl_c_leaves_nothing_half_done_and_the_next_run_works(bench, tmp_path):
-    arguments = command("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o")
-    first = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    # Its temporary sibling tells that the reconstruction has begun; it has most of a second to go.
-    _wait_for(lambda: list((tmp_path / "o").glob(".part-*")), first)
-    first.send_signal(signal.SIGINT)
-    _, err = first.communicate(timeout=60)
-    assert first.returncode == 130, err
-    assert err.splitlines()[-1] == "speckle3d: stopped"
-    assert "Traceback" not in err
-    assert list((tmp_path / "o").iterdir()) == []
-    again = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
-    assert again.returncode == 0, again.stderr
-    assert {path.name for path in (tmp_path / "o").iterdir()} == RESULTS
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
-def test_ctrl_c_while_simulating(tmp_path):
-    arguments = command("simulate", tmp_path / "s.h5", *SMALL, "--frames", "200")
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    _wait_for(lambda: list(tmp_path.glob(".part-*")), process)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
-    assert list(tmp_path.iterdir()) == []
-
-
-def _wait_for(condition, process, seconds=60.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, "ended before it could be stopped"
-        assert time.monotonic() < deadline
-        time.sleep(0.005)

@@ -107,3 +107,23 @@ def test_a_reference_volume_of_plus_is_read(realdata):
     assert volume.shape == (147, 106, 105)
     assert volume.spacing_mm == (0.5, 0.5, 0.5)
     np.testing.assert_allclose(volume.world_from_grid.translation, [-74.5217, 165.573, 29.072])
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii.gz", ".mhd", ".nhdr"])
+@pytest.mark.parametrize("dtype", ["u1", "i2", "f4", "f8", "u2"])
+@pytest.mark.parametrize("compress", [False, True])
+def test_volumes_of_others_are_what_the_image_library_finds(tmp_path, suffix, dtype, compress):
+    rng = np.random.default_rng(3)
+    image = SimpleITK.GetImageFromArray(rng.integers(0, 200, (3, 4, 5)).astype(dtype))
+    image.SetSpacing((0.5, 0.25, 1.1))
+    image.SetOrigin((1.0, -2.0, 3.0))
+    image.SetDirection(Rotation.random(rng=rng).as_matrix().ravel().tolist())
+    SimpleITK.WriteImage(image, str(tmp_path / f"v{suffix}"), useCompression=compress)
+    got, found = read_volume(tmp_path / f"v{suffix}"), SimpleITK.ReadImage(str(tmp_path / f"v{suffix}"))
+    np.testing.assert_array_equal(got.voxels, SimpleITK.GetArrayFromImage(found).T)
+    # NIfTI keeps its matrix in single precision.
+    np.testing.assert_allclose(got.spacing_mm, found.GetSpacing(), rtol=1e-6)
+    np.testing.assert_allclose(got.world_from_grid.translation, found.GetOrigin(), atol=1e-5)
+    np.testing.assert_allclose(
+        got.world_from_grid.rotation.as_matrix().ravel(), found.GetDirection(), atol=1e-6
+    )

@@ -153,7 +153,7 @@ def test_a_bug_in_one_sweep_is_its_reason_without_temporary_names_and_leaves_not
     def full(path, *arguments):
         raise ZeroDivisionError(f"in the middle of {arguments[2] / '.part-0123abcd-reconstruction.h5'}")
 
-    monkeypatch.setattr("speckle3d.study.sweepjob.run_job", full)
+    monkeypatch.setattr("speckle3d.study.sweepjob.write_results", full)
     # Words are set one space apart; a path with two must not hide its temporary name.
     found = compare_sweeps(sweeps[:1], tmp_path / "two  spaces")
     assert re.match("ZeroDivisionError: in the middle.*reconstruction.h5", found.outcomes[0].reason)

@@ -66,3 +66,14 @@ def test_a_run_may_hold_its_folder_already(tmp_path):
         pass
     with only_run(tmp_path):
         pass
+
+
+def test_a_folder_made_for_nothing_is_removed_and_one_that_was_there_stays(tmp_path):
+    for folder in (tmp_path / "above" / "new", tmp_path / "there"):
+        (tmp_path / "there").mkdir(exist_ok=True)
+        with pytest.raises(KeyboardInterrupt), only_run(folder):
+            raise KeyboardInterrupt
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    with only_run(tmp_path / "above"):
+        (tmp_path / "above" / "study.json").touch()
+    assert (tmp_path / "above" / "study.json").exists()

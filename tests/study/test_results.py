@@ -2,6 +2,7 @@ import csv
 import io
 import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,3 +131,25 @@ def test_a_directory_that_cannot_be_made_is_one_error(tmp_path):
 def test_what_json_cannot_hold_is_named():
     with pytest.raises(InvalidInputError, match="'object'"):
         json_text({"a": [object()]})
+
+
+def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):
+    failed = [SweepOutcome("a", tmp_path / "a.h5", "failed", "first")]
+    write_study(tmp_path, failed, "first")
+    (tmp_path / "figures").mkdir()
+    made = [tmp_path / "report.html", tmp_path / "figures" / "overview.png", tmp_path / "paper.txt"]
+    for path in made:
+        path.write_text("of the first")
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full_disk)
+        with pytest.raises(FileError, match=r"study\.json: .*No space"):
+            write_study(tmp_path, failed, "second")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == kept
+    write_study(tmp_path, failed, "second")
+    assert not any(path.exists() for path in made)
+    assert json.loads((tmp_path / "study.json").read_text())["settings_toml"] == "second"
+
+
+def full_disk(*_, **__):
+    raise OSError(28, "No space left on device")

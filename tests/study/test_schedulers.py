@@ -1,8 +1,11 @@
 import os
 import signal
 import time
+import urllib.request
 
 import dask
+import distributed
+import psutil
 import pytest
 from cluster_jobs import double, lost, noted, suicide
 
@@ -121,9 +124,48 @@ def test_an_address_without_a_scheduler_is_one_line(monkeypatch):
 
 
 def test_an_existing_cluster_is_used_and_left_running(client):
-    with scheduler_for(client.scheduler.address, None) as there:
-        assert dict(there.run(double, [4], lost)) == {0: 8}
+    held = client.security
+    key = {
+        "client.cert": held.tls_client_cert,
+        "client.key": held.tls_client_key,
+        "ca-file": held.tls_ca_file,
+    }
+    with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in key.items()}):  # noqa: SIM117
+        with scheduler_for(client.scheduler.address, None) as there:
+            assert dict(there.run(double, [4], lost)) == {0: 8}
     assert client.submit(double, 5).result(timeout=60) == 10
+
+
+@pytest.mark.parametrize(("scheme", "other_key"), [("tcp", False), ("tls", False), ("tls", True)])
+def test_without_the_key_nobody_gets_in(client, scheme, other_key):
+    address = client.scheduler.address.replace("tls", scheme)
+    key = distributed.Security.temporary() if other_key else None
+    began = time.monotonic()
+    with pytest.raises((OSError, TypeError)):
+        distributed.Client(address, security=key, timeout=5).close()
+    assert time.monotonic() - began < 5
+
+
+def test_no_port_of_a_study_answers_in_plain_text_or_serves_a_page(client):
+    processes = [os.getpid(), *client.run(os.getpid).values()]
+    addresses = [
+        client.scheduler.address,
+        *client.nthreads(),
+        *client.run(lambda dask_worker: dask_worker.nanny),
+    ]
+    assert all(address.startswith("tls://127.0.0.1:") for address in addresses)
+    open_ports = {
+        each.laddr
+        for number in processes
+        for each in psutil.Process(number).net_connections()
+        if each.status == psutil.CONN_LISTEN
+    }
+    assert {each.ip for each in open_ports} == {"127.0.0.1"}
+    assert len(open_ports) >= 3
+    for _, port in open_ports:
+        for page in ("info/main/workers.html", "json/counts.json", "metrics", "status"):
+            with pytest.raises(OSError, match=r"404|reset|closed|Remote"):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=5).close()
 
 
 @pytest.mark.parametrize(("address", "workers"), [("tcp://a:1", 2), (None, 0)])

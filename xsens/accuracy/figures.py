@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.printable import printable
 from xsens.accuracy.angles import ANGLES, PairErrors
 
 OFF_AXIS_RAD = np.deg2rad(0.5)
@@ -95,7 +96,7 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
         _draw(row[0], max(turns[angle], key=lambda turn: float(turn.drift_rad.max())), worst=True)
         _draw(row[1], min(turns[angle], key=lambda turn: float(turn.drift_rad.min())), worst=False)
     panels[0, 0].legend(frameon=False, fontsize="small")
-    figure.suptitle(title)
+    figure.suptitle(printable(title), parse_math=False)
     return figure
 
 
@@ -129,7 +130,9 @@ def _draw(axes: Axes, turn: Turn, worst: bool) -> None:
     axes.plot(at, measured, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
     which = "worst" if worst else "best"
     axes.set_title(
-        f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}", fontsize="medium"
+        f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}",
+        fontsize="medium",
+        parse_math=False,
     )
     axes.set_xlabel("orientation in the turn")
     axes.set_ylabel(f"{turn.angle} / degrees")

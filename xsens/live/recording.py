@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.parts import cannot_write
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor
 from xsens.messages.control import MessageId, utc_message
@@ -51,7 +52,7 @@ class RawFile:
         except FileExistsError as error:
             raise FileError(f"{path}: there already; expected a new file, or to be told to append") from error
         except OSError as error:
-            raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+            raise cannot_write(path, error) from error
 
     def append(self, data: bytes) -> None:
         """Append bytes; the operating system has all of them when this returns."""
@@ -60,7 +61,7 @@ class RawFile:
             while left:
                 left = left[os.write(self._file, left) :]
         except OSError as error:
-            raise FileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            raise cannot_write(self.path, error) from error
         self.written += len(data)
 
     def sync(self) -> None:

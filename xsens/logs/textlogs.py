@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
 from xsens.logs.clocks import Stamps, timeline_of_times
 from xsens.logs.parts import Hints, Parts, are_rotations, assembled, from_angles, on_clock, orientations_of
 from xsens.logs.samples import VECTORS, Gap, ImuLog
@@ -313,11 +313,13 @@ def _comments(log: ImuLog) -> Iterator[str]:
 
 def _write_whole(path: Path, text: str) -> None:
     """Write beside the file, then rename, so that it appears whole or not at all."""
-    part = path.with_name(f".part-{secrets.token_hex(4)}-{path.name}")
+    part = part_beside(path)
     try:
-        part.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(part, path)
+        clear_parts(path)
+        with marked(part):
+            part.write_text(text, encoding="utf-8", newline="\n")
+            os.replace(part, path)
     except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise cannot_write(path, error) from error
     finally:
         part.unlink(missing_ok=True)

@@ -1,0 +1,44 @@
+"""Files given by name: opened only if they are files, so that nothing waits for a pipe or reads a device."""
+
+from __future__ import annotations
+
+import os
+import stat
+from io import BufferedReader
+from typing import TypeAlias
+
+from speckle3d.core.errors import FileError
+
+PathLike: TypeAlias = str | os.PathLike[str]
+
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+"""A pipe is opened without waiting for its writer; where there is no such flag, there are no such pipes."""
+
+_SMALL_BYTES = 2**26
+"""An hour of a sensor at 1 kHz, or a frame of 8,000 x 4,000 samples; every machine has room for so much."""
+
+
+def open_regular(path: PathLike) -> BufferedReader:
+    """Open an ordinary file for reading bytes; a link is followed.
+
+    Raises
+    ------
+    FileError
+        If there is none, it cannot be read, or it is a folder, a pipe, a socket or a device.
+    """
+    try:
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT))  # noqa: SIM115
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise FileError(f"{path}: expected a file, got a folder, pipe or device")
+    return file
+
+
+def plausible_bytes(stored_bytes: int, ratio: int) -> int:
+    """Bytes that so many on disk may become in memory: little, or `ratio` times as many.
+
+    A compressed stream can claim a thousand times its size.
+    """
+    return max(_SMALL_BYTES, ratio * stored_bytes)

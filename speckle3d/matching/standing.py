@@ -1,0 +1,52 @@
+"""Echoes that stay where they are in the image while the probe moves: reverberation, side lobes, electronics.
+
+Speckle of places a beam's width and more apart has nothing in common, so that the product of two such frames'
+echoes, sample by sample and without looking for in-plane motion, averages to zero. What is added to every
+frame alike does not: the product's mean is its share of the power. The tissue's own structure moves in the
+image as the hand wanders, and a quarter of a wavelength in depth turns its phase round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.sweep import Sweep
+from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
+from speckle3d.matching.patches import PatchGrid
+
+
+def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -> FloatArray:
+    """Share of each patch's power that is the same in all of `frames`: median over their pairs.
+
+    Parameters
+    ----------
+    frames : sequence of int
+        At least two, far apart, read anew and all held at once. The median lets some of them see what
+        others do, as on the way back.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+        Of power, or with images of intensity of its variation; of either sign and about zero where nothing
+        stays. NaN where there is no echo.
+    """
+    echoes = [
+        _normalised(matcher.prepare(matcher.echo(sweep.frames[frame])), matcher.patches) for frame in frames
+    ]
+    shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(echoes, 2)]
+    return np.asarray(np.median(shared, axis=0), dtype=float)
+
+
+def _normalised(frame: ReadyFrame, patches: PatchGrid) -> Float32Array:
+    """Samples of every patch, of unit energy in all, shape (p, k); NaN where there is no echo."""
+    parts = frame.image[None] if frame.echo is None else frame.echo
+    wide, high = patches.size
+    tiles = np.stack([parts[:, v : v + wide, s : s + high].ravel() for v, s in patches.first])
+    if frame.echo is None:
+        tiles -= tiles.mean(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(tiles / np.linalg.norm(tiles, axis=1, keepdims=True), dtype=np.float32)

@@ -1,0 +1,87 @@
+"""Names from outside reach terminal, folders and pictures as text: no escape sequence, line or markup."""
+
+import io
+import json
+import os
+import shutil
+import sys
+from dataclasses import replace
+
+import h5py
+import pytest
+from calibration_files import made
+
+from speckle3d.cli import common
+from speckle3d.io.calibrations import write_calibration
+from speckle3d.study.folder import named
+
+HOSTILE = "a\x1b]0;gone\x07\x1b[31m\n\u202e[red]{0}$x^$<script>"
+SHOWN = "a\\x1b]0;gone\\x07\\x1b[31m\\n\\u202e[red]{0}$x^$<script>"
+
+
+def is_plain(text):
+    return all(line.isprintable() for line in text.split("\n"))
+
+
+def test_an_error_shows_a_name_escaped_in_one_line(run, tmp_path):
+    code, out, err = run("info", tmp_path / HOSTILE)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert SHOWN in err
+    assert is_plain(err)
+
+
+def test_what_a_file_says_of_itself_is_shown_escaped_and_json_stays_json(run, tmp_path):
+    path = tmp_path / "c.h5"
+    write_calibration(path, replace(made(), verdict=HOSTILE))
+    with h5py.File(path, "r+") as file:
+        file["frames/reason"][0] = HOSTILE
+    code, out, _ = run("info", path)
+    assert code == 0
+    assert SHOWN in out
+    assert is_plain(out)
+    code, out, _ = run("info", path, "--json")
+    assert HOSTILE in {row["value"] for row in json.loads(out)}
+    assert is_plain(out)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_sweep_of_any_name_is_reconstructed(run, tmp_path, small_sweeps):
+    # A name that is no Unicode, too.
+    name = os.fsdecode(os.fsencode(HOSTILE.replace("/", "")) + b"\xff")
+    shutil.copy(small_sweeps / "s5.h5", tmp_path / f"{name}.h5")
+    code, out, err = run(
+        "reconstruct", tmp_path / f"{name}.h5", "-o", tmp_path / "out", "--curves", small_sweeps / "curves.h5"
+    )
+    assert code == 0, err
+    assert is_plain(out)
+    assert is_plain(err)
+    assert is_plain((tmp_path / "out" / "table.txt").read_text(encoding="utf-8"))
+    json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+
+
+def test_a_bar_names_a_file_without_markup_or_template():
+    from rich.console import Console
+
+    with common.bar_on_stderr(f"reconstructing {HOSTILE}") as bar:
+        bar.add_task("", total=1)
+        out = io.StringIO()
+        Console(file=out, width=200, color_system=None).print(bar.get_renderable())
+    assert f"reconstructing {SHOWN}" in out.getvalue()
+
+
+def test_a_terminal_of_another_alphabet_shows_what_it_can(monkeypatch):
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    common.emit("3 µm \x1b[31m")
+    out.flush()
+    assert out.buffer.getvalue() == b"3 \\xb5m \\x1b[31m\n"
+
+
+def test_a_studys_folders_have_names_that_drive_nothing(tmp_path):
+    names = [
+        name for name, _ in named([tmp_path / f"{HOSTILE}.h5", tmp_path / "a%x1b.h5", tmp_path / "a\x1b.h5"])
+    ]
+    assert len(set(names)) == 3
+    assert all(name.isprintable() for name in names)
+    assert names[0] == SHOWN.replace("\\", "%")

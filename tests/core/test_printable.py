@@ -1,0 +1,45 @@
+"""Text from outside reaches a terminal, an error and a table escaped."""
+
+import pickle
+
+import pytest
+
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.printable import printable
+from speckle3d.core.tables import text_table
+from speckle3d.io.metaimage import MissingSettingError
+
+HOSTILE = "a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
+SHOWN = r"a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
+
+
+def test_what_drives_a_terminal_is_escaped_once():
+    assert printable(HOSTILE) == SHOWN
+    assert printable(SHOWN) == SHOWN
+    assert printable("a\nb\x1b", kept="\n") == "a\nb\\x1b"
+
+
+@pytest.mark.parametrize("text", ["Größe 3 µm, 1 %", "名前 𝛼", "[red] {0} $x$ <b>", "a\u00a0b\u3000c"])
+def test_what_people_write_stays(text):
+    assert printable(text) == text
+
+
+@pytest.mark.parametrize("kind", [InvalidInputError, FileError, MissingSettingError])
+def test_an_error_is_one_line_whatever_it_quotes(kind):
+    error = kind(f"{HOSTILE}: expected a")
+    assert str(error) == f"{SHOWN}: expected a"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    with pytest.raises(kind) as caught, naming(HOSTILE):
+        raise kind(f"{HOSTILE}: expected a")
+    assert str(caught.value) == str(error)
+
+
+def test_an_error_is_no_longer_than_a_screen():
+    words = str(InvalidInputError(f"file: {'9' * 5000}, got none"))
+    assert len(words) < 1200
+    assert words.startswith("file: 9")
+    assert words.endswith(", got none")
+
+
+def test_a_cell_is_one_line_of_a_table():
+    assert text_table([("name", "mm"), (HOSTILE, "1")]).splitlines()[2].split() == [SHOWN, "1"]

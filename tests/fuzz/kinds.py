@@ -1,0 +1,293 @@
+"""What is fuzzed: for every kind of file, whole examples of it, how they are damaged, and who reads them."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import calibration_files
+import challenge_examples
+import image_examples
+import imu_logs
+import numpy as np
+import speckle
+import sweep_examples
+from fuzz import mutations
+
+from speckle3d.core.curves import TiltResponse
+from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
+from speckle3d.core.volume import Volume
+from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.curves import write_curves
+from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.tum import write_tum
+from speckle3d.io.volumes import write_volume
+
+XML = """<PlusConfiguration version="2.1"><CoordinateDefinitions>
+<Transform From="Phantom" To="Reference" Matrix="0 -1 0 10  1 0 0 20  0 0 1 30  0 0 0 1" />
+</CoordinateDefinitions><Segmentation ApproximateSpacingMmPerPixel="0.078"
+ ClipRectangleOrigin="27 28" ClipRectangleSize="766 562" />
+<PhantomDefinition><Geometry><Pattern Type="NWire">
+ <Wire Name="a" EndPointFront="30 0 20" EndPointBack="30 40 20" />
+ <Wire Name="b" EndPointFront="55 0 20" EndPointBack="35 40 20" />
+ <Wire EndPointFront="60 0 20" EndPointBack="60 40 20" />
+</Pattern></Geometry></PhantomDefinition></PlusConfiguration>
+"""
+POINTS = "# by hand\nframe,column_px,row_px,wire\n0,605.7,191.9,G1\n0,436.2,181.1,1\n3,5,6.5,0\n"
+LOGS = (
+    "time_s,counter,acc_x,acc_y,acc_z\n0,1,0,0,9.8\n0.1,2,0,0,9.8\n0.2,3,0,0.1,9.8\n",
+    "PacketCounter\tAcc_X\tAcc_Y\tAcc_Z\tMat[1][1]\n00472\t\t0.1\t4.8\t-8.5\n00473\t1\t2\t3\t4\n",
+    "sep=,\nDeviceTag:,x\nOutputRate:,60Hz\nPacketCounter,SampleTimeFine,Quat_W,Quat_X,Quat_Y,Quat_Z\n1,5,1,0,0,0\n",
+)
+
+
+@dataclass
+class Kind:
+    """Files of one kind.
+
+    Attributes
+    ----------
+    write : callable
+        Writes whole examples into a folder; returns their paths.
+    read : callable
+        Reads one with everything in it.
+    damage : callable
+        Changes the file at a path.
+    seconds, beside_bytes : float, int
+        Most that one case may take, and its memory beside twice the file.
+    """
+
+    write: Any
+    read: Any
+    damage: Any
+    seconds: float = 10.0
+    beside_bytes: int = 160 * 2**20
+
+
+def bytes_of(change):
+    return lambda rng, path: path.write_bytes(change(rng, path.read_bytes()))
+
+
+def sweeps(folder):
+    paths = [folder / f"{i}.h5" for i in range(4)]
+    write_sweep(paths[0], sweep_examples.rf_sweep())
+    write_sweep(paths[1], sweep_examples.rf_sweep(dtype=np.float32), compression="lzf")
+    write_sweep(paths[2], sweep_examples.bmode_sweep(), compression=None)
+    write_sweep(paths[3], replace(sweep_examples.rf_sweep(), tracker=None, truth=None))
+    return paths
+
+
+def curves(folder):
+    tilt = TiltResponse(np.array([-7.5, 11.0]), np.array([1.5, 7.25]))
+    write_curves(folder / "c.h5", replace(speckle.curves(sigma_mm=[0.3, 0.6]), tilt=tilt))
+    return [folder / "c.h5"]
+
+
+def calibrations(folder):
+    for sensor in ("tracker", "orientation"):
+        write_calibration(folder / f"{sensor}.h5", calibration_files.made(sensor))
+    return [folder / "tracker.h5", folder / "orientation.h5"]
+
+
+def reconstructions(folder, n=8, patches=6):
+    rng = np.random.default_rng(0)
+    pairs = FramePairs(
+        first=np.arange(n - 1),
+        second=np.arange(1, n),
+        first_from_second=sweep_examples.poses(n - 1).as_matrix(),
+        covariance=np.tile(np.eye(6), (n - 1, 1, 1)),
+        distance_mm=rng.random((n - 1, patches)).astype(np.float32),
+        sigma_mm=rng.random((n - 1, patches)).astype(np.float32),
+        used=rng.random((n - 1, patches)) > 0.5,
+        patch_centre_mm=np.arange(2.0 * patches).reshape(patches, 2),
+    )
+    poses = {"image": sweep_examples.poses(n), "pose": sweep_examples.poses(n, 1)}
+    trust = Trust(np.tile(np.eye(6), (n, 1, 1)), np.zeros(n, dtype=np.int64))
+    with ReconstructionWriter(folder / "r.h5", 0.04 * np.arange(n), sweep_examples.rf_sweep().grid) as writer:
+        writer.append_pairs(pairs)
+        writer.finish(poses, Provenance("sweep.h5", "ab" * 32, "0.1.0"), "[matching]\n", trust)
+    return [folder / "r.h5"]
+
+
+def scans(folder):
+    return [challenge_examples.write_data_set(folder, split=False)[0]]
+
+
+def trajectories(folder):
+    write_tum(folder / "t.txt", np.arange(20) / 10, sweep_examples.poses(20))
+    return [folder / "t.txt"]
+
+
+def configurations(folder):
+    from speckle3d.config import Config
+
+    (folder / "c.toml").write_text(Config().to_toml(), encoding="utf-8")
+    return [folder / "c.toml"]
+
+
+def texts(suffix, *contents):
+    def write(folder):
+        paths = [folder / f"{i}{suffix}" for i in range(len(contents))]
+        for path, content in zip(paths, contents, strict=True):
+            path.write_text(content, encoding="utf-8")
+        return paths
+
+    return write
+
+
+def metaimages(folder):
+    _, _, frames = image_examples.tracked(3)
+    plain = image_examples.write_mha(folder / "a.mha", image_examples.grey(), frames=frames)
+    content = plain.read_bytes().replace(b"ElementDataFile = LOCAL", b"ElementDataFile = b.raw")
+    head, _, pixels = content.partition(b"b.raw\n")
+    (folder / "b.mhd").write_bytes(head + b"b.raw\n")
+    (folder / "b.raw").write_bytes(pixels)
+    import zlib
+
+    head, _, pixels = plain.read_bytes().partition(b"LOCAL\n")
+    packed = zlib.compress(pixels)
+    head = head.replace(
+        b"CompressedData = False", f"CompressedData = True\nCompressedDataSize = {len(packed)}".encode()
+    )
+    (folder / "c.mha").write_bytes(head + b"LOCAL\n" + packed)
+    return [plain, folder / "b.mhd", folder / "c.mha"]
+
+
+def nrrds(folder):
+    import gzip
+
+    fields = "\n".join(
+        f"Seq_Frame{i:04d}_{name}:={value}"
+        for i, frame in enumerate(image_examples.tracked(3)[2])
+        for name, value in frame.items()
+    )
+    paths = []
+    for encoding, packed in (("raw", bytes), ("gzip", gzip.compress)):
+        head = (
+            f"NRRD0004\ndimension: 3\nencoding: {encoding}\nendian: little\nkinds: domain domain list\n"
+            f"sizes: 5 4 3\nspace directions: (1,0) (0,1) none\ntype: uint8\n{fields}\n\n"
+        )
+        paths.append(folder / f"{encoding}.nrrd")
+        paths[-1].write_bytes(head.encode() + packed(image_examples.grey().tobytes()))
+    return paths
+
+
+def volumes(folder):
+    voxels = np.random.default_rng(0).integers(0, 256, (4, 5, 6)).astype(np.uint8)
+    volume = Volume(voxels, (0.5, 0.25, 1.0), sweep_examples.poses(1)[0])
+    paths = [folder / name for name in ("v.nrrd", "v.mha", "v.nii.gz", "u.nrrd", "u.mha")]
+    for path in paths:
+        write_volume(path, volume, compress=path.name.startswith("v"))
+    return paths
+
+
+def streams(folder):
+    s = imu_logs.samples(4)
+    unit = imu_logs.calibration()
+    (folder / "a.bin").write_bytes(imu_logs.mt9_bin(s, unit))
+    for form in range(3):
+        (folder / f"{form}.bin").write_bytes(b"".join(imu_logs.mtdata2_messages(s, form=form)))
+    layout = imu_logs.DataLayout(imu_logs.OutputMode.CALIBRATED | imu_logs.OutputMode.ORIENTATION, 0)
+    legacy = imu_logs.configured(layout) + b"".join(imu_logs.legacy_messages(s, layout))
+    (folder / "l.bin").write_bytes(legacy)
+    return sorted(folder.glob("*.bin"))
+
+
+def small_sweep(folder):
+    """A sweep of 12 frames with both sensors, and the curves for it."""
+    import shutil
+
+    from speckle3d.simulation.presets import SimulationSettings, simulate
+
+    settings = SimulationSettings(preset="tissue", vectors=26, samples=1000, seed=5, length_mm=1.5, frames=12)
+    write_sweep(folder / "s.h5", simulate(settings)[0].sweep)
+    shutil.copy(Path(__file__).resolve().parents[2] / "data" / "curves.h5", folder / "curves.h5")
+    return [folder / "s.h5", folder / "curves.h5"]
+
+
+def read_sweep(path):
+    from speckle3d.io.describe import describe
+    from speckle3d.io.load import load_sweep
+
+    sweep = load_sweep(path)
+    for i in range(min(len(sweep), 50)):
+        sweep.frames[i]
+    getattr(sweep.frames, "close", lambda: None)()
+    describe(path)
+
+
+def read_described(reader):
+    def read(path):
+        from speckle3d.io.describe import describe
+
+        reader(path)
+        describe(path)
+
+    return read
+
+
+def read_image(path):
+    from speckle3d.io.metaimage import ImportSettings, read_metaimage, read_poses
+
+    settings = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
+    read_metaimage(path, settings)
+    read_poses(path)
+
+
+def read_stream(path):
+    from xsens.logs.read import parse_stream
+
+    parse_stream(path.read_bytes())
+
+
+def run_track(path):
+    """Track a sweep and correct it by each of its sensors; the other file of the two is whole."""
+    from speckle3d.core.errors import Speckle3DError
+    from speckle3d.io.curves import read_curves
+    from speckle3d.io.load import load_sweep
+    from speckle3d.pipeline import correct, track
+
+    beside = path.with_name("curves.h5" if path.name == "s.h5" else "s.h5")
+    sweep_path, curves_path = (path, beside) if path.name == "s.h5" else (beside, path)
+    sweep = load_sweep(sweep_path)
+    try:
+        tracked = track(sweep, read_curves(curves_path))
+        for mode in ("orientation", "pose"):
+            try:
+                correct(tracked, sweep, [mode])
+            except Speckle3DError:
+                continue
+    finally:
+        sweep.frames.close()
+
+
+def kinds():
+    from speckle3d.config import load_config
+    from speckle3d.io.calibrations import read_calibration
+    from speckle3d.io.curves import read_curves
+    from speckle3d.io.plus_config import read_wire_phantom
+    from speckle3d.io.points import read_points
+    from speckle3d.io.reconstructions import read_reconstruction
+    from speckle3d.io.tum import read_tum
+    from speckle3d.io.volumes import read_volume
+    from xsens.logs.parts import Hints
+    from xsens.logs.read import read_log
+
+    hdf5, text, raw = mutations.of_hdf5, bytes_of(mutations.of_text), bytes_of(mutations.of_bytes)
+    return {
+        "sweep": Kind(sweeps, read_sweep, hdf5),
+        "curves": Kind(curves, read_described(read_curves), hdf5),
+        "calibration": Kind(calibrations, read_described(read_calibration), hdf5),
+        "reconstruction": Kind(reconstructions, read_described(read_reconstruction), hdf5),
+        "scan": Kind(scans, read_sweep, hdf5),
+        "tum": Kind(trajectories, read_tum, text),
+        "toml": Kind(configurations, load_config, text),
+        "xml": Kind(texts(".xml", XML), read_wire_phantom, text),
+        "points": Kind(texts(".csv", POINTS), lambda path: read_points(path, ("G1", "G2")), text),
+        "log": Kind(texts(".txt", *LOGS), lambda path: read_log(path, Hints(rate_hz=100.0)), text),
+        "metaimage": Kind(metaimages, read_image, text),
+        "nrrd": Kind(nrrds, read_image, text),
+        "volume": Kind(volumes, read_volume, text),
+        "stream": Kind(streams, read_stream, raw, seconds=5.0),
+        "track": Kind(small_sweep, run_track, hdf5, seconds=60.0, beside_bytes=512 * 2**20),
+    }

@@ -1,0 +1,204 @@
+"""Files of one result: never mixed, whenever the process is killed, and one run at a time."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.fileset import FileSet
+
+FILES = FileSet("main.h5", ("a.txt", "b.txt"), ("made/page.html",))
+
+
+def write(folder, content, error=None):
+    with FILES.replaced(folder) as part:
+        for name in FILES.names:
+            (part / name).write_text(content)
+        if error is not None:
+            raise error
+
+
+def held(folder):
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+WHOLE = {content: dict.fromkeys(FILES.names, content) for content in ("old", "new")}
+
+
+def test_a_new_folder_appears_whole(tmp_path):
+    folder = tmp_path / "above" / "results"
+    with FILES.replaced(folder) as part:
+        for name in FILES.names:
+            (part / name).write_text("new")
+        assert not folder.exists()
+    assert held(tmp_path / "above") == {f"results/{name}": "new" for name in FILES.names}
+
+
+def test_a_set_takes_the_place_of_the_old_one_and_other_files_stay(tmp_path):
+    write(tmp_path, "old")
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "page.html").write_text("of the old ones")
+    before = tmp_path.stat().st_ino
+    with FILES.replaced(tmp_path) as part:
+        for name in FILES.names:
+            (part / name).write_text("new")
+        assert held(tmp_path).items() >= WHOLE["old"].items()
+    assert held(tmp_path) == WHOLE["new"] | {"mine.txt": "mine"}
+    assert tmp_path.stat().st_ino == before
+
+
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), ValueError("no"), OSError(28, "No space left on device")]
+)
+def test_a_failure_leaves_everything_as_it_was(tmp_path, error):
+    kind = FileError if isinstance(error, OSError) else type(error)
+    with pytest.raises(kind):
+        write(tmp_path / "above" / "new", "new", error)
+    assert list(tmp_path.iterdir()) == []
+    write(tmp_path, "old")
+    with pytest.raises(kind):
+        write(tmp_path, "new", error)
+    assert held(tmp_path) == WHOLE["old"]
+
+
+def test_an_error_names_the_place_and_not_the_temporary_one(tmp_path):
+    for folder in (tmp_path / "new", tmp_path):
+        with pytest.raises(InvalidInputError) as caught, FILES.replaced(folder) as part:
+            raise InvalidInputError(f"{part / 'a.txt'}: wrong")
+        assert str(caught.value) == f"{folder / 'a.txt'}: wrong"
+
+
+def test_a_link_is_written_through(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "store").write_text("old")
+    (tmp_path / "out" / "main.h5").symlink_to(tmp_path / "store")
+    write(tmp_path / "out", "new")
+    assert (tmp_path / "out" / "main.h5").is_symlink()
+    assert (tmp_path / "store").read_text() == "new"
+
+
+def test_a_folder_in_the_way_is_refused_before_the_work(tmp_path):
+    (tmp_path / "b.txt").mkdir()
+    with pytest.raises(FileError, match=r"b\.txt.*folder"):
+        write(tmp_path, "new")
+    assert list(tmp_path.iterdir()) == [tmp_path / "b.txt"]
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from speckle3d.io.fileset import FileSet
+with FileSet("main.h5", ("a.txt", "b.txt")).replaced(Path(sys.argv[1])) as part:
+    (part / "a.txt").write_text("half")
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_second_run_is_refused_until_the_first_is_gone_however_it_went(tmp_path, there):
+    folder = tmp_path / "out"
+    if there:
+        write(folder, "old")
+    command = [sys.executable, "-c", HOLDER, str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(FileError, match="no other run"):
+            write(folder, "new")
+        holder.kill()
+    assert (held(folder) if there else {}).items() >= (WHOLE["old"] if there else {}).items()
+    write(folder, "new")
+    assert held(tmp_path) == {f"out/{name}": "new" for name in FILES.names}
+
+
+KILLED = """
+import json, os, signal, sys
+from pathlib import Path
+from speckle3d.io.fileset import FileSet
+
+files = FileSet("main.h5", ("a.txt", "b.txt"), ("made/page.html",))
+EVENTS = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "shutil.rmtree", "open"}
+
+def write(folder, content):
+    with files.replaced(folder) as part:
+        for name in files.names:
+            (part / name).write_text(content)
+
+def held(folder):
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+def killed_at(number, folder):
+    child = os.fork()
+    if child == 0:
+        seen = 0
+        def count(event, _):
+            nonlocal seen
+            if event in EVENTS:
+                seen += 1
+                if seen > number:
+                    os.kill(os.getpid(), signal.SIGKILL)
+        sys.addaudithook(count)
+        write(folder, "new")
+        os._exit(0)
+    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+
+found = []
+for there in (False, True):
+    for number in range(1000):
+        base = Path(sys.argv[1]) / f"{there}-{number}"
+        folder = base / "out"
+        if there:
+            write(folder, "old")
+            (folder / "mine.txt").write_text("mine")
+            (folder / "made").mkdir()
+            (folder / "made" / "page.html").write_text("old")
+        else:
+            base.mkdir()
+        killed = killed_at(number, folder)
+        after = held(folder) if folder.exists() else None
+        write(folder, "again")
+        found.append((there, killed, after, held(base)))
+        if not killed:
+            break
+print(json.dumps(found))
+"""
+
+
+def test_killed_at_any_moment_it_leaves_one_result_and_the_next_run_no_rubbish(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert sum(killed for _, killed, _, _ in found) > 20
+    moving = 0
+    for there, _, after, again in found:
+        expected = dict.fromkeys(FILES.names, "again") | ({"mine.txt": "mine"} if there else {})
+        assert again == {f"out/{name}": content for name, content in expected.items()}
+        if not there:
+            # A new folder is there and whole, or is not there.
+            assert after in (None, WHOLE["new"])
+            continue
+        assert after.pop("mine.txt") == "mine"
+        seen = {name: content for name, content in after.items() if not name.startswith(".")}
+        assert len(set(seen.values())) == 1, seen
+        assert seen["main.h5"] in ("old", "new")
+        moving += len(seen) < 3
+        if len(seen) < 3:
+            # Nothing is lost: what is not in place yet waits whole beside it.
+            waiting = {name.split("/")[1]: c for name, c in after.items() if name.startswith(".done-")}
+            assert waiting.items() | {p for p in seen.items() if p[1] == "new"} == WHOLE["new"].items()
+    # Of all moments, those between the first and the last of the renames.
+    assert 0 < moving < 10
+
+
+@pytest.mark.skipif(os.name == "nt", reason="rights as POSIX has them")
+@pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_that_may_not_be_written_is_one_line(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(FileError, match="Permission denied"):
+        write(tmp_path / "out", "new")

@@ -1,0 +1,143 @@
+"""Pixels of image files lie in the header's own folder, and take no more memory than is plausible."""
+
+import gzip
+import os
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+from image_examples import grey, tracked, write_mha
+
+from speckle3d.core.errors import FileError, Speckle3DError
+from speckle3d.io.headers import read_header
+from speckle3d.io.metaimage import ImportSettings, read_metaimage
+from speckle3d.io.pixels import read_pixels
+from speckle3d.io.volumes import read_volume
+
+BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
+
+
+def detached(folder, name, suffix=".mhd"):
+    """A header whose pixels are in another file."""
+    whole = write_mha(folder / "whole.mha", grey(), frames=tracked(3)[2]).read_bytes()
+    head, _, pixels = whole.partition(b"LOCAL\n")
+    path = folder / f"header{suffix}"
+    if suffix == ".nhdr":
+        head = b"NRRD0004\ndimension: 3\nencoding: raw\nsizes: 5 4 3\ntype: uint8\nData File: "
+    path.write_bytes(head + os.fsencode(name) + b"\n")
+    return path, pixels
+
+
+@pytest.mark.parametrize("suffix", [".mhd", ".nhdr"])
+@pytest.mark.parametrize("name", ["pixels.raw", "below/pixels.raw", "./pixels.raw", "below/../pixels.raw"])
+def test_pixels_beside_the_header_are_read(tmp_path, name, suffix):
+    path, pixels = detached(tmp_path, name, suffix)
+    (tmp_path / "below").mkdir()
+    (tmp_path / name).write_bytes(pixels)
+    np.testing.assert_array_equal(read_pixels(read_header(path).pixels), grey().ravel())
+
+
+@pytest.mark.parametrize("suffix", [".mhd", ".nhdr"])
+@pytest.mark.parametrize(
+    "name",
+    ["/etc/passwd", "/dev/zero", "../secret.raw", "below/../../secret.raw", "link.raw", "below/secret.raw",
+     "~/secret.raw", "", "LIST", "slice%03d.raw 1 3 1", "pipe", "below", "none.raw"],
+)  # fmt: skip
+def test_other_files_are_refused_in_one_line(tmp_path, name, suffix):
+    folder = tmp_path / "folder"
+    (tmp_path / "outside").mkdir()
+    folder.mkdir()
+    (tmp_path / "secret.raw").write_bytes(bytes(100))
+    (tmp_path / "outside" / "secret.raw").write_bytes(bytes(100))
+    (folder / "link.raw").symlink_to(tmp_path / "secret.raw")
+    (folder / "below").symlink_to(tmp_path / "outside", target_is_directory=True)
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(folder / "pipe")
+    path, _ = detached(folder, name, suffix)
+    for read in (read_header, read_volume, lambda p: read_metaimage(p, BMODE)):
+        with pytest.raises(Speckle3DError, match=r"header|pipe|below|none|LIST|slice|~") as caught:
+            read(path)
+        assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "size", ["1000000000000 1 1", "1000000 1000000 1000000", "1e300 1e300 1e300", "9" * 400 + " 1 1"]
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_lengths_beyond_the_file_are_refused_without_memory(tmp_path, size, packed):
+    fields = {"DimSize": size} | ({"CompressedData": "True"} if packed else {})
+    path = write_mha(tmp_path / "a.mha", grey(), fields)
+    tracemalloc.start()
+    try:
+        with pytest.raises(Speckle3DError, match=r"a\.mha: "):
+            read_metaimage(path, BMODE)
+        with pytest.raises(Speckle3DError, match=r"a\.mha: "):
+            read_volume(path)
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
+
+
+def packed_sequence(path, size, packed, kind="mha"):
+    if kind == "mha":
+        fields = {"DimSize": size, "CompressedData": "True", "CompressedDataSize": len(packed)}
+        whole = write_mha(path, grey(), fields)
+        head, _, _ = whole.read_bytes().partition(b"LOCAL\n")
+        path.write_bytes(head + b"LOCAL\n" + packed)
+        return path
+    head = f"NRRD0004\ndimension: 3\nencoding: gzip\nsizes: {size}\ntype: uint8\n\n"
+    path.write_bytes(head.encode() + packed)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["mha", "nrrd"])
+@pytest.mark.parametrize(
+    ("size", "content", "message"),
+    [
+        ("5 4 3", bytes(59), "60 bytes.*got 59"),
+        ("5 4 3", bytes(61), "60 bytes.*got more"),
+        ("5 4 3", bytes(10**7), "60 bytes.*got more"),
+        ("100000 100000 1", bytes(10**7), "at most.*10000000000"),
+    ],
+)
+def test_packed_pixels_are_as_many_as_the_header_says(tmp_path, kind, size, content, message):
+    pack = zlib.compress if kind == "mha" else gzip.compress
+    path = packed_sequence(tmp_path / f"a.{kind}", size, pack(content), kind)
+    with pytest.raises(Speckle3DError, match=rf"a\.{kind}: .*{message}"):
+        read_pixels(read_header(path).pixels)
+
+
+def test_damaged_packed_pixels_are_a_file_error(tmp_path):
+    packed = bytearray(zlib.compress(grey().tobytes()))
+    packed[10:14] = b"\xff\xff\xff\xff"
+    path = packed_sequence(tmp_path / "a.mha", "5 4 3", bytes(packed))
+    with pytest.raises(FileError, match=r"a\.mha: .*damaged|unpacked"):
+        read_metaimage(path, BMODE)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "int16", "int32", "float32"])
+@pytest.mark.parametrize("big", [False, True])
+def test_numbers_of_either_byte_order_are_read(tmp_path, kind, big):
+    values = np.random.default_rng(0).integers(0, 100, (3, 4, 5)).astype(kind)
+    path = write_mha(tmp_path / "a.mha", values, {"BinaryDataByteOrderMSB": str(big)})
+    if big:
+        head, _, _ = path.read_bytes().partition(b"LOCAL\n")
+        path.write_bytes(head + b"LOCAL\n" + values.byteswap().tobytes())
+    got = read_pixels(read_header(path).pixels)
+    assert got.dtype == values.dtype
+    np.testing.assert_array_equal(got, values.ravel())
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    "name",
+    ["plus/SpinePhantomFreehand.igs.mha", "plus/UltrasonixLinearRfData.igs.mha", "rf/MouseLiverRF.mha"],
+)
+def test_pixels_of_others_are_what_the_image_library_finds(realdata, name):
+    import SimpleITK
+
+    expected = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(realdata / name)))
+    got = read_pixels(read_header(realdata / name).pixels)
+    assert got.dtype == expected.dtype
+    np.testing.assert_array_equal(got, expected.ravel())

@@ -1,0 +1,129 @@
+"""Every writer on a full disk: one line that names the file and the reason, and the old file as it was."""
+
+import subprocess
+import sys
+
+import imu_logs
+import numpy as np
+import pytest
+import speckle
+import sweep_examples
+from calibration_files import made
+from disks import FULL, limited
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import NoSpaceError
+from speckle3d.core.reconstruction import FramePairs, Provenance
+from speckle3d.core.volume import Volume
+from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.curves import write_curves
+from speckle3d.io.points import PickedPoints, write_points
+from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.sweep_writer import attach_orientation, write_sweep
+from speckle3d.io.volumes import write_volume
+from speckle3d.report.figures import save_both
+from speckle3d.study.figures import new_figure, save_figure
+from speckle3d.study.results import write_texts
+from xsens.live.recording import RawFile
+from xsens.logs.read import parse_stream
+from xsens.logs.textlogs import write_csv
+
+SWEEP = sweep_examples.rf_sweep()
+VALUES = np.random.default_rng(0).random((99, 50), np.float32)
+VOLUME = Volume(
+    np.random.default_rng(0).integers(0, 255, (20, 15, 10)).astype(np.uint8),
+    (0.5, 0.5, 1.0),
+    RigidTransform.identity(),
+)
+
+
+def reconstruction(path):
+    frames, patches = 20, VALUES.shape[1]
+    with ReconstructionWriter(path, 0.04 * np.arange(frames), SWEEP.grid) as writer:
+        for first in range(frames - 1):
+            number = np.array([first])
+            pose = sweep_examples.poses(1, first).as_matrix()
+            values = VALUES[[first]]
+            centre = np.zeros((patches, 2))
+            writer.append_pairs(
+                FramePairs(number, number + 1, pose, np.eye(6)[None], values, values, values > 0.5, centre)
+            )
+        writer.finish({"image": sweep_examples.poses(frames)}, Provenance("s.h5", "ab" * 32, "0"))
+
+
+def figure():
+    drawn = new_figure(4, 3)
+    drawn.subplots().plot(VALUES[0])
+    return drawn
+
+
+def recorded(path):
+    path.unlink(missing_ok=True)  # a recording never replaces a file
+    file = RawFile(path)
+    try:
+        file.append(bytes(5000))
+    finally:
+        file.close()
+
+
+WRITERS = {
+    "curves.h5": lambda path: write_curves(path, speckle.curves(sigma_mm=[0.3, 0.6])),
+    "calibration.h5": lambda path: write_calibration(path, made()),
+    "sweep.h5": lambda path: write_sweep(path, SWEEP),
+    "plain.h5": lambda path: write_sweep(path, SWEEP, compression=None),
+    "attached.h5": lambda path: attach_orientation(path, SWEEP.orientation),
+    "reconstruction.h5": reconstruction,
+    "volume.nrrd": lambda path: write_volume(path, VOLUME),
+    "volume.mha": lambda path: write_volume(path, VOLUME),
+    "volume.nii.gz": lambda path: write_volume(path, VOLUME),
+    "figure.png": lambda path: save_figure(figure(), path),
+    "both.svg": lambda path: save_both(figure(), path.with_suffix("")),
+    "summary.json": lambda path: write_texts(path.parent, {path.name: "0123456789" * 500}),
+    "points.csv": lambda path: write_points(path, PickedPoints(np.arange(99), VALUES[:, :2])),
+    "log.csv": lambda path: write_csv(
+        path, parse_stream(b"".join(imu_logs.mtdata2_messages(imu_logs.samples())))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path, name, capfd):
+    path = tmp_path / name
+    if name == "attached.h5":
+        write_sweep(path, SWEEP)
+    WRITERS[name](path)
+    before = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+    size = len(before[name])
+    # The last bytes are those that are lost silently: they are written when the file is closed.
+    for room in (size // 2, size - 1):
+        with limited(room), pytest.raises(NoSpaceError, match=FULL) as caught:
+            WRITERS[name](path)
+        assert str(path.with_suffix("") if name == "both.svg" else path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert ".part-" not in str(caught.value)
+        assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before
+    assert capfd.readouterr().err == ""
+
+
+def test_a_recording_keeps_what_fitted(tmp_path):
+    with limited(1200), pytest.raises(NoSpaceError, match=FULL):
+        recorded(tmp_path / "r.mtb")
+    assert (tmp_path / "r.mtb").stat().st_size == 1200
+
+
+COMMAND = """
+import resource, sys
+from speckle3d.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (16_000, -1))
+main()
+"""
+
+
+def test_the_command_ends_with_one_line_and_no_crash(shipped, tmp_path):
+    arguments = ("convert", str(shipped / "phantom.h5"), str(tmp_path / "copy.h5"))
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND, *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"speckle3d: {tmp_path / 'copy.h5'}: cannot be written: {FULL}\n"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,104 @@
+"""Sweeps whose images are not one moving probe's, through the whole pipeline: never confident and wrong."""
+
+import numpy as np
+import pytest
+import spoiled_images as spoil
+
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.pipeline import track
+
+
+@pytest.fixture(scope="module")
+def narrow(sweep):
+    """Two columns of patches of the shipped sweep."""
+    return spoil.narrowed(sweep)
+
+
+@pytest.fixture(scope="module")
+def pattern(narrow):
+    """Speckle of another place: a frame of the sweep the other way round."""
+    return narrow.frames[40][::-1].copy()
+
+
+def length_of(sweep, found):
+    """Farthest distance travelled by truth and as found, and the standard error claimed there, mm."""
+    centre = sweep.grid.centre_mm
+    true = (sweep.truth[0].inv() * sweep.truth).apply(centre)[:, 2]
+    at = int(np.argmax(np.abs(true)))
+    seen = found.image.apply(centre)[:, 2]
+    return abs(true[at]), abs(seen[at]), float(np.sqrt(found.covariance[at, 2, 2]))
+
+
+def test_static_clutter_as_strong_as_the_signal_is_refused(narrow, curves, pattern):
+    with pytest.raises(InsufficientDataError, match=r"power the same at the same place.*static clutter"):
+        track(spoil.cluttered(narrow, pattern, 0.0), curves)
+
+
+def test_two_sweeps_frame_by_frame_are_refused(narrow, curves):
+    half = len(narrow) // 2
+    sweeps = spoil.in_order(narrow, range(half)), spoil.in_order(narrow, range(half, 2 * half))
+    with pytest.raises(InsufficientDataError, match="sweeps interleaved"):
+        track(spoil.interleaved(*sweeps), curves)
+
+
+def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
+    with pytest.raises(InsufficientDataError, match="expected"):
+        track(spoil.at_rest(spoil.in_order(narrow, range(40)), 3.0), curves)
+
+
+REFUSED = {
+    "clutter at -10 dB": lambda s, p: spoil.cluttered(s, p, -10.0),
+    "clutter in the upper half": lambda s, p: spoil.cluttered(s, p, 6.0, (0.0, 0.5)),
+    "noise at 6 dB at rest": lambda s, p: spoil.at_rest(s, 6.0),
+    "every frame twice": lambda s, p: spoil.in_order(s, np.repeat(np.arange(len(s)), 2)),
+    "shuffled": lambda s, p: spoil.in_order(s, np.random.default_rng(0).permutation(len(s))),
+    "there and back in turn": lambda s, p: spoil.interleaved(s, spoil.in_order(s, range(len(s))[::-1])),
+    "three in turn": lambda s, p: spoil.interleaved(
+        *(spoil.in_order(s, range(k, k + 32)) for k in (0, 32, 64))
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_measured_is_refused(narrow, curves, pattern, case):
+    with pytest.raises(InsufficientDataError) as refusal:
+        track(REFUSED[case](narrow, pattern), curves)
+    assert "\n" not in str(refusal.value)
+
+
+HONEST = {
+    "gain that flickers": lambda s: spoil.spoiled(
+        s, s.frames * np.random.default_rng(0).uniform(0.5, 1.0, (len(s), 1, 1))
+    ),
+    "every second frame": lambda s: spoil.in_order(s, range(0, len(s), 2)),
+    "a third of the time at rest": spoil.resting_first,
+    "backwards": lambda s: spoil.in_order(s, range(len(s))[::-1]),
+    "noise at 10 dB": lambda s: spoil.noisy(s, 10.0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", HONEST)
+def test_what_can_be_measured_is_and_holds(narrow, curves, case):
+    sweep = HONEST[case](narrow)
+    found = track(sweep, curves)
+    true, seen, sigma = length_of(sweep, found)
+    assert not found.doubts
+    assert abs(seen - true) < 4 * sigma
+
+
+@pytest.mark.slow
+def test_a_little_clutter_is_told(narrow, curves, pattern):
+    found = track(spoil.cluttered(narrow, pattern, -17.0), curves)
+    assert ["static clutter" in doubt.suspect for doubt in found.doubts] == [True]
+
+
+@pytest.mark.slow
+def test_a_gap_is_told_and_counts_in_the_error(narrow, curves):
+    sweep = spoil.in_order(narrow, [*range(40), *range(56, 96)])
+    found = track(sweep, curves)
+    true, seen, sigma = length_of(sweep, found)
+    assert ["frames lost" in doubt.suspect for doubt in found.doubts] == [True]
+    assert sigma > 0.8
+    assert abs(seen - true) < 4 * sigma
