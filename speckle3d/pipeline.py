@@ -174,12 +174,14 @@ def track(
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
     with times.of("checks of the images"):
-        doubts += _doubts_of_curves(
-            sweep, curves, matcher, reader, found.table, flags, pairs, coherence, path, settings
-        )
+        sound = _sound(found.table, flags)
         flags = _with_unjoined(flags, reader, pairs)
         _require_placed(sweep, flags)
+        # What stands still would be blamed on the curves.
         doubts += _doubts_of_standing(sweep, matcher, curves, path, flags)
+        doubts += _doubts_of_curves(
+            sweep, curves, matcher, reader, found.table, sound, flags, pairs, coherence, path, settings
+        )
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -316,6 +318,7 @@ def _doubts_of_curves(
     matcher: FrameMatcher,
     reader: PairReader,
     table: CorrelationTable,
+    sound: BoolArray,
     flags: IntArray,
     pairs: Sequence[SignedPair],
     coherence: Coherence | None,
@@ -324,7 +327,7 @@ def _doubts_of_curves(
 ) -> tuple[Doubt, ...]:
     """What a sweep's own speckle says against the curves; raises if it refutes them."""
     size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
-    factors = reader.depth_factors(table, path, _sound(table, flags), config.coherence)
+    factors = reader.depth_factors(table, path, sound, config.coherence)
     found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
     return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
 

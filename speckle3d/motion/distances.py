@@ -84,10 +84,10 @@ class DistanceEstimator:
         Whether correlations are of complex echoes.
     tilt : TiltResponse or None
         At the patches.
-    reach_mm : float
-        Up to where the curves were measured.
     end_amplitude : ndarray, shape (p,)
         At the curve's last distance, beyond which nothing is read; 0 if the curve has levelled out by then.
+    reach_mm : float
+        Up to where the curves were measured.
     """
 
     def __init__(self, curves: DecorrelationCurves, patches: PatchGrid) -> None:

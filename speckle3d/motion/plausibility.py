@@ -29,7 +29,7 @@ with noise of half the signal's power 0.15."""
 
 MOST_FRAMES = 10
 """Frames in which standing echoes are looked for: 45 pairs, held at once."""
-ECHO_LIMITS = (0.01, 0.1), (0.05, 1 / 3)
+ECHO_LIMITS = (0.01, 0.2), (0.05, 1 / 2)
 """From which clutter is flagged and refused: share of the median patch's power, and share of patches lost.
 Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard errors wrong at 0.09; sweeps without
 clutter have up to 0.005. A quarter of the patches lost is made good by the adaptation to coherent echoes,
@@ -60,10 +60,10 @@ LISTED = 4
 """Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
-FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.30
+FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
-to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to a
-half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
+to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
+a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
