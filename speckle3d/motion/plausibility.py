@@ -29,7 +29,7 @@ with noise of half the signal's power 0.15."""
 
 MOST_FRAMES = 10
 """Frames in which standing echoes are looked for: 45 pairs, held at once."""
-ECHO_LIMITS = (0.01, 0.2), (0.05, 1 / 2)
+ECHO_LIMITS = (0.01, 0.1), (0.15, 1 / 2)
 """From which clutter is flagged and refused: share of the median patch's power, and share of patches lost.
 Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard errors wrong at 0.09; sweeps without
 clutter have up to 0.005. A quarter of the patches lost is made good by the adaptation to coherent echoes,
