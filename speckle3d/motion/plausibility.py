@@ -62,8 +62,8 @@ LEAST_COMPARED = 6
 """Pairs that a window needs."""
 FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.30
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
-to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to a
-half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
+to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
+a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
