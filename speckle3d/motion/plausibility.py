@@ -60,6 +60,8 @@ LISTED = 4
 """Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
+FOLD_PATCHES = 24
+"""Patches from which a fold is refused: the median over fewer scatters too much, and it is only flagged."""
 FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
@@ -206,7 +208,8 @@ def folded(
         f"expected frames equally alike to be equally far apart, got distances {worst:.0%} off what the "
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
-    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_REFUSED)
+    refuted = worst > FOLD_REFUSED and len(patch_centre_mm) >= FOLD_PATCHES
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted)
 
 
 def severed(first: Sequence[int], second: Sequence[int], usable: BoolArray) -> Doubt | None:

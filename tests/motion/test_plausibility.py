@@ -19,7 +19,7 @@ from speckle3d.motion.plausibility import (
 )
 
 WIDTH_MM, CELLS = 0.45, 60.0
-PATCHES_MM = np.array([[x, y] for x in (2.0, 6.0, 10.0) for y in (5.0, 15.0, 25.0)])
+PATCHES_MM = np.array([[x, y] for x in (2.0, 6.0, 10.0) for y in np.linspace(5.0, 25.0, 9)])
 
 
 def table_of(position_mm, seed=0, noise=0.03, gain=1.0, source=None):
