@@ -60,8 +60,8 @@ LISTED = 4
 """Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
-FOLD_PATCHES = 24
-"""Patches from which a fold is refused: the median over fewer scatters too much, and it is only flagged."""
+FOLD_TOLD, FOLD_PATCHES = 8, 24
+"""Patches from which a fold is told, and from which it is refused: the median over fewer scatters too much."""
 FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
@@ -189,7 +189,7 @@ def folded(
     rows = np.flatnonzero((table.median > low) & (table.median < high))
     rows = rows[usable[table.first[rows]] & usable[table.second[rows]]]
     rows = rows[np.argsort(-table.median[rows], kind="stable")]
-    if rows.size < LEAST_COMPARED:
+    if rows.size < LEAST_COMPARED or len(patch_centre_mm) < FOLD_TOLD:
         return None
     second = table.second[rows]
     apart = _distance(poses[table.first[rows]].inv() * poses[second], patch_centre_mm)
