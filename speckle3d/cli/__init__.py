@@ -46,6 +46,13 @@ _STOPPED = 128 + signal.SIGINT
 """Exit code after Ctrl-C, as shells have it."""
 
 
+class _ToldToStopError(KeyboardInterrupt):
+    """A signal asks for the end.
+
+    A plain `KeyboardInterrupt` that passes through code run from C makes Python end by SIGINT, with its code.
+    """
+
+
 def main() -> None:
     """Run the command line.
 
@@ -95,7 +102,7 @@ def _stoppable() -> Iterator[list[int]]:
             heard.append(number)
         elif time.monotonic() - first_s < _CLEANING_S:
             return
-        raise KeyboardInterrupt
+        raise _ToldToStopError
 
     before = {}
     if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
