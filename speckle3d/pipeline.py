@@ -7,7 +7,7 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
@@ -38,11 +38,13 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
+from speckle3d.matching.texture import doubt_band, speckle_size
 from speckle3d.motion.coherence import Coherence, scale_sigma
+from speckle3d.motion.curve_doubts import doubt_curves, doubt_depths, doubt_speed, doubt_widths
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
-from speckle3d.motion.phantom import phantom_pairs, phantom_samples
+from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
 from speckle3d.motion.plausibility import far_apart, folded, interleaved, severed, standing, undetermined
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
@@ -140,7 +142,8 @@ def track(
     Raises
     ------
     MismatchError
-        If the curves belong to another probe, frequency, sampling or patch size.
+        If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
+        or by what the images do; see `speckle3d.motion.curve_doubts`.
     InsufficientDataError
         If too many frames have no speckle in common with others, if the images do not determine the length,
         or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
@@ -155,6 +158,9 @@ def track(
     """
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
+    doubts = unrefuted(
+        [*doubt_depths(curves, matcher.laid, matcher.patches), *doubt_band(sweep)], sweep.name, MismatchError
+    )
     reader = PairReader(
         curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
     )
@@ -164,14 +170,18 @@ def track(
         sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
     )
     flags = _flagged(sweep, found, settings)
-    _believed(sweep, interleaved(found.table, len(sweep), settings.trajectory.least_correlation))
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
-    flags = _with_unjoined(flags, reader, pairs)
-    _require_placed(sweep, flags)
-    with times.of("standing echoes"):
-        doubts = _believed(sweep, _standing(sweep, matcher, curves, path, flags))
+    with times.of("checks of the images"):
+        sound = _sound(found.table, flags)
+        flags = _with_unjoined(flags, reader, pairs)
+        _require_placed(sweep, flags)
+        # What stands still would be blamed on the curves.
+        doubts += _doubts_of_standing(sweep, matcher, curves, path, flags)
+        doubts += _doubts_of_curves(
+            sweep, curves, matcher, reader, found.table, sound, flags, pairs, coherence, path, settings
+        )
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -196,10 +206,9 @@ def track(
             slopes,
             0.0 if coherence is None else float(coherence.share.mean()),
         )
-    doubts += _believed(sweep, _undetermined(trajectory.poses, covariance, matcher, curves))
-    ends = [pair.first for pair in pairs], [pair.second for pair in pairs]
-    doubts += _believed(sweep, severed(*ends, flags == 0))
-    doubts += _believed(sweep, folded(found.table, trajectory.poses, matcher.patches.centre_mm, flags == 0))
+        doubts += _doubts_of_path(
+            sweep, trajectory.poses, covariance, found.table, pairs, matcher, curves, flags
+        )
 
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
@@ -254,6 +263,9 @@ def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> F
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
     matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
     curves.key.require_same(matcher.key)
+    unrefuted(doubt_widths(curves), sweep.name, MismatchError)
+    with naming(sweep.name):
+        matcher.keep_depths(curves.depth_mm)
     return matcher
 
 
@@ -262,6 +274,8 @@ def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
     flags = flag_frames(found.features, config.quality)
     flags[found.table.unmatched(len(sweep), config.trajectory.least_correlation)] |= FrameFlag.UNMATCHED
     _require_placed(sweep, flags)
+    mixed = interleaved(found.table, len(sweep), config.trajectory.least_correlation)
+    unrefuted([mixed], sweep.name, InsufficientDataError)
     return flags
 
 
@@ -282,8 +296,7 @@ def _measured(
 
     Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
     """
-    bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    sound: BoolArray = ~bad[table.first] & ~bad[table.second]
+    sound = _sound(table, flags)
     with times.of(PLANES):
         path = reader.rough_path(table)
     if not config.coherence.adapt:
@@ -299,29 +312,63 @@ def _measured(
     return pairs, coherence, path
 
 
-def _believed(sweep: Sweep, doubt: Doubt | None) -> tuple[Doubt, ...]:
-    """Refuse what is refuted; anything else is used and flagged."""
-    if doubt is not None and doubt.refuted:
-        raise InsufficientDataError(f"{sweep.name}: {doubt}")
-    return () if doubt is None else (doubt,)
+def _doubts_of_curves(
+    sweep: Sweep,
+    curves: DecorrelationCurves,
+    matcher: FrameMatcher,
+    reader: PairReader,
+    table: CorrelationTable,
+    sound: BoolArray,
+    flags: IntArray,
+    pairs: Sequence[SignedPair],
+    coherence: Coherence | None,
+    path: FloatArray,
+    config: Config,
+) -> tuple[Doubt, ...]:
+    """What a sweep's own speckle says against the curves; raises if it refutes them."""
+    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
+    factors = reader.depth_factors(table, path, sound, config.coherence)
+    found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
+    return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
 
 
-def _standing(
+def _doubts_of_standing(
     sweep: Sweep, matcher: FrameMatcher, curves: DecorrelationCurves, path: FloatArray, flags: IntArray
-) -> Doubt | None:
+) -> tuple[Doubt, ...]:
+    """Echoes that are the same in frames beyond the reach of speckle."""
     frames = far_apart(path[:, 0], flags == 0, curves)
     if len(frames) < 2:
-        return None
+        return ()
     share = standing_share(sweep, matcher, frames.tolist())
-    return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+    found = standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+    return unrefuted([found], sweep.name, InsufficientDataError)
 
 
-def _undetermined(
-    poses: RigidTransform, covariance: FloatArray, matcher: FrameMatcher, curves: DecorrelationCurves
-) -> Doubt | None:
-    return undetermined(
-        poses.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])
+def _doubts_of_path(
+    sweep: Sweep,
+    image: RigidTransform,
+    covariance: FloatArray,
+    table: CorrelationTable,
+    pairs: Sequence[SignedPair],
+    matcher: FrameMatcher,
+    curves: DecorrelationCurves,
+    flags: IntArray,
+) -> tuple[Doubt, ...]:
+    """A length that is open, a sweep in pieces, a path that pairs contradict."""
+    z_mm, sigma_mm = image.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2])
+    found = (
+        undetermined(z_mm, sigma_mm, float(curves.distance_mm[-1])),
+        severed([pair.first for pair in pairs], [pair.second for pair in pairs], flags == 0),
+        folded(table, image, matcher.patches.centre_mm, flags == 0),
     )
+    return unrefuted(found, sweep.name, InsufficientDataError)
+
+
+def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
+    """Pairs of frames that are to be trusted, shape (e,)."""
+    bad = (flags & ~FrameFlag.UNMATCHED) != 0
+    sound: BoolArray = ~bad[table.first] & ~bad[table.second]
+    return sound
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:
@@ -397,7 +444,7 @@ def calibrate_curves(
     settings = config or Config()
     if not sweeps:
         raise InsufficientDataError("expected at least one phantom sweep, got none")
-    samples, keys = [], []
+    samples, keys, sizes = [], [], []
     total, before = sum(len(sweep) for sweep in sweeps), 0
     for sweep in sweeps:
         matcher = FrameMatcher(
@@ -408,8 +455,10 @@ def calibrate_curves(
         wanted = phantom_pairs(sweep, settings.curves)
         matches = match_in_order(sweep, matcher, wanted, _shifted(progress, before, total))
         samples.append(phantom_samples(sweep, matcher.patches, matches))
+        sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
         before += len(sweep)
-    return fit_curves(keys[0], samples, settings.curves)
+    curves = fit_curves(keys[0], samples, settings.curves)
+    return replace(curves, speckle=phantom_speckle(curves.depth_mm, sizes))
 
 
 def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:

@@ -14,7 +14,7 @@ from speckle3d.io.load import load_sweep
 from speckle3d.study.job import run_job
 
 MODES = ["image", "orientation", "pose"]
-REASON = "torn.h5: /rf: expected <three> axes & more, got none"
+REASON = "torn.h5: /rf: expected <three> axes & more, got \x1b[31mnone\u202e"
 HOSTILE = "<script>alert('gone')</script>"
 
 

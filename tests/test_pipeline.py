@@ -15,6 +15,7 @@ from speckle3d.core.sweep import OrientationSensor
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_rotations
+from speckle3d.motion.plausibility import MOST_FRAMES
 from speckle3d.pipeline import correct, track
 from speckle3d.scoring.lengths import compare_modes
 
@@ -91,7 +92,8 @@ def test_few_frames_are_kept_however_long_the_sweep(sweep, curves, monkeypatch):
     monkeypatch.setattr(FrameMatcher, "prepare", prepare)
     track(head(sweep, 48), curves, progress=lambda *_: most.append(sum(r() is not None for r in made)))
     s = Config().trajectory
-    assert len(made) == 48
+    # Some are read again to see what stands still in the image.
+    assert 48 < len(made) <= 48 + MOST_FRAMES
     # References, the frame itself, and those read ahead: three waiting, one being made, one handed over.
     assert max(most) <= s.recent + s.key_frames + s.far_key_frames + 1 + 5
 

@@ -12,12 +12,22 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
 PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
-"""Numbers in a `CurveKey` beside those of the signal."""
+"""Numbers in a `CurveKey` beside those of the signal, in every file of curves."""
+EDGE_FRACTION = 0.1
+"""Of `CurveKey.edge_fraction` in files that do not give it: all that versions before wrote by default."""
 
 
 @dataclass(frozen=True)
 class CurveKey:
-    """Signal and patches that curves were measured with; a sweep with another key needs other curves."""
+    """Signal and patches that curves were measured with; a sweep with another key needs other curves.
+
+    Attributes
+    ----------
+    edge_fraction : float
+        Width of the band's edges over its width.
+    probe : str
+        Name of probe and preset as the recording has it; empty if it has none, and then not compared.
+    """
 
     signal: RFSettings | BModeSettings
     vector_pitch_mm: float
@@ -25,6 +35,8 @@ class CurveKey:
     patch_height_mm: float
     equalise_mm: float
     correlation_of: str = "intensity"
+    edge_fraction: float = EDGE_FRACTION
+    probe: str = ""
 
     def __post_init__(self) -> None:
         if self.correlation_of not in ("echo", "intensity"):
@@ -35,6 +47,8 @@ class CurveKey:
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         others = _settings(other)
+        if self.probe and other.probe and self.probe != other.probe:
+            raise MismatchError(f"{what}: probe is {self.probe!r} and {other.probe!r}")
         for name, mine in _settings(self).items():
             theirs = others[name]
             exact = isinstance(mine, str)
@@ -66,6 +80,26 @@ class TiltResponse:
 
 
 @dataclass(frozen=True)
+class SpeckleSize:
+    """Width of speckle in the image, by depth, as a probe and its settings make it.
+
+    Attributes
+    ----------
+    lateral_mm, axial_mm : ndarray, shape (r,)
+        Standard deviation of the Gaussian that intensity's correlation between neighbouring samples fits.
+    """
+
+    lateral_mm: FloatArray
+    axial_mm: FloatArray
+
+    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> SpeckleSize:
+        """Sizes at other depths than those known, by linear interpolation."""
+        return SpeckleSize(
+            np.interp(depth_mm, known_mm, self.lateral_mm), np.interp(depth_mm, known_mm, self.axial_mm)
+        )
+
+
+@dataclass(frozen=True)
 class DecorrelationCurves:
     """Correlation of fully developed speckle against elevational distance, by depth.
 
@@ -81,6 +115,8 @@ class DecorrelationCurves:
         Independent speckle cells in a patch; see `speckle3d.kernels.statistics`.
     tilt : TiltResponse or None
         None if the phantom sweeps did not turn.
+    speckle : SpeckleSize or None
+        Of the phantom's images; None in files that older versions wrote.
     """
 
     key: CurveKey
@@ -90,6 +126,7 @@ class DecorrelationCurves:
     cells: FloatArray
     pairs_used: int = 0
     tilt: TiltResponse | None = None
+    speckle: SpeckleSize | None = None
 
     def __post_init__(self) -> None:
         if self.correlation.shape != (self.depth_mm.size, self.distance_mm.size):
@@ -102,9 +139,14 @@ class DecorrelationCurves:
             raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
         if self.cells.shape != self.depth_mm.shape or not (np.isfinite(self.cells) & (self.cells > 0)).all():
             raise InvalidInputError("cells: expected a number above zero for each depth, got others")
-        for name, values in vars(self.tilt).items() if self.tilt is not None else ():
-            if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
-                raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
+        for part in (self.tilt, self.speckle):
+            for name, values in vars(part).items() if part is not None else ():
+                if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
+                    raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
+        sizes = vars(self.speckle).items() if self.speckle is not None else ()
+        for name, values in sizes:
+            if (values <= 0).any():
+                raise InvalidInputError(f"{name}: expected speckle sizes above zero, got others")
         if not ((self.correlation > 0) & (self.correlation <= 1)).all():
             raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
         if (np.diff(self.correlation, axis=1) > 0).any():
@@ -124,10 +166,11 @@ class DecorrelationCurves:
             np.interp(depth_mm, self.depth_mm, self.cells),
             self.pairs_used,
             None if self.tilt is None else self.tilt.at(np.asarray(depth_mm), self.depth_mm),
+            None if self.speckle is None else self.speckle.at(np.asarray(depth_mm), self.depth_mm),
         )
 
 
 def _settings(key: CurveKey) -> dict[str, Any]:
     kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
-    numbers = {name: getattr(key, name) for name in PATCH_NUMBERS}
+    numbers = {name: getattr(key, name) for name in (*PATCH_NUMBERS, "edge_fraction")}
     return {"signal": kind, "correlation_of": key.correlation_of} | vars(key.signal) | numbers

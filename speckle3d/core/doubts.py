@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+from speckle3d.core.errors import Speckle3DError
 
 
 @dataclass(frozen=True)
@@ -33,3 +36,12 @@ class Doubt:
     def consequence(self) -> str:
         """The doubt as a line, which says so where what is doubted is not used."""
         return f"{self}; refused" if self.refuted else str(self)
+
+
+def unrefuted(doubts: Iterable[Doubt | None], where: str, error: type[Speckle3DError]) -> tuple[Doubt, ...]:
+    """Return doubts that leave what is doubted usable; raise `error` with the first that does not."""
+    found = tuple(doubt for doubt in doubts if doubt is not None)
+    for doubt in found:
+        if doubt.refuted:
+            raise error(f"{where}: {doubt}")
+    return found

@@ -144,7 +144,7 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
         raise InvalidInputError(f"{where}: expected shape (m, 4, 4), got {m.shape}")
     require_finite(m, where)
     r = m[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         skewed = ~(np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE)
         mirrored = np.linalg.det(r) < 0
     affine = np.abs(m[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > RIGID_TOLERANCE

@@ -172,6 +172,8 @@ class Sweep:
         The image clock, strictly increasing.
     truth : RigidTransform, length n, optional
         ``world_from_image`` of every frame; simulations only.
+    probe : str, optional
+        Name of probe and preset: everything that shapes the beam.
 
     Examples
     --------
@@ -190,6 +192,7 @@ class Sweep:
     tracker: Tracker | None = None
     truth: RigidTransform | None = None
     name: str = "sweep"
+    probe: str = ""
 
     def __post_init__(self) -> None:
         times = require_increasing(self.frame_time_s, f"{self.name}: frame_time_s")

@@ -151,7 +151,8 @@ class WirePhantom:
         """
         _require_vectors(ends_mm, (len(names), 2, 3), "ends_mm")
         along = ends_mm[:, 1] - ends_mm[:, 0]
-        length = np.linalg.norm(along, axis=1, keepdims=True)
+        with np.errstate(over="ignore"):
+            length = np.linalg.norm(along, axis=1, keepdims=True)
         if not (length > 0).all():
             name = names[int(np.flatnonzero(length[:, 0] <= 0)[0])]
             raise InvalidInputError(f"wire {name}: expected two different ends, got the same twice")

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from speckle3d.core.curves import PATCH_NUMBERS, CurveKey, DecorrelationCurves, TiltResponse
+from speckle3d.core.curves import (
+    EDGE_FRACTION,
+    PATCH_NUMBERS,
+    CurveKey,
+    DecorrelationCurves,
+    SpeckleSize,
+    TiltResponse,
+)
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import RFSettings
@@ -35,11 +42,11 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     with atomic_hdf5(path, FORMAT) as file:
         for name in ("depth_mm", "distance_mm", "correlation", "cells"):
             file[name] = getattr(curves, name)
-        if curves.tilt is not None:
-            for name, values in vars(curves.tilt).items():
-                file[f"tilt/{name}"] = values
+        for group, part in (("tilt", curves.tilt), ("speckle", curves.speckle)):
+            for name, values in vars(part).items() if part is not None else ():
+                file[f"{group}/{name}"] = values
         file.attrs["pairs_used"] = curves.pairs_used
-        write_attributes(file, curves.key, (*PATCH_NUMBERS, "correlation_of"))
+        write_attributes(file, curves.key, (*PATCH_NUMBERS, "correlation_of", "edge_fraction", "probe"))
         file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
         file.attrs.update(vars(curves.key.signal))
 
@@ -76,13 +83,18 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         kind = read_text(file, "signal")
         if kind not in ("rf", "bmode"):
             raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-        key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of)
+        edge = read_attribute(file, "edge_fraction", EDGE_FRACTION)
+        probe = read_text(file, "probe") if "probe" in file.attrs else ""
+        key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of, edge_fraction=edge, probe=probe)
         pairs = int(read_attribute(file, "pairs_used", 0))
-        tilt = None
+        tilt = speckle = None
         if has_member(file, "tilt"):
             names = ("tilt/pivot_mm", "tilt/spread_mm")
             tilt = TiltResponse(*(read_checked(file, name, (depth.size,)) for name in names))
-        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt)
+        if has_member(file, "speckle"):
+            names = ("speckle/lateral_mm", "speckle/axial_mm")
+            speckle = SpeckleSize(*(read_checked(file, name, (depth.size,)) for name in names))
+        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt, speckle)
 
 
 load_curves = read_curves

@@ -199,4 +199,5 @@ def _direction_lengths(path: PathLike, text: str) -> tuple[float, ...] | None:
     if len(vectors) < 2:
         return None
     where = f"{path}: space directions"
-    return tuple(float(np.linalg.norm(numbers(v.replace(",", " "), None, where))) for v in vectors)
+    with np.errstate(over="ignore"):
+        return tuple(float(np.linalg.norm(numbers(v.replace(",", " "), None, where))) for v in vectors)

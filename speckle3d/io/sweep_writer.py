@@ -112,6 +112,10 @@ class SweepWriter(HDF5Writer):
         """Write the true pose of every frame."""
         self._file["truth/world_from_image"] = world_from_image.as_matrix()
 
+    def write_probe(self, name: str) -> None:
+        """Write the name of probe and preset."""
+        self._file.attrs["probe"] = name
+
     def write_simulation(self, values: Mapping[str, Any]) -> None:
         """Write how a sweep was simulated as attributes of ``/simulation``; nested values become JSON."""
         group = self._file.require_group("simulation")
@@ -191,6 +195,8 @@ def write_sweep(
                 writer.write_sensor(sensor)
         if sweep.truth is not None:
             writer.write_truth(sweep.truth)
+        if sweep.probe:
+            writer.write_probe(sweep.probe)
         if simulation is not None:
             writer.write_simulation(simulation)
         if type(sweep.frames) is HDF5Frames:

@@ -41,6 +41,7 @@ from speckle3d.io.hdf5 import (
     opened,
     read_attribute,
     read_checked,
+    read_text,
     read_transforms,
     read_vector_attribute,
     reading,
@@ -167,6 +168,7 @@ def read_sweep(path: PathLike) -> Sweep:
             tracker=_read_tracker(file),
             truth=_read_truth(file, n),
             name=printable(Path(path).stem),
+            probe=read_text(file, "probe") if "probe" in file.attrs else "",
         )
 
 

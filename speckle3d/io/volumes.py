@@ -104,8 +104,8 @@ class _Stored:
         cls, size: tuple[int, ...], voxels: npt.NDArray[Any], steps_mm: FloatArray, origin_mm: FloatArray
     ) -> _Stored:
         """Take spacing and directions from the steps to the next voxel along each axis, a row each."""
-        spacing = np.linalg.norm(steps_mm, axis=1)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            spacing = np.linalg.norm(steps_mm, axis=1)
             return cls(size, voxels, spacing, steps_mm / spacing[:, None], origin_mm)
 
 

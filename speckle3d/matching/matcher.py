@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from speckle3d.core.arrays import Complex64Array, Float32Array
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.inplane import (
@@ -61,7 +61,13 @@ class ReadyFrame:
 
 
 class FrameMatcher:
-    """Prepares the frames of one sweep and matches pairs of them."""
+    """Prepares the frames of one sweep and matches pairs of them.
+
+    Attributes
+    ----------
+    laid, patches : PatchGrid
+        All that fit on the image, and those that are matched.
+    """
 
     def __init__(
         self,
@@ -74,8 +80,8 @@ class FrameMatcher:
         self.extractor = IntensityExtractor.for_sweep(sweep, intensity)
         self.grid = self.extractor.grid
         self.centre_mm = sweep.grid.centre_mm
-        self.patches = lay_patches(self.grid, patches)
-        self.at_mm = self.patches.centre_mm - self.centre_mm[:2]
+        self.laid = lay_patches(self.grid, patches)
+        self.patches = self.laid
         self.inplane = inplane
         self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
         rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
@@ -88,7 +94,18 @@ class FrameMatcher:
             patches.height_mm,
             intensity.equalise_mm,
             "echo" if self.of_echo else "intensity",
+            intensity.edge_fraction,
+            sweep.probe,
         )
+
+    @property
+    def at_mm(self) -> FloatArray:
+        """Position of the patches from the image's centre, shape (p, 2)."""
+        return self.patches.centre_mm - self.centre_mm[:2]
+
+    def keep_depths(self, depth_mm: FloatArray) -> None:
+        """Leave out the patches beyond the first and the last of some depths; see `PatchGrid.between`."""
+        self.patches = self.laid.between(depth_mm)
 
     def echo(self, frame: npt.NDArray[Any]) -> Echo:
         """Echo of a frame as read."""

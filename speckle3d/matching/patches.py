@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
 
 
@@ -48,6 +48,38 @@ class PatchGrid:
 
     def __len__(self) -> int:
         return int(self.first.shape[0])
+
+    @property
+    def row_depth_mm(self) -> FloatArray:
+        """Depth of the centres of each row of patches, shape (r,), increasing."""
+        return np.unique(self.centre_mm[:, 1])
+
+    def rows_of(self, values: FloatArray) -> FloatArray:
+        """Values of patches, shape (..., p), as rows and columns, shape (..., r, c)."""
+        by_column = values.reshape(*values.shape[:-1], -1, self.row_depth_mm.size)
+        return np.asarray(by_column.swapaxes(-1, -2))
+
+    def between(self, depth_mm: FloatArray) -> PatchGrid:
+        """Keep the rows whose centres lie between the first and the last of some depths, or half a patch off.
+
+        Raises
+        ------
+        MismatchError
+            If that is less than half of the rows, or one row alone.
+        """
+        rows, half = self.row_depth_mm, float(self.size[1] * self.spacing_mm[1]) / 2
+        low, high = float(depth_mm[0]), float(depth_mm[-1])
+        kept = (rows >= low - half) & (rows <= high + half)
+        if kept.sum() < max(2, rows.size / 2):
+            raise MismatchError(
+                f"the curves do not match the sweep: expected patches at the curves' depths of {low:.1f} to "
+                f"{high:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {kept.sum()} of {rows.size} rows "
+                "between them"
+            )
+        if kept.all():
+            return self
+        inside = np.isin(self.centre_mm[:, 1], rows[kept])
+        return replace(self, first=self.first[inside], centre_mm=self.centre_mm[inside])
 
 
 def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> PatchGrid:

@@ -29,7 +29,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
 from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.motion.distances import EchoModel
+from speckle3d.motion.distances import WELL_FALLEN, EchoModel
 
 COARSE_SCALES = np.geomspace(0.4, 3.0, 16)
 FINE_SCALES = np.geomspace(0.85, 1.18, 7)
@@ -138,7 +138,7 @@ def estimate_coherence(
         The path, rescaled.
     """
     s = settings or CoherenceSettings()
-    problem = _Problem(first, second, correlation, curves, patches, lateral_mm, s)
+    problem = EchoProblem(first, second, correlation, curves, patches, lateral_mm, s)
     path = np.asarray(path, dtype=float)
     scale, sigma = np.ones(problem.centres.size), 0.0
     every, some = (STRETCHES, LENGTHS_MM), (STRETCHES[:1], LENGTHS_MM[[0, 1, 3]])
@@ -179,7 +179,7 @@ def _chosen(
     return Coherence(centres, share, gain, STRETCHES[k], decay, scale, sigma)
 
 
-class _Problem:
+class EchoProblem:
     """Pairs by block of frames, and the curves' amplitudes at the patches."""
 
     def __init__(
@@ -201,6 +201,8 @@ class _Problem:
             here.cells,
             curves.key.correlation_of == "echo",
         )
+        ends = here.correlation[:, -1].max() > WELL_FALLEN
+        self._reach_mm = float(curves.distance_mm[-1]) if ends else np.inf
         frames = int(second.max()) + 1
         half = settings.block_frames / 2
         count = max(1, round(frames / half) - 1)
@@ -223,7 +225,7 @@ class _Problem:
         cost, found = np.empty(shape), np.empty((*shape, 2))
         bins = np.empty((patches, _EDGES_MM.size - 1, 4))
         for block, centre in enumerate(self.centres):
-            inside = np.abs(middle - centre) <= self._half
+            inside = (np.abs(middle - centre) <= self._half) & (np.abs(moved[:, 0]) <= self._reach_mm)
             offset, slope = moved[inside].T.copy()
             bin_by_distance(self._rho[inside], offset, slope, self._lateral, _EDGES_MM, bins)
             fit_echo_models(
@@ -240,13 +242,19 @@ class _Problem:
         departures = 1.0 * (stretches > 1)[:, None] + (lengths_mm != NO_GAIN)
         return cost + evidence * departures, found
 
+    def cost_of_scales(self, path: FloatArray, scales: FloatArray) -> FloatArray:
+        """Twice the negative log-likelihood of each scale for each patch, shape (s, p), whatever stays."""
+        cost, _ = self.fit(path, scales, STRETCHES[:1], LENGTHS_MM, self._settings.evidence)
+        # Blocks overlap by half, so their costs count twice.
+        return np.asarray(cost.min(axis=(-2, -1)).sum(axis=0) / 2)
+
 
 def _best_scale(cost: FloatArray, scales: FloatArray) -> tuple[FloatArray, float]:
     """Scale of each block from the likelihood profile, neighbours helping, and its overall deviation."""
     cost = cost.sum(axis=2)
     padded = np.pad(cost, ((2, 2), (0, 0)), mode="edge")
     smooth = sum(w * padded[k : k + len(cost)] for k, w in enumerate((1.0, 2.0, 3.0, 2.0, 1.0))) / 3.0
-    best = np.array([_vertex(np.log(scales), row) for row in np.asarray(smooth)])
+    best = np.array([vertex(np.log(scales), row) for row in np.asarray(smooth)])
     # Blocks overlap by half, so their costs count twice.
     total = cost.sum(axis=0) / 2
     k = int(np.clip(np.argmin(total), 1, scales.size - 2))
@@ -255,7 +263,7 @@ def _best_scale(cost: FloatArray, scales: FloatArray) -> tuple[FloatArray, float
     return np.exp(best), float(np.sqrt(2 / max(curvature, 1e-6)))
 
 
-def _vertex(x: FloatArray, cost: FloatArray) -> float:
+def vertex(x: FloatArray, cost: FloatArray) -> float:
     """Place of the least cost, by a parabola through the least value and its neighbours."""
     k = int(np.argmin(cost))
     if k in (0, len(x) - 1):

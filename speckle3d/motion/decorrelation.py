@@ -89,7 +89,7 @@ def fit_curves(
         fitted = [
             _fit_row(row, grid, s.terms, of_echo, *_select(fair, depth, row, distance, rho)) for row in rows
         ]
-        curves, cells = np.stack([curve for curve, _ in fitted]), np.array([count for _, count in fitted])
+        curves, cells, ends = (np.array(part) for part in zip(*fitted, strict=True))
         if turn == TILT_ROUNDS - 1:
             break
         response = fit_tilt_response(
@@ -100,7 +100,9 @@ def fit_curves(
         here = response.at(depth, rows)
         distance = effective_distance(offset, tilt, here.pivot_mm, here.spread_mm)
         fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT_MM + LITTLE_TILT * np.abs(offset)
-    return DecorrelationCurves(key, rows, grid, curves, cells, sum(one.pairs for one in every), response)
+    grid = grid[: max(2, int(np.searchsorted(grid, ends.min(), side="right")))]
+    pairs = sum(one.pairs for one in every)
+    return DecorrelationCurves(key, rows, grid, curves[:, : grid.size], cells, pairs, response)
 
 
 def _wavenumber(key: CurveKey) -> float:
@@ -120,8 +122,11 @@ def _fit_row(
     of_echo: bool,
     distance: FloatArray,
     rho: FloatArray,
-) -> tuple[FloatArray, float]:
-    """Curve of one depth on `grid`, and the number of cells that explains the scatter about it."""
+) -> tuple[FloatArray, float, float]:
+    """Curve of one depth on `grid`, the cells that explain the scatter about it, and its last distance.
+
+    A curve that has fallen as low as can be told goes on; one whose phantom did not go so far ends there.
+    """
     centre, mean = _bin_means(distance, rho)
     floor = _floor(centre, mean)
     excess = (mean - floor) / (1 - floor)
@@ -138,7 +143,8 @@ def _fit_row(
     curve = floor + (1 - floor) * np.exp(-_fitted_fall(grid, centre, excess, min(terms, centre.size - 2)))
     used = distance <= centre[-1]
     expected = np.interp(distance[used], grid, curve)
-    return curve, _cells(rho[used] - expected, expected, of_echo)
+    end = float(grid[-1] if below.size else centre[-1])
+    return curve, _cells(rho[used] - expected, expected, of_echo), end
 
 
 def _cells(left: FloatArray, expected: FloatArray, of_echo: bool) -> float:

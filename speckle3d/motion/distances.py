@@ -13,6 +13,8 @@ from speckle3d.matching.patches import PatchGrid
 
 LEAST_CORRELATION = 0.03
 """A patch that correlates less than this holds no distance at all."""
+WELL_FALLEN = 0.1
+"""Correlation above which a curve's end is where it was no longer measured, not where it has levelled out."""
 TABLE_STEPS = 400
 SHARE_ERROR = 0.35
 """Relative error of a coherent share: structure is neither quite frozen nor quite Gaussian."""
@@ -82,6 +84,8 @@ class DistanceEstimator:
         Whether correlations are of complex echoes.
     tilt : TiltResponse or None
         At the patches.
+    end_amplitude : ndarray, shape (p,)
+        At the curve's last distance, beyond which nothing is read; 0 if the curve has levelled out by then.
     reach_mm : float
         Up to where the curves were measured.
     """
@@ -94,6 +98,9 @@ class DistanceEstimator:
         self.tilt = here.tilt
         self._grid = curves.distance_mm
         self._rho = here.correlation
+        end = here.correlation[:, -1]
+        self._least = np.maximum(LEAST_CORRELATION, end)
+        self.end_amplitude = np.where(end > WELL_FALLEN, self.amplitude[:, -1], 0.0)
         self._typical = np.median(self.amplitude, axis=0)
         self._slope = -np.gradient(here.correlation, self.step_mm, axis=1)
         self._slope[:, 0] = 0.0
@@ -108,7 +115,7 @@ class DistanceEstimator:
         if model is not None:
             echo = np.sqrt(np.maximum(correlation, 0.0) / model.gain)
             correlation = np.maximum((echo - model.staying) / model.moving, 0.0) ** 2
-        rho = np.where(correlation > LEAST_CORRELATION, np.minimum(correlation, 0.9999), np.nan)
+        rho = np.where(correlation > self._least, np.minimum(correlation, 0.9999), np.nan)
         with np.errstate(invalid="ignore"):
             position = np.sqrt(-np.log(rho)) / self._root_step
         cell = np.clip(np.nan_to_num(position), 0, TABLE_STEPS - 1.001).astype(int)
@@ -125,9 +132,10 @@ class DistanceEstimator:
         return float(np.interp(amplitude, falling, self._grid[: self._typical.size][::-1]))
 
     def fully_developed(self, distance_mm: float) -> FloatArray:
-        """Correlation that fully developed speckle would have at one distance, shape (p,)."""
-        cell = min(round(distance_mm / self.step_mm), self._grid.size - 1)
-        return np.asarray(self._rho[:, cell])
+        """Correlation of fully developed speckle at one distance, shape (p,); 0 where it was not measured."""
+        cell = round(distance_mm / self.step_mm)
+        known = self._rho[:, min(cell, self._grid.size - 1)]
+        return np.where((cell >= self._grid.size) & (self.end_amplitude > 0), 0.0, known)
 
     def sigma(self, distance_mm: FloatArray, model: EchoModel | None = None) -> FloatArray:
         """Standard deviation of a distance estimate where the true distance is `distance_mm`, shape (p,).

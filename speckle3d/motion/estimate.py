@@ -16,6 +16,7 @@ from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, CoherenceSettings, estimate_coherence, scale_sigma
+from speckle3d.motion.curve_doubts import FLAT, DepthFactors, depth_factors, sum_ratios
 from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, EchoModel, PatchDistances
 from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings, consistent_subset
 from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, SignResolver, pair_signs
@@ -163,6 +164,19 @@ class PairReader:
             settings,
             known_scale,
         )
+
+    def depth_factors(
+        self, table: CorrelationTable, path: FloatArray, sound: BoolArray, settings: CoherenceSettings
+    ) -> DepthFactors:
+        """Distances read at each depth over those of all depths; see `speckle3d.motion.curve_doubts`."""
+        lateral = self._patches.centre_mm[:, 0] - self._centre[0]
+        return depth_factors(table, sound, path, self._curves, self._patches, lateral, settings)
+
+    def sum_ratios(self, pairs: Sequence[SignedPair]) -> FloatArray:
+        """Sums of two distances over the one that spans both; see `speckle3d.motion.curve_doubts`."""
+        first, second = (np.array([getattr(pair, name) for pair in pairs]) for name in ("first", "second"))
+        distance = np.array([pair.sign * pair.plane.offset_mm for pair in pairs])
+        return sum_ratios(first, second, distance, FLAT * self._estimator.typical_distance(np.sqrt(0.5)))
 
     def slopes(self, pairs: Sequence[SignedPair], coherence: Coherence | None) -> SlopeEvidence:
         """Weigh what the images see of yaw and tilt."""

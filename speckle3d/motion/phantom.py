@@ -9,6 +9,7 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.curves import SpeckleSize
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
@@ -110,3 +111,27 @@ def _patch_offsets(
     return np.asarray(first_from_second.apply(points)[:, 2]), float(
         first_from_second.rotation.as_matrix()[2, 1]
     )
+
+
+def phantom_speckle(
+    depth_mm: FloatArray, seen: Iterable[tuple[FloatArray, SpeckleSize]]
+) -> SpeckleSize | None:
+    """Mean speckle size of phantom sweeps at each depth of the curves; None if no depth has any.
+
+    Parameters
+    ----------
+    depth_mm : ndarray, shape (r,)
+    seen : iterable of (ndarray, SpeckleSize)
+        Depths of a sweep's rows of patches, and the sizes there, NaN where they are not known.
+    """
+    some = list(seen)
+    depth = np.concatenate([depths for depths, _ in some])
+    sizes = []
+    for name in ("lateral_mm", "axial_mm"):
+        values = np.concatenate([getattr(size, name) for _, size in some])
+        known = np.isfinite(values)
+        if not known.any():
+            return None
+        rows, label = np.unique(np.round(depth[known], 6), return_inverse=True)
+        sizes.append(np.interp(depth_mm, rows, np.bincount(label, values[known]) / np.bincount(label)))
+    return SpeckleSize(*sizes)

@@ -154,11 +154,12 @@ class PlaneFitter:
         either_side : bool
             Whether a plane of known slopes may have a < 0.
         """
-        used = np.isfinite(correlation) if subset is None else np.isfinite(correlation) & subset
+        model = model or EchoModel.fully_developed(correlation.size)
+        used = np.isfinite(correlation) & self._measured(correlation, model)
+        used = used if subset is None else used & subset
         if used.sum() < LEAST_PATCHES:
             return None
         rho = np.where(used, correlation, np.nan).astype(float)
-        model = model or EchoModel.fully_developed(rho.size)
         echo, design = model.table(), self.design(moved_mm)
         middle = self._middle(rho, model) if start_mm is None else max(start_mm, NEAR_MM)
         best, least = np.zeros(3), np.inf
@@ -187,6 +188,12 @@ class PlaneFitter:
         return PairPlane(
             float(best[0]), float(best[1]), float(best[2]), np.asarray(covariance, float), used, excess, sigma
         )
+
+    def _measured(self, correlation: FloatArray, model: EchoModel) -> BoolArray:
+        """Patches that correlate more than at their curve's last distance."""
+        end = self._estimator.end_amplitude
+        least = model.gain * (model.staying + model.moving * end) ** 2
+        return np.asarray((end == 0.0) | (correlation > least))
 
     def _middle(self, rho: FloatArray, model: EchoModel) -> float:
         known = rho[np.isfinite(rho)]

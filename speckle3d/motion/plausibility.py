@@ -29,7 +29,7 @@ with noise of half the signal's power 0.15."""
 
 MOST_FRAMES = 10
 """Frames in which standing echoes are looked for: 45 pairs, held at once."""
-ECHO_LIMITS = (0.01, 0.1), (0.05, 1 / 3)
+ECHO_LIMITS = (0.01, 0.1), (0.15, 1 / 2)
 """From which clutter is flagged and refused: share of the median patch's power, and share of patches lost.
 Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard errors wrong at 0.09; sweeps without
 clutter have up to 0.005. A quarter of the patches lost is made good by the adaptation to coherent echoes,
@@ -60,9 +60,12 @@ LISTED = 4
 """Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
-FOLD_FLAGGED, FOLD_REFUSED = 0.22, 0.25
-"""Mean departure over mean distance in the worst window. Tuned on 32 sweeps of 6 to 21 patches: up to 0.15,
-0.20 where the length is three standard errors off; a direction lost 0.27 and more."""
+FOLD_PATCHES = 24
+"""Patches from which a fold is refused: the median over fewer scatters too much, and it is only flagged."""
+FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
+"""Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
+to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
+a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
@@ -205,7 +208,8 @@ def folded(
         f"expected frames equally alike to be equally far apart, got distances {worst:.0%} off what the "
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
-    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, worst > FOLD_REFUSED)
+    refuted = worst > FOLD_REFUSED and len(patch_centre_mm) >= FOLD_PATCHES
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted)
 
 
 def severed(first: Sequence[int], second: Sequence[int], usable: BoolArray) -> Doubt | None:

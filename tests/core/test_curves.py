@@ -28,11 +28,22 @@ def test_curves_of_another_signal_are_refused_and_the_setting_named(setting, val
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("setting", ["vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm"])
+@pytest.mark.parametrize(
+    "setting", ["vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm", "edge_fraction"]
+)
 def test_curves_of_another_geometry_are_refused_and_both_values_told(setting):
     other = replace(speckle.KEY, **{setting: 1.25})
     with pytest.raises(MismatchError, match=rf"{setting} is {getattr(speckle.KEY, setting)} and 1\.25"):
         speckle.KEY.require_same(other)
+
+
+def test_curves_of_another_probe_are_refused_where_both_are_named():
+    mine, theirs = (replace(speckle.KEY, probe=name) for name in ("L12-5, focus 2 cm", "L12-5, focus 3 cm"))
+    mine.require_same(mine)
+    mine.require_same(speckle.KEY)
+    speckle.KEY.require_same(theirs)
+    with pytest.raises(MismatchError, match="probe is 'L12-5, focus 2 cm' and 'L12-5, focus 3 cm'"):
+        mine.require_same(theirs)
 
 
 def test_rf_and_bmode_are_never_the_same():

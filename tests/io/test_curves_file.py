@@ -5,50 +5,57 @@ import numpy as np
 import pytest
 import speckle
 
-from speckle3d.core.curves import TiltResponse
+from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.curves import read_curves, write_curves
 
 ARRAYS = ("depth_mm", "distance_mm", "correlation", "cells")
 
 
-TILT = ("pivot_mm", "spread_mm")
+PARTS = {"tilt": ("pivot_mm", "spread_mm"), "speckle": ("lateral_mm", "axial_mm")}
 
 
-def made(signal=speckle.RF, of="intensity", turned=False):
-    tilt = TiltResponse(np.array([-7.5, 11.0]), np.array([1.5, 7.25])) if turned else None
-    key = replace(speckle.KEY, signal=signal, correlation_of=of)
-    return replace(speckle.curves(sigma_mm=[0.3, 0.6]), key=key, pairs_used=4321, tilt=tilt)
+def made(signal=speckle.RF, of="intensity", whole=False):
+    tilt = TiltResponse(np.array([-7.5, 11.0]), np.array([1.5, 7.25])) if whole else None
+    size = SpeckleSize(np.array([0.3, 0.4]), np.array([0.07, 0.08])) if whole else None
+    probe = "L12-5, 4 cm, focus 2 cm" if whole else ""
+    key = replace(speckle.KEY, signal=signal, correlation_of=of, edge_fraction=0.2, probe=probe)
+    return replace(speckle.curves(sigma_mm=[0.3, 0.6]), key=key, pairs_used=4321, tilt=tilt, speckle=size)
 
 
 @pytest.fixture
 def path(tmp_path):
-    write_curves(tmp_path / "curves.h5", made(turned=True))
+    write_curves(tmp_path / "curves.h5", made(whole=True))
     return tmp_path / "curves.h5"
 
 
 @pytest.mark.parametrize("of", ["intensity", "echo"])
-@pytest.mark.parametrize("turned", [False, True], ids=["no tilt", "tilt"])
+@pytest.mark.parametrize("whole", [False, True], ids=["curves alone", "tilt, speckle, probe"])
 @pytest.mark.parametrize("signal", [speckle.RF, BModeSettings(60.0, 250.0)], ids=["rf", "bmode"])
-def test_curves_come_back(tmp_path, signal, turned, of):
-    written = made(signal, of, turned)
+def test_curves_come_back(tmp_path, signal, whole, of):
+    written = made(signal, of, whole)
     write_curves(tmp_path / "c.h5", written)
     got = read_curves(tmp_path / "c.h5")
     assert got.key == written.key
     assert got.pairs_used == 4321
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(got, name), getattr(written, name))
-    assert (got.tilt is not None) == turned
-    for name in TILT if turned else ():
-        np.testing.assert_array_equal(getattr(got.tilt, name), getattr(written.tilt, name))
+    for part, names in PARTS.items():
+        assert (getattr(got, part) is not None) == whole
+        for name in names if whole else ():
+            found, kept = (getattr(getattr(each, part), name) for each in (got, written))
+            np.testing.assert_array_equal(found, kept)
 
 
-def test_files_from_before_echoes_were_correlated_hold_intensity(path):
+def test_files_of_earlier_versions_are_read(path):
     with h5py.File(path, "r+") as file:
-        del file.attrs["correlation_of"], file["tilt"]
+        for name in ("correlation_of", "edge_fraction", "probe"):
+            del file.attrs[name]
+        del file["tilt"], file["speckle"]
     got = read_curves(path)
-    assert got.key.correlation_of == "intensity"
+    assert (got.key.correlation_of, got.key.edge_fraction, got.key.probe) == ("intensity", 0.1, "")
     assert got.tilt is None
+    assert got.speckle is None
 
 
 def test_an_older_file_stays_whole_when_writing_fails(path):

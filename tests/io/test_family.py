@@ -11,7 +11,7 @@ from calibration_files import made
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from speckle3d.core.curves import TiltResponse
+from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.io.calibrations import read_calibration, write_calibration
 from speckle3d.io.curves import read_curves, write_curves
@@ -20,11 +20,14 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.sweeps import read_sweep
 
 TILT = TiltResponse(np.array([-7.5, 11.0]), np.array([1.5, 7.25]))
+SIZE = SpeckleSize(np.array([0.3, 0.4]), np.array([0.07, 0.08]))
 KINDS = {
     "sweep": (lambda path: write_sweep(path, sweep_examples.rf_sweep()), read_sweep),
     "calibration": (lambda path: write_calibration(path, made()), read_calibration),
     "curves": (
-        lambda path: write_curves(path, replace(speckle.curves(sigma_mm=[0.3, 0.6]), tilt=TILT)),
+        lambda path: write_curves(
+            path, replace(speckle.curves(sigma_mm=[0.3, 0.6]), tilt=TILT, speckle=SIZE)
+        ),
         read_curves,
     ),
 }
@@ -152,7 +155,8 @@ WRONG = {
     ],
     "curves": [
         *((drop(name), f": /{name}") for name in (
-            "depth_mm", "distance_mm", "correlation", "cells", "tilt/pivot_mm", "tilt/spread_mm")),
+            "depth_mm", "distance_mm", "correlation", "cells", "tilt/pivot_mm", "tilt/spread_mm",
+            "speckle/lateral_mm", "speckle/axial_mm")),
         *((lose("/", name), name) for name in (
             "vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm", "signal",
             "sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz", "bandwidth_hz")),
@@ -169,6 +173,10 @@ WRONG = {
         (changed("tilt/pivot_mm", lambda a: a * np.nan), "pivot_mm"),
         (changed("tilt/spread_mm", lambda a: a + np.inf), "spread_mm"),
         (changed("tilt/spread_mm", lambda a: a.astype("S8")), "/tilt/spread_mm"),
+        (changed("speckle/lateral_mm", lambda a: a * np.nan), "lateral_mm"),
+        (changed("speckle/axial_mm", lambda a: -a), "axial_mm: expected speckle sizes above zero"),
+        (attribute("/", "probe", 3.0), "probe"),
+        (attribute("/", "edge_fraction", "wide"), "edge_fraction"),
         (attribute("/", "signal", "video"), "'rf'.*'bmode'.*'video'"),
         (attribute("/", "correlation_of", "amplitude"), "correlation_of.*'ampl"),
         (attribute("/", "correlation_of", 3.0), "correlation_of"),

@@ -301,3 +301,17 @@ def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
     with h5py.File(tmp_path / "s.h5") as file:
         assert file["simulation"].attrs["seed"] == 7
         assert json.loads(file["simulation"].attrs["movement"]) == {"length_mm": 40.0}
+
+
+def test_the_name_of_the_probe_comes_back(tmp_path):
+    sweep = replace(sweep_examples.rf_sweep(), probe="L12-5, 4 cm, focus 2 cm")
+    write_sweep(tmp_path / "named.h5", sweep)
+    assert read_sweep(tmp_path / "named.h5").probe == sweep.probe
+    write_sweep(tmp_path / "again.h5", read_sweep(tmp_path / "named.h5"))
+    assert read_sweep(tmp_path / "again.h5").probe == sweep.probe
+    write_sweep(tmp_path / "nameless.h5", sweep_examples.rf_sweep())
+    assert read_sweep(tmp_path / "nameless.h5").probe == ""
+    with h5py.File(tmp_path / "named.h5", "r+") as file:
+        file.attrs["probe"] = 3.0
+    with pytest.raises(InvalidInputError, match="attribute probe: expected a text"):
+        read_sweep(tmp_path / "named.h5")

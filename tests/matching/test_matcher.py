@@ -92,6 +92,9 @@ def test_the_key_holds_what_curves_depend_on(steps):
         1.5,
     )
     assert key.correlation_of == "intensity"
+    assert (key.edge_fraction, key.probe) == (intensity.edge_fraction, "")
+    named = FrameMatcher(replace(sweep, probe="L12-5"), intensity, patches, InPlaneSettings())
+    assert named.key.probe == "L12-5"
 
 
 # ---- echoes ----------------------------------------------------------------------------------------------

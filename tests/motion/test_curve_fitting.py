@@ -142,3 +142,15 @@ def test_curves_never_rise_however_noisy_the_samples():
         noisy = samples(speckle.triangle_correlation, FREEHAND, cells=12, seed=seed)
         curves = fit_curves(speckle.KEY, [noisy], CurveSettings(terms=5))
         assert (np.diff(curves.correlation, axis=1) <= 0).all()
+
+
+def test_curves_end_where_the_phantom_did():
+    curves = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, np.arange(0.0, 0.56, 0.05))])
+    assert curves.distance_mm[-1] == pytest.approx(0.55, abs=0.01)
+    np.testing.assert_allclose(
+        curves.correlation[:, -1],
+        speckle.gaussian_correlation(curves.distance_mm[-1], np.array(WIDTHS_MM)),
+        atol=5e-3,
+    )
+    whole = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED)])
+    assert whole.distance_mm[-1] == pytest.approx(CurveSettings().largest_mm)

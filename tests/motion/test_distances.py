@@ -281,3 +281,27 @@ def test_the_table_holds_a_models_parameters_and_what_is_uncertain_of_them():
     np.testing.assert_allclose(table[:, 5], [0, 0, STRETCH_ERROR])
     assert 0.1 < SHARE_ERROR < 0.6
     assert 0.05 < STRETCH_ERROR < 0.2
+
+
+def ending_at(distance_mm):
+    """Curves that were not measured farther than this: correlation 0.61 at 0.45 mm."""
+    return DistanceEstimator(speckle.curves(sigma_mm=SIGMA_MM, largest_mm=distance_mm), PATCHES)
+
+
+def test_nothing_is_read_beyond_the_last_distance_of_the_curves():
+    estimator = ending_at(SIGMA_MM)
+    rho = speckle.gaussian_correlation(np.linspace(0.05, 1.0, len(PATCHES)), SIGMA_MM)
+    got = estimator.distances(rho)
+    beyond = np.linspace(0.05, 1.0, len(PATCHES)) > SIGMA_MM
+    assert np.isnan(got.distance_mm[beyond]).all()
+    np.testing.assert_allclose(
+        got.distance_mm[~beyond], np.linspace(0.05, 1.0, len(PATCHES))[~beyond], atol=2e-3
+    )
+    assert (estimator.fully_developed(0.9) == 0.0).all()
+    assert (estimator.fully_developed(0.3) > 0.7).all()
+
+
+def test_curves_that_have_levelled_out_say_so_at_any_distance():
+    estimator = ending_at(2.0)
+    assert (estimator.end_amplitude == 0.0).all()
+    assert (estimator.fully_developed(30.0) > 0.0).all()

@@ -391,3 +391,15 @@ def test_a_side_that_is_settled_is_held():
     held = fitter.fit(correlations(plane), STILL, slopes=-plane[1:], either_side=False)
     np.testing.assert_allclose(turned.coefficients, -plane, atol=1e-3)
     assert held.offset_mm > 0.25
+
+
+def test_patches_beyond_the_last_distance_of_the_curves_take_no_part():
+    made = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, largest_mm=0.5)
+    fitter = PlaneFitter(DistanceEstimator(made, PATCHES), AT, PlaneSettings())
+    plane = (0.45, 0.02, 0.0)
+    found = fitter.fit(correlations(plane, None), STILL)
+    far = patch_distances(plane, None) > 0.5
+    assert 0.3 < far.mean() < 0.7
+    np.testing.assert_array_equal(found.used, ~far)
+    np.testing.assert_allclose(found.coefficients, plane, atol=5e-3)
+    assert fitter.fit(correlations((0.9, 0.0, 0.0), None), STILL) is None

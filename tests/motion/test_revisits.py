@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from speckle3d import pipeline
 from speckle3d.config import Config
 from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
@@ -103,10 +104,12 @@ def test_revisits_draw_together_ways_that_drifted_apart(sweep, curves):
     assert tied < 0.5 * loose
 
 
-def test_one_way_no_frame_is_read_again(sweep, curves, monkeypatch):
-    reads = []
-    plain = FrameMatcher.prepare
-    monkeypatch.setattr(FrameMatcher, "prepare", lambda m, echo: reads.append(1) or plain(m, echo))
+def test_one_way_no_frame_is_matched_again(sweep, curves, monkeypatch):
+    chosen = []
+    plain = pipeline.match_again
+    monkeypatch.setattr(
+        pipeline, "match_again", lambda s, m, pairs: chosen.extend(pairs) or plain(s, m, chosen)
+    )
     frames = np.arange(48)
     # Six millimetres, twice what a return takes at least.
     assert positions(sweep)[47] > 1.5 * AWAY_MM
@@ -115,7 +118,7 @@ def test_one_way_no_frame_is_read_again(sweep, curves, monkeypatch):
         truth=sweep.truth[:48],
     )  # fmt: skip
     track(half, curves)
-    assert len(reads) == 48
+    assert not chosen
 
 
 # ---- finding -----------------------------------------------------------------------------------------------

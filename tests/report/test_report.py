@@ -1,6 +1,7 @@
 """The page and its parts: the study's facts, names escaped, pictures and plots of the same series."""
 
 import base64
+import html
 import json
 import re
 from html.parser import HTMLParser
@@ -11,6 +12,7 @@ from report_examples import HOSTILE, MODES, REASON
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.printable import printable
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.report.data import cut_modes, load_view, read_study, rejected_patches
@@ -136,7 +138,7 @@ def test_every_row_is_in_the_table_and_the_broken_sweep_with_its_reason(page, re
     for row in read_study(report_study).rows:
         assert f"{row['length_error_mm']:+.2f}" in words
         assert f"{row['tilt_error_deg']:+.2f}" in words
-    assert REASON in words
+    assert printable(REASON) in words
     assert "GPE / mm" in words
     assert "0.123" in words
     assert "sensors" in words[words.index("Every setting") :]
@@ -145,6 +147,13 @@ def test_every_row_is_in_the_table_and_the_broken_sweep_with_its_reason(page, re
 def test_names_and_reasons_of_others_are_text(text, page):
     assert HOSTILE not in text
     assert "&lt;three&gt; axes &amp; more" in text
+    # What drives a terminal or turns the direction of writing is shown; the scripts of plotly have their own.
+    assert r"got \x1b[31mnone\u202e" in text
+    assert not {"\x1b", "\u202e"} & set(text.partition("<script>")[0])
+    # Plotly takes some markup in what it shows under the pointer.
+    plot = re.search(r'id="plot-overview">(.*?)</script>', text)[1]
+    shown = {word for trace in json.loads(plot)["data"] for word in trace.get("text", ())}
+    assert f"{html.escape(HOSTILE, quote=False)}, part f" in shown
     # In the chooser, above its figures, in its rows of the table and in the provenance.
     assert page.words.count(HOSTILE) >= 2 + len(MODES)
     # The two of the page, and the data of the plots.

@@ -1,0 +1,119 @@
+"""Speckle's size by depth and the echo's spectrum, from some frames: marks of a probe and its settings.
+
+The size of speckle along the vectors is the pulse's, across them the aperture's over depth; neither depends
+on what is scanned as long as it scatters as a phantom does; patches whose contrast denies that do not count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.curves import SpeckleSize
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.patches import PatchGrid
+
+FRAMES, SPECTRA = 12, 3
+"""Frames looked at for speckle and for the spectrum, evenly spread over the sweep."""
+CONTRAST = (0.75, 1.15)
+"""Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
+cells. Coherent structure is above; its patches look coarser than speckle."""
+LEAST_PATCHES = 8
+"""Patches, over all frames, that a row's size is taken from at least."""
+_NOISE_QUANTILE = 0.2
+_LEAST_ECHO = 0.05
+
+
+def speckle_size(sweep: Sweep, matcher: FrameMatcher, among: IntArray | None = None) -> SpeckleSize:
+    """Measure lateral and axial speckle size in each row of the patches that are matched.
+
+    Parameters
+    ----------
+    among : ndarray of int, optional
+        Frames to choose from; by default all.
+
+    Returns
+    -------
+    SpeckleSize
+        Of shape (r,); NaN where too few patches hold fully developed speckle.
+    """
+    frames = np.arange(len(sweep)) if among is None else among
+    found = [
+        _sizes(matcher.echo(sweep.frames[k]).intensity, matcher.patches) for k in _spread(frames, FRAMES)
+    ]
+    sizes = matcher.patches.rows_of(np.stack(found))
+    lateral, axial = sizes.transpose(1, 2, 0, 3).reshape(*sizes.shape[1:3], -1)
+    return SpeckleSize(_medians(lateral), _medians(axial))
+
+
+def doubt_band(sweep: Sweep) -> tuple[Doubt, ...]:
+    """Doubt a sampling rate or a band that the echoes contradict.
+
+    Tissue takes high frequencies away and adds none, so most of the echo above the noise cannot lie above the
+    band; below it lies what attenuation or a harmonic leaves, which is no contradiction.
+    """
+    signal = sweep.signal
+    if not isinstance(signal, RFSettings):
+        return ()
+    low, high = signal.bandwidth_hz
+    frequency, power = _spectrum(sweep, signal.sampling_rate_hz)
+    # Mains, gain control and steps between samples are below.
+    frequency, power = frequency[frequency >= low / 4], power[frequency >= low / 4]
+    echo = np.maximum(power - 2 * np.quantile(power, _NOISE_QUANTILE), 0.0)
+    if echo.sum() < _LEAST_ECHO * power.sum():
+        return ()
+    middle = float(np.interp(0.5, np.cumsum(echo) / echo.sum(), frequency))
+    inside = float(echo[(frequency >= low) & (frequency <= high)].sum() / echo.sum())
+    if middle <= high and (middle >= low or inside > _LEAST_ECHO):
+        return ()
+    return (
+        Doubt(
+            "images",
+            "sampling rate or band",
+            f"expected echoes of {low / 1e6:.3g} to {high / 1e6:.3g} MHz, got {100 * inside:.0f} % of their "
+            f"power there and half of it {'above' if middle > high else 'below'} {middle / 1e6:.3g} MHz",
+            refuted=middle > high,
+        ),
+    )
+
+
+def _spread(frames: IntArray, count: int) -> list[int]:
+    """At most so many of some frames, evenly spread."""
+    at = np.unique(np.linspace(0, frames.size - 1, count).round().astype(int))
+    return [int(k) for k in frames[at]]
+
+
+def _medians(rows: FloatArray) -> FloatArray:
+    """Median of each row's finite values; NaN where they are few."""
+    known = [row[np.isfinite(row)] for row in rows]
+    return np.array([np.median(row) if row.size >= LEAST_PATCHES else np.nan for row in known])
+
+
+def _sizes(intensity: Float32Array, patches: PatchGrid) -> FloatArray:
+    """Lateral and axial size of each patch's speckle, mm, shape (2, p); NaN unless it is fully developed."""
+    (wide, high), first = patches.size, patches.first
+    tiles = np.stack([intensity[v : v + wide, d : d + high] for v, d in first]).astype(float)
+    mean = tiles.mean(axis=(1, 2), keepdims=True)
+    with np.errstate(all="ignore"):  # Flat patches come out as NaN.
+        varying = tiles / mean - 1.0
+        contrast = varying.std(axis=(1, 2))
+        lags = (varying[:, :-1], varying[:, 1:]), (varying[..., :-1], varying[..., 1:])
+        rho = np.stack([(a * b).mean(axis=(1, 2)) / (contrast**2) for a, b in lags])
+        # The width of a Gaussian with this correlation one sample off.
+        size = patches.spacing_mm[:, None] / np.sqrt(-2.0 * np.log(np.clip(rho, 1e-3, 0.999)))
+        fair = (contrast > CONTRAST[0]) & (contrast < CONTRAST[1])
+    return np.where(fair & np.isfinite(rho), size, np.nan)
+
+
+def _spectrum(sweep: Sweep, rate_hz: float) -> tuple[FloatArray, FloatArray]:
+    """Power by frequency from zero to half the sampling rate, over all vectors of some frames."""
+    total, samples = np.zeros(1), sweep.grid.samples
+    window = np.hanning(samples).astype(np.float32)
+    for k in _spread(np.arange(len(sweep)), SPECTRA):
+        frame = sweep.frames[k]
+        # Of analytic samples the negative frequencies are empty.
+        spectrum = np.fft.fft(frame * window, axis=1)[:, : samples // 2]
+        total = total + (np.abs(spectrum) ** 2).mean(axis=0)
+    return np.arange(samples // 2) * rate_hz / samples, total

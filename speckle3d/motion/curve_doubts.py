@@ -1,0 +1,365 @@
+"""Do the curves belong to the sweep? What its own correlations, patches and clock say.
+
+A factor that all of a curve's distances have in common cannot be told from images: the same frames are then
+seen as far apart, and everything below fits as well as before. What can be told is curves that are wrong by
+another factor at each depth, since all depths of one image move together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.sweep import RFSettings
+from speckle3d.matching.intensity import two_way_wavenumber
+from speckle3d.matching.patches import PatchGrid
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.coherence import Coherence, CoherenceSettings, EchoProblem, vertex
+
+FASTEST_MM_S = 300.0
+"""Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
+WIDEST_MM = 8.0
+"""Distance over which no beam keeps half of its correlation: that of an unfocused element 25 mm high, which
+keeps (1 - d / 25)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
+BENT, REFUTED_BEND = 0.12, 0.25
+"""Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
+tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
+LEAST_EVIDENCE = 20.0
+"""Gain in twice the log-likelihood for a factor at each depth, below which a bend may be chance."""
+RESIZED = {"lateral_mm": 0.13, "axial_mm": 0.3}
+REFUTED_SIZE = {"lateral_mm": 0.3, "axial_mm": 0.6}
+"""Median over depth of the logarithm of speckle sizes over the phantom's, either sign. Simulated: lateral up
+to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial 0.08, with attenuation wrong
+by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
+LEAST_ROWS, ENOUGH_ROWS = 3, 4
+"""Rows of patches from which doubts arise, and from which sizes refute."""
+NOISY_GAIN = 0.9
+"""Part of the correlation that noise leaves, below which it makes speckle look finer."""
+UNSEEN_NOISE, REFUTED_NOISE = 1.8, 2.5
+"""Correlation of neighbouring vectors over what the noise taken from distances would leave of it. Simulated:
+up to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
+UNEVEN, REFUTED_SUM = 0.32, 0.5
+"""Median logarithm of two steps' sum over the one step that spans both, either sign. Simulated: below 0.02 in
+half of 64 good sweeps, 0.24 in the worst; with a fifth of the curves' correlation missing 0.38."""
+LEAST_TRIPLES = 12
+FLAT = 0.3
+"""Part of the distance that halves the correlation, below which it is too flat for distances to be summed."""
+TILT_FACTOR = 1.4
+"""Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
+_SCALES = np.geomspace(0.3, 3.4, 25)
+_ROW_ERROR = 0.03
+"""Of a row's factor, from the curves and tissue, beside the likelihood's."""
+_HUBER, _ROUNDS = 2.0, 20
+
+
+def doubt_curves(
+    seen: SpeckleSize,
+    factors: DepthFactors,
+    ratios: FloatArray,
+    curves: DecorrelationCurves,
+    patches: PatchGrid,
+    coherence: Coherence | None,
+) -> tuple[Doubt, ...]:
+    """Doubts that a sweep's own speckle raises: by its size, noise, depths that disagree, and steps' sums.
+
+    Size, depths and sums say so independently of each other: two of them at once refute the curves.
+    """
+    gain = np.ones(len(patches)) if coherence is None else coherence.gain.mean(axis=0)
+    kinds = doubt_size(seen, curves, patches, gain), doubt_bend(factors), doubt_sums(ratios)
+    found = tuple(doubt for kind in kinds for doubt in kind)
+    if sum(map(bool, kinds)) > 1:
+        found = tuple(replace(doubt, refuted=True) for doubt in found)
+    return (*found, *doubt_noise(seen, curves, patches, gain))
+
+
+def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
+    """Tell that patches were left out because the curves did not measure their depths."""
+    rows, kept = laid.row_depth_mm, used.row_depth_mm
+    if rows.size == kept.size:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "depths",
+            f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to "
+            f"{curves.depth_mm[-1]:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: "
+            f"{rows.size - kept.size} of {rows.size} rows left out",
+            refuted=False,
+        ),
+    )
+
+
+def doubt_widths(curves: DecorrelationCurves) -> tuple[Doubt, ...]:
+    """Doubt curves that no beam has."""
+    half = np.array([np.interp(-0.5, -row, curves.distance_mm) for row in curves.correlation])
+    found = []
+    if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
+        width = np.array([np.interp(0.5, -np.log(row), curves.distance_mm) for row in curves.correlation])
+        ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
+        if abs(np.log(ratio)) > np.log(TILT_FACTOR):
+            found.append(
+                Doubt(
+                    "curves",
+                    "distances changed after the curves were measured",
+                    f"expected tilt to spread echoes as the curves' width has it, got {ratio:.2f} times that",
+                    refuted=True,
+                )
+            )
+    if np.median(half) > WIDEST_MM:
+        found.append(
+            Doubt(
+                "curves",
+                "units",
+                f"expected correlation to halve within {WIDEST_MM:g} mm, got {np.median(half):.3g} mm",
+                refuted=True,
+            )
+        )
+    return tuple(found)
+
+
+def doubt_speed(path: FloatArray, time_s: FloatArray) -> tuple[Doubt, ...]:
+    """Doubt distances that no hand travels in the time.
+
+    Parameters
+    ----------
+    path : ndarray, shape (n, 2)
+        Elevational position of each frame's centre, mm, and its slope along x.
+    time_s : ndarray, shape (n,)
+    """
+    speed = float(np.abs(np.diff(path[:, 0])).sum() / (time_s[-1] - time_s[0]))
+    if speed <= FASTEST_MM_S:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "units",
+            f"expected a hand's speed of at most {FASTEST_MM_S:g} mm/s, got {speed:.0f} mm/s by the curves "
+            "and the frame times",
+            refuted=True,
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class DepthFactors:
+    """Distances read at each depth over those of all depths together.
+
+    Attributes
+    ----------
+    depth_mm, logarithm, sigma : ndarray, shape (r,)
+        Of rows of patches; the logarithm of the ratio, whose mean says nothing, and its standard deviation.
+    evidence : float
+        Gain in twice the log-likelihood over one factor for all.
+    """
+
+    depth_mm: FloatArray
+    logarithm: FloatArray
+    sigma: FloatArray
+    evidence: float
+
+    @property
+    def bend(self) -> float:
+        """Standard deviation of the logarithm's smooth course over depth, beyond what its own errors make.
+
+        A lens or a depth that is wrong bends all rows smoothly; rows that stand out alone hold structure.
+        """
+        at = (self.depth_mm - self.depth_mm.mean()) / np.ptp(self.depth_mm)
+        design = np.vander(at, min(3, at.size - 1))
+        spread = np.hypot(self.sigma, _ROW_ERROR)
+        weight = 1.0 / spread
+        for _ in range(_ROUNDS):
+            fit = np.linalg.lstsq(design * weight[:, None], self.logarithm * weight, rcond=None)[0]
+            size = np.abs(self.logarithm - design @ fit) / spread
+            weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))) / spread
+        course, weight = design @ fit, weight**2
+        off = course - np.average(course, weights=weight)
+        chance = (design.shape[1] - 1) / weight.sum()
+        return float(np.sqrt(max(np.average(off**2, weights=weight) - chance, 0.0)))
+
+
+def depth_factors(
+    table: CorrelationTable,
+    sound: BoolArray,
+    path: FloatArray,
+    curves: DecorrelationCurves,
+    patches: PatchGrid,
+    lateral_mm: FloatArray,
+    settings: CoherenceSettings,
+) -> DepthFactors:
+    """Fit a factor for each row of patches, coherent shares and noise granted as `estimate_coherence` does.
+
+    Parameters
+    ----------
+    sound : ndarray of bool, shape (e,)
+        Pairs both of whose frames are to be trusted.
+    path : ndarray, shape (n, 2)
+        Elevational position of each frame's centre and its slope along x.
+    lateral_mm : ndarray, shape (p,)
+        Of the patches, from the image's centre.
+    """
+    problem = EchoProblem(
+        table.first[sound],
+        table.second[sound],
+        table.correlation[sound],
+        curves,
+        patches,
+        lateral_mm,
+        settings,
+    )
+    cost = problem.cost_of_scales(path, _SCALES)
+    rows = patches.rows_of(cost).sum(axis=-1)  # shape (s, r)
+    logs = np.log(_SCALES)
+    best = rows.argmin(axis=0)
+    inner = np.clip(best, 1, _SCALES.size - 2)
+    each = np.arange(best.size)
+    curvature = rows[inner - 1, each] - 2 * rows[inner, each] + rows[inner + 1, each]
+    sigma = np.sqrt(2.0 / np.maximum(curvature / (logs[1] - logs[0]) ** 2, 1.0))
+    factor = np.array([vertex(logs, column) for column in rows.T])
+    return DepthFactors(
+        patches.row_depth_mm, factor, sigma, float(rows.sum(axis=1).min() - rows.min(axis=0).sum())
+    )
+
+
+def doubt_bend(factors: DepthFactors) -> tuple[Doubt, ...]:
+    """Doubt curves by which depths of one image are not as far from the next."""
+    if factors.depth_mm.size < LEAST_ROWS or factors.bend < BENT or factors.evidence < LEAST_EVIDENCE:
+        return ()
+    ratio = np.exp(np.ptp(factors.logarithm))
+    return (
+        Doubt(
+            "curves",
+            "curves of another probe, lens or depth",
+            f"expected all depths to tell the same distance, got distances at {factors.depth_mm[0]:.0f} to "
+            f"{factors.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} "
+            f"({100 * factors.bend:.0f} % rms, at most {100 * BENT:.0f} expected)",
+            refuted=factors.bend > REFUTED_BEND,
+        ),
+    )
+
+
+def sum_ratios(first: IntArray, second: IntArray, distance_mm: FloatArray, least_mm: float) -> FloatArray:
+    """Sums of two distances over the one that spans both, of all three frames that go one way.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (e,)
+        Frames of each pair.
+    distance_mm : ndarray, shape (e,)
+        Signed, at the image's centre.
+    least_mm : float
+        Distances below are passed over.
+    """
+    to: dict[int, dict[int, float]] = {}
+    for i, j, d in zip(first.tolist(), second.tolist(), distance_mm.tolist(), strict=True):
+        if abs(d) > least_mm:
+            to.setdefault(j, {})[i] = d
+    ratios = [
+        (before + after) / whole
+        for spans in to.values()
+        for j, after in spans.items()
+        for i, before in to.get(j, {}).items()
+        if (whole := spans.get(i, 0.0)) * after > 0 and before * after > 0
+    ]
+    return np.array(ratios)
+
+
+def doubt_sums(ratios: FloatArray) -> tuple[Doubt, ...]:
+    """Doubt curves by which two steps are not as long as the one that spans both."""
+    if ratios.size < LEAST_TRIPLES:
+        return ()
+    middle = float(np.median(ratios))
+    if abs(np.log(middle)) <= UNEVEN:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "curves of another signal or with noise",
+            f"expected two steps to be as long as the one that spans both, got {middle:.2f} times its length "
+            f"(median of {ratios.size})",
+            refuted=bool(abs(np.log(middle)) > REFUTED_SUM),
+        ),
+    )
+
+
+def doubt_size(
+    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
+) -> tuple[Doubt, ...]:
+    """Doubt a sweep whose speckle is not as large as the curves' phantom's at the same depths.
+
+    Parameters
+    ----------
+    seen : SpeckleSize
+        Of the rows of patches; NaN where they hold no speckle.
+    gain : ndarray, shape (p,)
+        Part of the patches' correlation that noise leaves.
+    """
+    if curves.speckle is None:
+        return ()
+    known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
+    left = np.median(patches.rows_of(gain), axis=-1)
+    excused = (left < NOISY_GAIN) & (_unseen_noise(seen, known, left, patches) < UNSEEN_NOISE)
+    found = []
+    for name in ("lateral_mm", "axial_mm"):
+        here, there = getattr(seen, name), getattr(known, name)
+        fair = np.isfinite(here)
+        if fair.sum() < LEAST_ROWS:
+            continue
+        ratio = np.log(here[fair] / there[fair])
+        # Noise differs from sample to sample, so that speckle under it looks finer.
+        off = float(np.median(np.where(excused[fair], np.maximum(ratio, 0.0), np.abs(ratio))))
+        if off > RESIZED[name]:
+            found.append(
+                Doubt(
+                    "curves",
+                    "another probe, depth or sampling rate",
+                    f"expected {name.removesuffix('_mm')} speckle of {np.median(there[fair]):.3f} mm, as in "
+                    f"the curves' phantom, got {np.median(here[fair]):.3f} mm ({100 * off:.0f} % off at the "
+                    "median depth)",
+                    refuted=bool(off > REFUTED_SIZE[name] and fair.sum() >= ENOUGH_ROWS),
+                )
+            )
+    return tuple(found)
+
+
+def doubt_noise(
+    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
+) -> tuple[Doubt, ...]:
+    """Doubt distances read with noise that the images do not show.
+
+    Noise takes as much from the correlation of neighbouring vectors as from that of frames. Where frames lack
+    correlation that vectors have, it was not noise that took it, and the curves are read at wrong distances.
+
+    Parameters
+    ----------
+    seen, gain
+        As for `doubt_size`.
+    """
+    if curves.speckle is None:
+        return ()
+    known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
+    left = np.median(patches.rows_of(gain), axis=-1)
+    excess = _unseen_noise(seen, known, left, patches)
+    if excess < UNSEEN_NOISE:
+        return ()
+    return (
+        Doubt(
+            "curves",
+            "curves of another probe, lens or depth",
+            f"expected the noise that distances were read with, {100 * (1 - np.median(left)):.0f} % of the "
+            f"correlation, between vectors too, got {excess:.1f} times the correlation that it leaves there",
+            refuted=excess > REFUTED_NOISE,
+        ),
+    )
+
+
+def _unseen_noise(seen: SpeckleSize, known: SpeckleSize, left: FloatArray, patches: PatchGrid) -> float:
+    """Median over depth of neighbouring vectors' correlation over what noise would leave of the phantom's."""
+    fair = np.isfinite(seen.lateral_mm)
+    if fair.sum() < LEAST_ROWS:
+        return 1.0
+    here, there = (np.exp(-0.5 * (patches.spacing_mm[0] / s.lateral_mm[fair]) ** 2) for s in (seen, known))
+    return float(np.median(here / (there * left[fair])))

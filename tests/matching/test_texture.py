@@ -1,0 +1,100 @@
+"""Speckle of a known size and spectrum is found to have them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import speckle
+
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.matching.inplane import InPlaneSettings
+from speckle3d.matching.intensity import IntensitySettings
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.texture import doubt_band, speckle_size
+
+GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
+"""Fine enough to hold intensities as they are."""
+
+
+def grey_sweep(frames, grid=speckle.GRID):
+    """Frames of echo intensity as grey levels."""
+    decibel = 10 * np.log10(np.maximum(frames / frames.max(), 1e-9))
+    grey = np.clip((decibel / GREY.dynamic_range_db + 1) * GREY.full_scale, 0, GREY.full_scale)
+    return Sweep(grey.astype(np.uint16), grid, GREY, np.arange(len(frames)) / 25)
+
+
+def matcher_of(sweep):
+    return FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+
+
+@pytest.fixture(scope="module")
+def seen():
+    rng = np.random.default_rng(5)
+    return np.stack([speckle.intensity(speckle.Speckle(rng).seen()) for _ in range(2)])
+
+
+def test_speckle_has_the_size_it_was_made_with(seen):
+    sweep = grey_sweep(seen)
+    size = speckle_size(sweep, matcher_of(sweep))
+    # Some 16 patches a row; taking each one's own mean away makes speckle 6 % finer, in a phantom as here.
+    np.testing.assert_allclose(size.lateral_mm, speckle.LATERAL_MM, rtol=0.13)
+    np.testing.assert_allclose(size.axial_mm, speckle.AXIAL_MM, rtol=0.13)
+
+
+def test_rows_without_speckle_have_no_size(seen):
+    frames = seen.copy()
+    frames[:, :, :100] = 1.0 + 0.01 * frames[:, :, :100]
+    frames[:, 5::12, 250:] *= 100.0
+    sweep = grey_sweep(frames)
+    matcher = matcher_of(sweep)
+    size, depth = speckle_size(sweep, matcher), matcher.patches.row_depth_mm
+    assert np.isnan(size.lateral_mm[depth < 5.0]).all()
+    assert np.isnan(size.axial_mm[depth > 18.0]).all()
+    assert np.isfinite(size.lateral_mm[(depth > 8.0) & (depth < 14.0)]).all()
+
+
+RATE, SAMPLES = 40e6, 2048
+
+
+def echoes(low_hz, high_hz, complex_too=False, noise=0.0, rate_hz=RATE, band=(4e6, 8e6)):
+    """Sweep of white echoes between two frequencies, and white noise, with the settings that it claims."""
+    rng = np.random.default_rng(3)
+    frequency = np.fft.fftfreq(SAMPLES, 1 / RATE)
+    spectrum = rng.normal(size=(3, 8, SAMPLES)) + 1j * rng.normal(size=(3, 8, SAMPLES))
+    frames = np.fft.ifft(spectrum * ((frequency >= low_hz) & (frequency <= high_hz))) * 1e3
+    frames += noise * frames.std() * (rng.normal(size=frames.shape) + 1j * rng.normal(size=frames.shape))
+    signal = RFSettings(rate_hz, 1540.0, sum(band) / 2, band)
+    grid = replace(speckle.GRID, vectors=8, samples=SAMPLES, sample_spacing_mm=signal.sample_spacing_mm)
+    data = frames.astype(np.complex64) if complex_too else frames.real.astype(np.float32)
+    return Sweep(data, grid, signal, np.arange(3) / 25)
+
+
+@pytest.mark.parametrize("complex_too", [False, True])
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(4e6, 8e6), (3e6, 9e6), (5e6, 6e6), (2e6, 6e6), (0.2e6, 5e6)],
+    ids=["as claimed", "wider", "narrower", "attenuated", "mostly attenuated"],
+)
+def test_echoes_in_the_band_are_believed(low, high, complex_too):
+    assert doubt_band(echoes(low, high, complex_too)) == ()
+
+
+@pytest.mark.parametrize("complex_too", [False, True])
+def test_echoes_above_the_band_refute_the_sampling_rate(complex_too):
+    (doubt,) = doubt_band(echoes(4e6, 8e6, complex_too, rate_hz=2 * RATE))
+    assert doubt.refuted
+    assert doubt.suspect == "sampling rate or band"
+    assert "expected echoes of 4 to 8 MHz" in doubt.evidence
+    assert "above 12" in doubt.evidence or "above 11.9" in doubt.evidence
+
+
+def test_echoes_below_the_band_are_doubted_but_used():
+    # Fundamental echoes beside a band at their harmonic.
+    (doubt,) = doubt_band(echoes(2e6, 3.5e6, band=(6e6, 8e6)))
+    assert not doubt.refuted
+
+
+def test_noise_and_grey_levels_tell_nothing_of_the_band(seen):
+    assert doubt_band(echoes(4e6, 8e6, noise=30.0)) == ()
+    assert doubt_band(grey_sweep(seen)) == ()

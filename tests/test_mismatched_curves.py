@@ -1,0 +1,108 @@
+"""Curves that do not belong to the shipped sweep are refused, whichever way they are wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from speckle3d.core.curves import SpeckleSize, TiltResponse
+from speckle3d.core.errors import MismatchError
+from speckle3d.matching.blocks import Block
+from speckle3d.pipeline import match_ahead, track
+
+FRAMES = 32
+
+
+class First:
+    """The first of some frames."""
+
+    def __init__(self, frames):
+        self._frames, self.dtype = frames, frames.dtype
+        self.shape = (FRAMES, *frames.shape[1:])
+
+    def __getitem__(self, index):
+        return self._frames[index]
+
+
+@pytest.fixture(scope="module")
+def part(sweep):
+    """5 mm of the shipped sweep, without sensors."""
+    return replace(
+        sweep,
+        frames=First(sweep.frames),
+        frame_time_s=sweep.frame_time_s[:FRAMES],
+        truth=sweep.truth[:FRAMES],
+        tracker=None,
+        orientation=None,
+    )
+
+
+@pytest.fixture(scope="module")
+def matched(part, curves):
+    block = match_ahead(part, curves, Block(0, FRAMES))
+    return lambda _: block
+
+
+def turned_over(curves):
+    """Curves reversed in depth, all that belongs to a depth with them."""
+    tilt = TiltResponse(*(each[::-1].copy() for each in vars(curves.tilt).values()))
+    size = SpeckleSize(*(each[::-1].copy() for each in vars(curves.speckle).values()))
+    rho, cells = curves.correlation[::-1].copy(), curves.cells[::-1].copy()
+    return replace(curves, correlation=rho, cells=cells, tilt=tilt, speckle=size)
+
+
+def of_other_depths(sweep, first_mm):
+    return replace(sweep, grid=replace(sweep.grid, first_sample_depth_mm=first_mm))
+
+
+def at_rate(sweep, factor):
+    signal = replace(sweep.signal, sampling_rate_hz=factor * sweep.signal.sampling_rate_hz)
+    grid = replace(sweep.grid, sample_spacing_mm=signal.sample_spacing_mm)
+    return replace(sweep, signal=signal, grid=grid)
+
+
+def test_right_curves_raise_no_doubt(tracked, part, curves, matched):
+    assert tracked.doubts == ()
+    found = track(part, curves, matched=matched)
+    assert found.doubts == ()
+    true = np.linalg.norm((part.truth[0].inv() * part.truth[-1]).translation)
+    assert np.linalg.norm(found.image.translation[-1]) == pytest.approx(true, rel=0.05)
+
+
+def test_reversed_curves_are_refused(part, curves, matched):
+    with pytest.raises(MismatchError, match=r"^phantom: curves: expected all depths to tell the same dist"):
+        track(part, turned_over(curves), matched=matched)
+
+
+@pytest.mark.parametrize(("factor", "why"), [(1.5, "tilt"), (1000.0, "tilt")])
+def test_scaled_distances_are_refused(part, curves, factor, why):
+    with pytest.raises(MismatchError, match=f"^phantom: curves: expected {why}"):
+        track(part, replace(curves, distance_mm=factor * curves.distance_mm))
+
+
+def test_scaled_distances_of_curves_without_tilt_are_refused_where_no_beam_is_so_wide(part, curves):
+    scaled = replace(curves, distance_mm=1000 * curves.distance_mm, tilt=None)
+    with pytest.raises(
+        MismatchError, match=r"^phantom: curves: expected correlation to halve within 8 mm, got 394"
+    ):
+        track(part, scaled)
+
+
+def test_curves_of_other_depths_are_refused(part, curves):
+    deeper = replace(curves, depth_mm=curves.depth_mm + 60.5)
+    with pytest.raises(MismatchError, match=r"^phantom: .*64\.0 to 100\.2 mm, got 3\.5 to 39\.7 mm"):
+        track(part, deeper)
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves, factor):
+    other = at_rate(part, factor)
+    key = replace(curves.key, signal=other.signal)
+    with pytest.raises(MismatchError, match=r"^phantom: (images: expected echoes|the curves do not match)"):
+        track(other, replace(curves, key=key))
+
+
+@pytest.mark.slow
+def test_a_sweep_whose_depth_is_wrong_by_ten_millimetres_is_refused(part, curves):
+    with pytest.raises(MismatchError, match=r"^phantom: curves: expected"):
+        track(of_other_depths(part, 10.0), curves)
