@@ -42,8 +42,18 @@ _CLEANING_S = 3.0
 
 A closed terminal sends two at once."""
 
+_AGAIN_S = 0.01
+"""Until a signal that was dropped is sent once more."""
+
 _STOPPED = 128 + signal.SIGINT
 """Exit code after Ctrl-C, as shells have it."""
+
+
+class _ToldToStopError(KeyboardInterrupt):
+    """A signal asks for the end.
+
+    A plain `KeyboardInterrupt` that passes through code run from C makes Python end by SIGINT, with its code.
+    """
 
 
 def main() -> None:
@@ -83,10 +93,11 @@ def _run(heard: list[int]) -> None:
 def _stoppable() -> Iterator[list[int]]:
     """Turn signals that ask for the end into `KeyboardInterrupt`; yields a list with the first one's number.
 
-    A signal that the process was started to ignore, as SIGHUP by nohup, stays ignored.
+    A signal that the process was started to ignore, as SIGHUP by nohup, stays ignored. One that arrives where
+    Python can only drop what is raised (finalisers, functions called from C) is sent once more.
     """
     heard: list[int] = []
-    first_s = 0.0
+    first_s, show_dropped = 0.0, sys.unraisablehook
 
     def stop(number: int, _frame: FrameType | None) -> None:
         nonlocal first_s
@@ -95,7 +106,17 @@ def _stoppable() -> Iterator[list[int]]:
             heard.append(number)
         elif time.monotonic() - first_s < _CLEANING_S:
             return
-        raise KeyboardInterrupt
+        raise _ToldToStopError
+
+    def dropped(what: sys.UnraisableHookArgs) -> None:
+        nonlocal first_s
+        if not heard:
+            show_dropped(what)
+        elif isinstance(what.exc_value, _ToldToStopError):
+            first_s = -_CLEANING_S
+            again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), heard[0]))
+            again.daemon = True
+            again.start()
 
     before = {}
     if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
@@ -104,9 +125,11 @@ def _stoppable() -> Iterator[list[int]]:
         before = {each: was for each, was in before.items() if was not in (signal.SIG_IGN, None)}
         for each in before:
             signal.signal(each, stop)
+        sys.unraisablehook = dropped
     try:
         yield heard
     finally:
+        sys.unraisablehook = show_dropped
         for each, was in before.items():
             signal.signal(each, was)
 

@@ -7,16 +7,21 @@ import importlib
 import os
 import re
 import secrets
-from collections.abc import Iterator
+import signal
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Self
 
 from speckle3d.core.errors import FileError, NoSpaceError
 
 _NO_SPACE = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """A full disk, a limit on the size of a file, and one on what a user may store."""
+
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Those that ask a process to end."""
 
 
 def cannot_write(path: str | os.PathLike[str], error: OSError, words: str = "cannot be written") -> FileError:
@@ -83,6 +88,9 @@ class DiskFile:
     write succeeds: from the first one that the system refuses on they are kept in memory, and `check` raises
     the system's error. To be called after every piece of a file that may become large.
 
+    HDF5 also swallows what is raised while it calls the methods below. So a signal that arrives there, as
+    Ctrl-C does, waits for `check` or for the end of the block.
+
     Parameters
     ----------
     path : path
@@ -94,13 +102,22 @@ class DiskFile:
         self._at = 0
         self._failure: OSError | None = None
         self._kept: list[tuple[int, bytes]] = []
+        self._handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
+        self._waiting: list[int] = []
 
     def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # the only one that sees signals
+            found = {number: signal.getsignal(number) for number in _SIGNALS}
+            self._handlers = {number: was for number, was in found.items() if callable(was)}
+            for number in self._handlers:
+                signal.signal(number, self._hear)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for number, was in self._handlers.items():
+            signal.signal(number, was)
         try:
             self._file.close()
         finally:
@@ -108,9 +125,22 @@ class DiskFile:
                 self.check()
 
     def check(self) -> None:
-        """Raise the `OSError` of the first write that the system refused, if any."""
+        """Handle signals that wait, and raise the `OSError` of the first write that the system refused."""
+        while self._waiting:
+            number = self._waiting.pop(0)
+            self._handlers[number](number, None)
         if self._failure is not None:
             raise self._failure
+
+    def _hear(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal at once, unless HDF5 is calling."""
+        caller = frame
+        while caller is not None:
+            if caller.f_code in _CALLED_BY_HDF5:
+                self._waiting.append(number)
+                return
+            caller = caller.f_back
+        self._handlers[number](number, frame)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move to an offset, from the end if `whence` is 2."""
@@ -171,3 +201,17 @@ class DiskFile:
 
     def flush(self) -> None:
         """Do nothing: no write is buffered."""
+
+
+_CALLED_BY_HDF5 = {
+    each.__code__
+    for each in (
+        DiskFile.seek,
+        DiskFile.tell,
+        DiskFile.read,
+        DiskFile.readinto,
+        DiskFile.write,
+        DiskFile.truncate,
+        DiskFile.flush,
+    )
+}

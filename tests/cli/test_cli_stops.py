@@ -65,6 +65,19 @@ def test_a_second_signal_does_not_disturb_the_cleaning_and_a_later_one_is_heard(
     assert len(cleaned) == 3
 
 
+def test_a_signal_that_python_drops_is_sent_again(run, monkeypatch):
+    class Finalised:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def told(**_):
+        Finalised()
+        time.sleep(10)
+
+    monkeypatch.setattr(cli, "app", told)
+    assert run() == (143, "", "speckle3d: stopped\n")
+
+
 def test_what_a_process_was_started_to_ignore_stays_ignored(run, monkeypatch):
     def told(**_):
         os.kill(os.getpid(), signal.SIGHUP)

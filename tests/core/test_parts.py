@@ -1,6 +1,7 @@
 """Temporary files, and files on a disk that is full."""
 
 import os
+import signal
 
 import h5py
 import numpy as np
@@ -55,6 +56,25 @@ def test_a_file_reads_as_written_however_much_of_it_is_on_the_disk(tmp_path_fact
             with pytest.raises(OSError, match="large"):
                 file.check()
         file._failure = None
+
+
+def test_a_signal_that_arrives_while_hdf5_calls_waits_for_the_next_check(tmp_path, monkeypatch):
+    def interrupted(file, data):
+        os.kill(os.getpid(), signal.SIGINT)
+        return write(file, data)
+
+    write, before = DiskFile.write, signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(DiskFile, "write", interrupted)
+    monkeypatch.setattr("speckle3d.core.parts._CALLED_BY_HDF5", {interrupted.__code__})
+    with pytest.raises(KeyboardInterrupt), DiskFile(tmp_path / "a") as disk:  # noqa: PT012
+        disk.write(memoryview(b"written"))
+        assert (tmp_path / "a").read_bytes() == b"written"
+        disk.check()
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt), DiskFile(tmp_path / "a") as disk:
+        disk.write(memoryview(b"again"))
+    with pytest.raises(KeyboardInterrupt), DiskFile(tmp_path / "a"):
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.parametrize("room", [0, 700, 3000, 9000])
