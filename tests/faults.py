@@ -109,7 +109,7 @@ _PLACE = ("sign", "pose")
 
 _UNITS, _HAND, _MOUNT, _CLOCK = (
     ("unit", "scale"),
-    ("hand", "mirror", "inverse", "mount"),
+    ("hand", "mirror", "inver", "transposed", "mount"),
     ("mount",),
     ("clock",),
 )
@@ -191,7 +191,7 @@ TRACKER = (
 
 
 _TURNS = ("sign", "orientation")
-_ORDER = ("order", "wxyz", "xyzw", "quaternion", "inverse", "hand", "mount")
+_ORDER = ("order", "wxyz", "xyzw", "quaternion", "inver", "hand", "mount")
 
 
 def _about_orientation(
