@@ -61,7 +61,7 @@ LISTED = 4
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
 FOLD_TOLD, FOLD_PATCHES = 8, 24
-"""Patches from which a fold is told, and from which it is refused: the median over fewer scatters too much."""
+"""Patches from which a fold is told, and from which it is refused: a median over fewer scatters too much."""
 FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
