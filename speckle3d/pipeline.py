@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.checks import doubts_of_curves, doubts_of_path, doubts_of_standing, examined_sensors
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
@@ -22,7 +23,7 @@ from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import correct_mode, require_modes, sensor_of
-from speckle3d.correction.trust import believed, cleaned_readings, examine_sensors, require_believed
+from speckle3d.correction.trust import cleaned_readings, require_believed
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -36,16 +37,15 @@ from speckle3d.matching.blocks import (
 from speckle3d.matching.chosen import match_again, match_in_order
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
-from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import doubt_band, speckle_size
 from speckle3d.motion.coherence import Coherence, scale_sigma
-from speckle3d.motion.curve_doubts import doubt_curves, doubt_depths, doubt_speed, doubt_widths
+from speckle3d.motion.curve_doubts import doubt_depths, doubt_widths
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
-from speckle3d.motion.plausibility import far_apart, folded, interleaved, severed, standing, undetermined
+from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
 
@@ -178,8 +178,8 @@ def track(
         flags = _with_unjoined(flags, reader, pairs)
         _require_placed(sweep, flags)
         # What stands still would be blamed on the curves.
-        doubts += _doubts_of_standing(sweep, matcher, curves, path, flags)
-        doubts += _doubts_of_curves(
+        doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
+        doubts += doubts_of_curves(
             sweep, curves, matcher, reader, found.table, sound, flags, pairs, coherence, path, settings
         )
 
@@ -206,18 +206,20 @@ def track(
             slopes,
             0.0 if coherence is None else float(coherence.share.mean()),
         )
-        doubts += _doubts_of_path(
+        doubts += doubts_of_path(
             sweep, trajectory.poses, covariance, found.table, pairs, matcher, curves, flags
         )
 
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
-        trusted, sensed, confirmed = _examined(sweep, trajectory.poses, covariance, settings)
-        direction, source = settle_direction(trusted, trajectory.poses, settings.sensors, confirmed)
+        sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
+        direction, source = settle_direction(
+            sensors.telling, trajectory.poses, settings.sensors, sensors.turn_confirmed
+        )
 
     # -> orientation-consistent subset -> its own trajectory
     with times.of(PLANES):
-        subset, used = _consistent(trusted, table, pairs, direction, reader, settings)
+        subset, used = _consistent(sensors.trusted, table, pairs, direction, reader, settings)
 
     if sink:
         for rows in reader.rows(table, pairs, edges, used, direction, scale_sigma(coherence)):
@@ -234,7 +236,7 @@ def track(
         coherence=coherence,
         slopes=slopes,
         times=times,
-        doubts=(*doubts, *sensed),
+        doubts=(*doubts, *sensors.doubts),
     )
 
 
@@ -312,58 +314,6 @@ def _measured(
     return pairs, coherence, path
 
 
-def _doubts_of_curves(
-    sweep: Sweep,
-    curves: DecorrelationCurves,
-    matcher: FrameMatcher,
-    reader: PairReader,
-    table: CorrelationTable,
-    sound: BoolArray,
-    flags: IntArray,
-    pairs: Sequence[SignedPair],
-    coherence: Coherence | None,
-    path: FloatArray,
-    config: Config,
-) -> tuple[Doubt, ...]:
-    """What a sweep's own speckle says against the curves; raises if it refutes them."""
-    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
-    factors = reader.depth_factors(table, path, sound, config.coherence)
-    found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
-    return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
-
-
-def _doubts_of_standing(
-    sweep: Sweep, matcher: FrameMatcher, curves: DecorrelationCurves, path: FloatArray, flags: IntArray
-) -> tuple[Doubt, ...]:
-    """Echoes that are the same in frames beyond the reach of speckle."""
-    frames = far_apart(path[:, 0], flags == 0, curves)
-    if len(frames) < 2:
-        return ()
-    share = standing_share(sweep, matcher, frames.tolist())
-    found = standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
-    return unrefuted([found], sweep.name, InsufficientDataError)
-
-
-def _doubts_of_path(
-    sweep: Sweep,
-    image: RigidTransform,
-    covariance: FloatArray,
-    table: CorrelationTable,
-    pairs: Sequence[SignedPair],
-    matcher: FrameMatcher,
-    curves: DecorrelationCurves,
-    flags: IntArray,
-) -> tuple[Doubt, ...]:
-    """A length that is open, a sweep in pieces, a path that pairs contradict."""
-    z_mm, sigma_mm = image.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2])
-    found = (
-        undetermined(z_mm, sigma_mm, float(curves.distance_mm[-1])),
-        severed([pair.first for pair in pairs], [pair.second for pair in pairs], flags == 0),
-        folded(table, image, matcher.patches.centre_mm, flags == 0),
-    )
-    return unrefuted(found, sweep.name, InsufficientDataError)
-
-
 def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
     """Pairs of frames that are to be trusted, shape (e,)."""
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
@@ -395,21 +345,6 @@ def _consistent(
         return None, [pair.plane.used for pair in pairs]
     planes = reader.consistent(table, pairs, sensed, direction)
     return reader.solve(reader.edges(table, pairs, planes)).poses, [plane.used for plane in planes]
-
-
-def _examined(
-    sweep: Sweep, image: RigidTransform, covariance: FloatArray, config: Config
-) -> tuple[Sweep, tuple[Doubt, ...], bool]:
-    """The sweep with what may be used of its sensors, doubts, and whether its sensed turns are confirmed."""
-    if not config.sensors.examine:
-        return sweep, (), True
-    cleaned, doubts = cleaned_readings(sweep)
-    trusted = believed(cleaned, doubts)
-    z_mm = image.apply(sweep.grid.centre_mm)[:, 2]
-    farthest = int(np.argmax(np.abs(z_mm)))
-    sigma = float(np.sqrt(covariance[farthest, 2, 2])) / max(abs(float(z_mm[farthest])), 1e-9)
-    trust = examine_sensors(trusted, image, sigma)
-    return believed(trusted, trust.doubts), (*doubts, *trust.doubts), trust.turn_confirmed
 
 
 def _rejected_share(pairs: Sequence[SignedPair], used: Sequence[BoolArray]) -> float:

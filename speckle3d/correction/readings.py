@@ -21,6 +21,8 @@ _WINDOW = 9
 _SPIKE_SIGMA = 10.0
 _SPIKE_MM, _SPIKE_RAD = 3.0, float(np.deg2rad(5.0))
 """No hand goes so far and back between readings: at 50 Hz it would take 7 m/s^2 and 220 rad/s^2."""
+_SLIP_MM_S, _SLIP_RAD_S = 250.0, float(np.deg2rad(300.0))
+"""No scan is so fast, from one reading to the next."""
 _STILL = 1e-9
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
 
@@ -43,6 +45,20 @@ def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
 def _medians(values: FloatArray) -> FloatArray:
     """Running medians along the first axis."""
     return np.asarray(median_filter(values, (_WINDOW, *[1] * (values.ndim - 1)), mode="mirror"))
+
+
+def slips(sensor: OrientationSensor | Tracker) -> int:
+    """Number of places where the readings go on elsewhere than they were, faster than any hand."""
+    samples, pause = sensor.readings.world_from_sensor, np.diff(sensor.readings.time_s)
+    if len(samples) < _WINDOW:
+        return 0
+    rotation = samples.rotation if isinstance(samples, RigidTransform) else samples
+    rate = (rotation[:-1].inv() * rotation[1:]).magnitude() / pause
+    found = rate > max(_SLIP_RAD_S, _SPIKE_SIGMA * float(np.median(rate)))
+    if isinstance(samples, RigidTransform):
+        speed = np.linalg.norm(np.diff(samples.translation, axis=0), axis=1) / pause
+        found |= speed > max(_SLIP_MM_S, _SPIKE_SIGMA * float(np.median(speed)))
+    return int(np.sum(found))
 
 
 def without(sensor: Sensor, left_out: BoolArray) -> Sensor:

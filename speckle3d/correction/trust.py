@@ -25,7 +25,7 @@ from speckle3d.correction.evidence import (
     noise_of,
     total_misfit,
 )
-from speckle3d.correction.readings import Sensor, spikes, standstill, without
+from speckle3d.correction.readings import Sensor, slips, spikes, standstill, without
 from speckle3d.correction.suspects import Suspect, suspects
 
 TRACKER, ORIENTATION = "tracker", "orientation sensor"
@@ -57,6 +57,8 @@ _PREFERENCE = 5.0
 
 _UNEQUAL, _UNEQUAL_SIGMA = 0.06, 3.0
 """Elevational scale between tracker and images: images alone are right to a few per cent."""
+_FAR_FROM_EQUAL = 2.0
+"""Beyond what curves of another probe do to a length."""
 _VERTICAL_DEG, _UPRIGHT_DEG = 25.0, 10.0
 _MOST_BIAS_DEG_S = 3.0
 """Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
@@ -74,10 +76,13 @@ class Trust:
     turn_confirmed : bool
         Whether the images' roll or the gyroscope confirm how the orientation sensor turns, without which it
         tells no sign.
+    misled : frozenset of str
+        Sensors whose motion is not the images', by clock, mounting or convention: these tell no sign either.
     """
 
     doubts: tuple[Doubt, ...]
     turn_confirmed: bool
+    misled: frozenset[str] = frozenset()
 
 
 def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
@@ -101,13 +106,17 @@ def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
 
 def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
     """The sweep without the sensors that are refuted."""
-    refuted = {doubt.about for doubt in doubts if doubt.refuted}
-    if not refuted & {TRACKER, ORIENTATION}:
+    return without_sensors(sweep, frozenset(doubt.about for doubt in doubts if doubt.refuted))
+
+
+def without_sensors(sweep: Sweep, about: frozenset[str]) -> Sweep:
+    """The sweep without sensors of some names, as doubts have them."""
+    if not about & {TRACKER, ORIENTATION}:
         return sweep
     return replace(
         sweep,
-        tracker=None if TRACKER in refuted else sweep.tracker,
-        orientation=None if ORIENTATION in refuted else sweep.orientation,
+        tracker=None if TRACKER in about else sweep.tracker,
+        orientation=None if ORIENTATION in about else sweep.orientation,
     )
 
 
@@ -140,19 +149,27 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) ->
     """
     seen = MotionEvidence(sweep.frame_time_s, sweep.grid.centre_mm, image)
     doubts: list[Doubt] = []
+    misled: set[str] = set()
     if sweep.tracker is not None and _usable(sweep.tracker, seen):
         found = [*_frozen_doubts(sweep.tracker, seen)] or [*_Examination(sweep.tracker, seen).doubts()]
-        doubts += found or _unequal_lengths(sweep.tracker, seen, length_sigma)
+        misled |= {doubt.about for doubt in found}
+        doubts += [*found, *_unequal_lengths(sweep.tracker, seen, length_sigma), *_slip_doubts(sweep.tracker)]
     confirmed = False
     if sweep.orientation is not None and _usable(sweep.orientation, seen):
         examination = _Examination(sweep.orientation, seen)
         found = [*_frozen_doubts(sweep.orientation, seen)] or [*examination.doubts()]
+        misled |= {doubt.about for doubt in found}
         if not found and sweep.tracker is not None and not doubts and _usable(sweep.tracker, seen):
-            found = [*_Examination(sweep.orientation, _tracked(sweep, sweep.tracker)).doubts()]
+            by_tracker = _Examination(sweep.orientation, _tracked(sweep, sweep.tracker)).doubts()
+            # One of the two is wrong, and which is not known.
+            found = [
+                replace(each, suspect=f"{each.suspect}, or the tracker", refuted=False) for each in by_tracker
+            ]
         found = found or [*examination.weak_doubts(), *_gravity_doubts(sweep.orientation)]
+        found += _slip_doubts(sweep.orientation)
         confirmed = examination.turn_confirmed() and not any(doubt.refuted for doubt in found)
         doubts += found
-    return Trust(tuple(doubts), confirmed)
+    return Trust(tuple(doubts), confirmed, frozenset(misled))
 
 
 def _tracked(sweep: Sweep, tracker: Tracker) -> MotionEvidence:
@@ -227,7 +244,10 @@ class _Examination(Generic[Sensor]):
         late, seconds = self._clock()
         least = _CLOCK_GAIN if self.seen.by_images else _CLOCK_GAIN_BY_TRACKER
         if self._beyond(best) and best.total > max(turned.images - _PREFERENCE, late.images):
-            yield Doubt(self.about, best.name, self._evidence(), True)
+            # Where the images go with the readings, it is the gyroscope whose axes are others.
+            otherwise = best.images < -_GYROSCOPE_GAIN
+            name = f"gyroscope on other axes, or {best.name}" if otherwise else best.name
+            yield Doubt(self.about, name, self._evidence(), not otherwise)
         elif late.images > max(least, turned.images):
             side = "later" if seconds > 0 else "earlier"
             whose = "images'" if self.seen.by_images else "tracker's"
@@ -306,6 +326,14 @@ class _Examination(Generic[Sensor]):
         return f"{seen}{last.noise[part]:.2f} {unit}, got a difference of {last.left[part]:.2f}"
 
 
+def _slip_doubts(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
+    """Readings that go on elsewhere: a sensor that slipped, or a tracker that found itself anew."""
+    count = slips(sensor)
+    if count:
+        evidence = f"expected a path that a hand can follow, got {count} jumps in it"
+        yield Doubt(name_of(sensor), "slip, or readings lost and found elsewhere", evidence, False)
+
+
 def _frozen_doubts(sensor: OrientationSensor | Tracker, seen: MotionEvidence) -> Iterator[Doubt]:
     """Readings that are all the same while the images move."""
     begin, end = standstill(sensor)
@@ -339,7 +367,8 @@ def _unequal_lengths(tracker: Tracker, seen: MotionEvidence, length_sigma: float
         evidence = (
             f"expected to travel as far as the images, to {100 * both:.1f} %, got {scale:.3f} times as far"
         )
-        yield Doubt(TRACKER, "its scale, or curves of another probe", evidence, False)
+        far = max(scale, 1.0 / max(scale, 1e-9)) > _FAR_FROM_EQUAL
+        yield Doubt(TRACKER, "its scale, or curves of another probe", evidence, far)
 
 
 def _gravity_doubts(sensor: OrientationSensor) -> Iterator[Doubt]:

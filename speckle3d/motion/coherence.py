@@ -260,7 +260,9 @@ def _best_scale(cost: FloatArray, scales: FloatArray) -> tuple[FloatArray, float
     k = int(np.clip(np.argmin(total), 1, scales.size - 2))
     width = np.log(scales[1] / scales[0])
     curvature = (total[k - 1] - 2 * total[k] + total[k + 1]) / width**2
-    return np.exp(best), float(np.sqrt(2 / max(curvature, 1e-6)))
+    # A likelihood without curvature leaves the scale anywhere in the range that is searched first.
+    anywhere = np.log(COARSE_SCALES[-1] / COARSE_SCALES[0]) / np.sqrt(12.0)
+    return np.exp(best), float(min(np.sqrt(2 / max(curvature, 1e-6)), anywhere))
 
 
 def vertex(x: FloatArray, cost: FloatArray) -> float:

@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from faults import FAULTS_BY_NAME, ORIENTATION, TRACKER
+from rare_faults import RARE
 
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError
-from speckle3d.correction.trust import believed, cleaned_readings, examine_sensors
+from speckle3d.correction.trust import believed, cleaned_readings, examine_sensors, without_sensors
 from speckle3d.motion.direction import settle_direction
 from speckle3d.pipeline import correct
 
@@ -20,8 +21,13 @@ UNTOLD = {
     "tracker clock off by -0.25 s",
     *(f"orientation clock off by {late} s" for late in (0.25, -0.25, 0.5, 1.0)),
     *(f"orientation mount turned by 20 deg about {axis}" for axis in "xyz"),
+    "orientation lags by a filter of 30 readings",
 }
-FAULTS = [fault for fault in (*TRACKER, *ORIENTATION) if fault.name not in UNTOLD and fault.honest != "stand"]
+FAULTS = [
+    fault
+    for fault in (*TRACKER, *ORIENTATION, *(each for each in RARE if "image" not in each.corrupts))
+    if fault.name not in UNTOLD and fault.honest != "stand"
+]
 
 
 def examined(sweep, tracked):
@@ -44,8 +50,9 @@ def test_a_fault_is_seen_and_the_right_sensor_named(fault, sweep, tracked):
     doubts, _ = examined(fault.into(sweep), tracked)
     assert doubts, "nothing was said"
     assert {doubt.about for doubt in doubts} == {fault.about}
-    # A clock that is off by seconds, or another sweep's stream, may pass for the other.
-    if fault.honest == "refuse" and "another" not in fault.name:
+    # Another sweep's stream may pass for a late one, and where an orientation sensor and a tracker contradict
+    # each other alone, either may be wrong.
+    if fault.honest == "refuse" and fault.about == "tracker" and "another" not in fault.name:
         assert any(doubt.refuted for doubt in doubts)
 
 
@@ -118,3 +125,18 @@ def test_what_is_refuted_can_be_used_all_the_same(sweep, tracked):
     bad = FAULTS_BY_NAME["tracker in metres"].into(sweep)
     config = Config(sensors={"examine": False})
     assert len(correct(tracked, bad, ["pose"], config)["pose"].poses) == len(sweep)
+
+
+def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracked):
+    turned_round = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
+    doubts, _ = examined(replace(sweep, tracker=None, orientation=turned_round), tracked)
+    assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in doubts] == [(False, True)]
+
+
+def test_a_sensor_whose_motion_is_not_the_images_tells_no_sign(sweep, tracked):
+    late = FAULTS_BY_NAME["tracker clock off by 0.5 s"].into(sweep)
+    _, trust = examined(late, tracked)
+    assert trust.misled == {"tracker"}
+    assert without_sensors(late, trust.misled).tracker is None
+    _, trust = examined(FAULTS_BY_NAME["tracker x 1.1"].into(sweep), tracked)
+    assert trust.misled == frozenset()

@@ -135,7 +135,7 @@ def test_no_sums_over_a_turn_and_none_of_hardly_any_distance():
 
 
 @pytest.mark.parametrize(
-    ("read", "refuted"),
+    ("read", "doubted"),
     [
         (lambda d: 1.5 * d, []),
         (lambda d: np.maximum(d - 0.15, 1e-3), [True]),
@@ -143,9 +143,9 @@ def test_no_sums_over_a_turn_and_none_of_hardly_any_distance():
     ],
     ids=["scaled: cannot be told", "noise taken away", "noise left"],
 )
-def test_sums_tell_curves_of_another_shape(read, refuted):
+def test_sums_tell_curves_of_another_shape(read, doubted):
     ratios = sum_ratios(*pairs_of(THERE_AND_BACK, 0.5, read), 0.01)
-    assert [d.refuted for d in doubt_sums(ratios)] == refuted
+    assert len(doubt_sums(ratios)) == doubted
     assert doubt_sums(ratios[:5]) == ()
 
 
