@@ -44,8 +44,8 @@ UNSEEN_NOISE, REFUTED_NOISE = 1.8, 2.5
 up to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
 UNEVEN = 0.32
 """Median logarithm of two steps' sum over the one step that spans both, either sign. Simulated: below 0.02 in
-half of 64 good sweeps, 0.24 in the worst; with a fifth of the curves' correlation missing 0.38. Noise bends it
-in images of few patches: alone, it refutes nothing."""
+half of 64 good sweeps, 0.24 in the worst; with a fifth of the curves' correlation missing 0.38. Noise moves
+it in images of few patches: alone, it refutes nothing."""
 LEAST_TRIPLES = 12
 FLAT = 0.3
 """Part of the distance that halves the correlation, below which it is too flat for distances to be summed."""

@@ -137,9 +137,9 @@ def test_no_sums_over_a_turn_and_none_of_hardly_any_distance():
 @pytest.mark.parametrize(
     ("read", "doubted"),
     [
-        (lambda d: 1.5 * d, []),
-        (lambda d: np.maximum(d - 0.15, 1e-3), [True]),
-        (lambda d: np.hypot(d, 0.25), [False]),
+        (lambda d: 1.5 * d, 0),
+        (lambda d: np.maximum(d - 0.15, 1e-3), 1),
+        (lambda d: np.hypot(d, 0.25), 1),
     ],
     ids=["scaled: cannot be told", "noise taken away", "noise left"],
 )
