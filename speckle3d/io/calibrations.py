@@ -36,6 +36,7 @@ from speckle3d.io.hdf5 import (
     sha256_of,
     write_attributes,
 )
+from speckle3d.io.hdf5_guard import plain_attribute
 
 FORMAT = "speckle3d.calibration"
 
@@ -187,7 +188,7 @@ def _require_spread(values: FloatArray, where: str) -> None:
 
 def _read_condition(file: h5py.File) -> float:
     """Read the condition number, which may be infinite, unlike other attributes."""
-    raw = np.asarray(file.attrs.get("condition_number", np.nan))
+    raw = np.asarray(plain_attribute(file, "condition_number"))
     if raw.dtype.kind not in "fiu" or raw.size != 1 or np.isnan(raw).any():
         raise InvalidInputError("attribute condition_number: expected a number, got none")
     return float(raw.ravel()[0])

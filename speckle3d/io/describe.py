@@ -18,6 +18,7 @@ from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
+from speckle3d.io.hdf5_guard import plain_attribute
 from speckle3d.io.headers import read_header
 from speckle3d.io.load import IMAGE, kind_of
 from speckle3d.io.metaimage import image_orientation, image_type
@@ -168,13 +169,14 @@ def _describe_curves(path: PathLike) -> list[Row]:
     rows: list[Row] = []
     curves.read_curves(path)
     with reading(path), open_hdf5(path) as file:
-        for name, value in file.attrs.items():
+        for name in file.attrs:
             if name != "format":
                 spoken, unit = _spoken(name)
-                rows.append((spoken, str(value), unit))
-        groups = [name for name in file if isinstance(find_member(file, name), h5py.Group)]
-        below = [f"{name}/{inner}" for name in groups for inner in require_group(file, name)]
-        for name in sorted({*file, *below} - {*groups}):
+                rows.append((spoken, str(plain_attribute(file, name)), unit))
+        names = {name for name in file if isinstance(name, str)}
+        groups = {name for name in names if isinstance(find_member(file, name), h5py.Group)}
+        below = {f"{name}/{inner}" for name in groups for inner in require_group(file, name)}
+        for name in sorted((names | below) - groups):
             shape = " x ".join(str(n) for n in require_dataset(file, name).shape)
             rows.append((_spoken(name)[0], shape, "values"))
     return rows

@@ -22,7 +22,14 @@ from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
-from speckle3d.io.hdf5_guard import follow, require_held, require_readable, require_sound_heaps, require_texts
+from speckle3d.io.hdf5_guard import (
+    follow,
+    plain_attribute,
+    require_held,
+    require_readable,
+    require_sound_heaps,
+    require_texts,
+)
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
@@ -309,8 +316,8 @@ def read_attribute(node: Node, name: str, default: float | None = None) -> float
 def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     """Read an attribute of `size` finite numbers as a flat array."""
     where = f"{locate(node)} attribute {name}"
-    with reading(where):
-        raw = node.attrs.get(name)
+    with reading(where), naming(where):
+        raw = plain_attribute(node, name)
     value = np.asarray(raw)
     if value.dtype.kind not in "fiu" or value.size != size or not np.isfinite(value).all():
         raise InvalidInputError(f"{where}: expected {size} finite number(s), got {_shown(raw)}")
@@ -320,8 +327,8 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
 def read_text(node: Node, name: str) -> str:
     """Read a text attribute."""
     where = f"{locate(node)} attribute {name}"
-    with reading(where):
-        raw = node.attrs.get(name)
+    with reading(where), naming(where):
+        raw = plain_attribute(node, name)
     if isinstance(raw, bytes):
         raw = raw.decode("utf-8", errors="replace")
     if not isinstance(raw, str):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Iterator
 from io import BufferedReader
 from typing import Any, TypeAlias
 
@@ -46,11 +47,15 @@ _REFERENCE = np.dtype([("length", "<u4"), ("place", "<u8"), ("index", "<u4")])
 _HEAP = b"GCOL"
 """First bytes of the places in a file that hold texts."""
 
+_CONTINUED, _ATTRIBUTE = 0x10, 0x0C
+"""Messages in an object's header."""
+_MOST_BLOCKS = 64
+
 _HEAP_START = _HEAP + b"\1\0\0\0"
 _SEARCHED_BYTES = 2**25
 
 
-def follow(group: h5py.Group, name: str) -> Any:
+def follow(group: h5py.Group, name: str | bytes) -> Any:
     """Find a member of `group` by its path, never out of the file.
 
     Returns
@@ -64,7 +69,8 @@ def follow(group: h5py.Group, name: str) -> Any:
         If the name is a link to another file, or to nothing.
     """
     node: Any = group
-    ahead, hops = _steps(name.encode("utf-8", "surrogateescape")), 0
+    # h5py gives names that are no text as bytes.
+    ahead, hops = _steps(name if isinstance(name, bytes) else name.encode("utf-8", "surrogateescape")), 0
     while ahead:
         step = ahead.pop()
         if not isinstance(node, h5py.Group) or not node.id.links.exists(step):
@@ -105,10 +111,11 @@ def require_sound_heaps(path: PathLike) -> None:
             stream.seek(start)
             content, at = stream.read(stop - start), -1
             while (at := content.find(_HEAP_START, at + 1)) >= 0:
-                _require_sound_heap(path, stream, start + at, size)
+                _entries_of_heap(path, stream, start + at, size)
 
 
-def _require_sound_heap(path: PathLike, stream: BufferedReader, start: int, file_bytes: int) -> None:
+def _entries_of_heap(path: PathLike, stream: BufferedReader, start: int, file_bytes: int) -> dict[int, int]:
+    """Length of each text in a heap, by its index."""
     where = f"{path}: heap at byte {start}"
     stream.seek(start)
     (length,) = struct.unpack("<8xQ", stream.read(16).ljust(16, b"\0"))
@@ -116,12 +123,16 @@ def _require_sound_heap(path: PathLike, stream: BufferedReader, start: int, file
         raise FileError(f"{where}: expected it in the file, got {length} bytes")
     stream.seek(start)
     heap, at = stream.read(length), 16
+    entries: dict[int, int] = {}
     while at + 16 <= length:
         index, size = struct.unpack_from("<H6xQ", heap, at)
         step = size if index == 0 else 16 + -(-size // 8) * 8
         if not 16 <= step <= length - at:
             raise FileError(f"{where}: expected entries of 16 bytes or more, got {step}")
+        if index:
+            entries[index] = size
         at += step
+    return entries
 
 
 def require_held(node: h5py.Dataset) -> None:
@@ -205,11 +216,23 @@ def require_texts(node: h5py.Dataset) -> None:
         raise InvalidInputError("expected texts stored in one run, got chunks")
     with open_regular(node.file.filename) as stream:
         stream.seek(at)
-        references = np.frombuffer(stream.read(node.size * _REFERENCE.itemsize), dtype=_REFERENCE)
-        for i, (length, place, _) in enumerate(references.tolist()):
+        _require_in_heaps(
+            stream, stream.read(node.size * _REFERENCE.itemsize), file_bytes, node.file.filename
+        )
+
+
+def _require_in_heaps(stream: BufferedReader, references: bytes, file_bytes: int, path: str) -> None:
+    """Refuse references to texts that are not where they say, or not so long."""
+    heaps: dict[int, dict[int, int]] = {}
+    for i, (length, place, index) in enumerate(np.frombuffer(references, dtype=_REFERENCE).tolist()):
+        if not length:
+            continue
+        if place not in heaps:
             stream.seek(min(place, file_bytes))
-            if length and (length > file_bytes or stream.read(len(_HEAP)) != _HEAP):
-                raise InvalidInputError(f"[{i}]: expected a text in the file, got {length} bytes at {place}")
+            is_heap = stream.read(len(_HEAP)) == _HEAP
+            heaps[place] = _entries_of_heap(path, stream, place, file_bytes) if is_heap else {}
+        if length > heaps[place].get(index, 0):
+            raise InvalidInputError(f"[{i}]: expected a text in the file, got {length} bytes at {place}")
 
 
 def require_whole_chunk(node: h5py.Dataset, offset: Offset) -> None:
@@ -358,3 +381,60 @@ def _lzf_length(packed: bytes) -> int:
     from speckle3d.kernels.packing import lzf_length
 
     return int(lzf_length(np.frombuffer(packed, dtype=np.uint8)))
+
+
+def plain_attribute(node: h5py.Group | h5py.Dataset, name: str) -> Any:
+    """Value of an attribute of numbers or text; None if there is none.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is of another kind, among which are some that HDF5 does not survive where a file is damaged.
+    """
+    if name not in node.attrs:
+        return None
+    attribute = node.attrs.get_id(name)
+    kind = attribute.get_type()
+    if kind.get_class() not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM):
+        raise InvalidInputError(f"expected a number or a text, got HDF5's type {kind.get_class()}")
+    if isinstance(kind, h5py.h5t.TypeStringID) and kind.is_variable_str():
+        size = attribute.get_space().get_simple_extent_npoints() * _REFERENCE.itemsize
+        with open_regular(node.file.filename) as stream:
+            file_bytes = node.file.id.get_filesize()
+            for value in _attribute_values(stream, h5py.h5o.get_info(node.id).addr, name, file_bytes):
+                _require_in_heaps(stream, value[:size], file_bytes, node.file.filename)
+    return node.attrs[name]
+
+
+def _attribute_values(stream: BufferedReader, address: int, name: str, file_bytes: int) -> Iterator[bytes]:
+    """Bytes of an attribute in an object's header of version 1, which h5py writes; none of another version.
+
+    References
+    ----------
+    .. [1] HDF5 File Format Specification 3.0, IV.A.1.a and IV.A.2.m.
+    """
+    stream.seek(address)
+    version, size = struct.unpack("<B7xI", stream.read(12).ljust(12, b"\0"))
+    blocks = [(address + 16, size)] if version == 1 else []
+    for at, length in blocks:
+        stream.seek(min(at, file_bytes))
+        content, start = stream.read(min(length, file_bytes)), 0
+        while start + 8 <= len(content):
+            kind, size = struct.unpack_from("<HH", content, start)
+            message = content[start + 8 : start + 8 + size]
+            start += 8 + size
+            if kind == _CONTINUED and len(message) >= 16 and len(blocks) < _MOST_BLOCKS:
+                blocks.append(struct.unpack_from("<QQ", message))
+            elif kind == _ATTRIBUTE and len(message) >= 8:
+                named, value = _parted(message)
+                if named == name.encode("utf-8", "surrogateescape"):
+                    yield value
+
+
+def _parted(message: bytes) -> tuple[bytes, bytes]:
+    """Name and value of an attribute's message."""
+    version, *sizes = struct.unpack_from("<BxHHH", message)
+    padded = [-(-size // 8) * 8 if version == 1 else size for size in sizes]
+    start = 9 if version == 3 else 8
+    name = message[start : start + sizes[0]].split(b"\0")[0]
+    return name, message[start + sum(padded) :]

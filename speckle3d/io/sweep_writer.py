@@ -25,7 +25,7 @@ from speckle3d.core.sweep import (
     Tracker,
 )
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
-from speckle3d.io.hdf5_guard import require_own
+from speckle3d.io.hdf5_guard import plain_attribute, require_own
 from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
 
 Compression = Literal["gzip", "lzf"] | None
@@ -129,9 +129,9 @@ class SweepWriter(HDF5Writer):
             for name in other:
                 if name not in KNOWN and name not in self._file:
                     other.copy(require_own(other, name), self._file, name)
-            for name, value in other.attrs.items():
+            for name in other.attrs:
                 if name not in self._file.attrs:
-                    self._file.attrs[name] = value
+                    self._file.attrs[name] = plain_attribute(other, name)
 
     def _write(self, i: int, frame: npt.NDArray[Any]) -> None:
         self._frames.set_extent((i + 1, *frame.shape))

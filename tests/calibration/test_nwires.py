@@ -198,6 +198,7 @@ def test_a_start_from_published_points_is_the_published_calibration(realdata, fc
     np.testing.assert_allclose(start.pixel_mm, np.linalg.norm(matrix[:3, :2], axis=0), rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_dots_found_here_calibrate_real_images_for_others(realdata, fcal):
     known = ImportSettings(column_pitch_mm=0.08, row_spacing_mm=0.0745, dynamic_range_db=60.0)

@@ -30,6 +30,7 @@ def test_info_tells_what_a_sweep_holds(run, bench):
     assert "26 x 1800" in out
 
 
+@pytest.mark.slow
 def test_a_simulation_is_told_in_the_file_and_comes_again(run, bench, tmp_path):
     again = tmp_path / "again.h5"
     assert run("simulate", again, *SMALL, "--length-mm", "3", "--frames", "24")[0] == 0

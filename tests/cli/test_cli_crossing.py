@@ -47,6 +47,7 @@ def start_of(mounting):
 PIXELS = ("--pixel-mm", GRID.vector_pitch_mm, GRID.sample_spacing_mm)
 
 
+@pytest.mark.slow
 def test_two_sequences_give_a_calibration_with_its_report(run, sequences, tmp_path):
     first, second, truth = sequences
     start = crossing_scenes.displaced(truth, np.random.default_rng(3), 2.0, 2.0)

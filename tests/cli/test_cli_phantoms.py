@@ -106,6 +106,7 @@ def test_a_plane_calibrates_what_a_sensor_says_of_orientation(run, scans, tmp_pa
     assert "orientation" in table
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_off_is_found(run, scans, tmp_path):
     out, true = tmp_path / "c.h5", clock_of(scans / "bar.h5")
 
@@ -286,6 +287,7 @@ def test_real_n_wires_calibrate_better_than_published(run, realdata, tmp_path):
     assert mean["validation"] <= 0.540
 
 
+@pytest.mark.slow
 def test_repeated_calibrations_are_compared(run, refused, scans, tmp_path):
     files = [tmp_path / name for name in ("a.h5", "b.h5")]
     for scan, out in zip(("bar.h5", "noisy.h5"), files, strict=True):

@@ -90,6 +90,7 @@ def test_what_a_process_was_started_to_ignore_stays_ignored(run, monkeypatch):
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.slow
 def test_told_to_end_it_leaves_nothing_and_the_next_run_works(bench, tmp_path):
     out = tmp_path / "above" / "o"
     first = started(tmp_path, *reconstruct(bench, out))

@@ -103,6 +103,7 @@ def test_radius_caps_the_filling():
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(volume.voxels[4, 4])), np.arange(4, 17))
 
 
+@pytest.mark.slow
 def test_one_frame_in_memory_at_a_time():
     alive = []
 

@@ -13,6 +13,7 @@ from calibration_files import made
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.calibrations import read_calibration, write_calibration
 from speckle3d.io.challenge import is_challenge_scan
+from speckle3d.io.hdf5 import read_attribute, read_text
 from speckle3d.io.hdf5_guard import follow, require_texts
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.sweeps import read_sweep
@@ -276,3 +277,37 @@ def test_what_is_no_file_is_refused_at_once_by_every_reader(tmp_path, name):
     for read in readers:
         with pytest.raises(FileError, match=name):
             read(tmp_path / name)
+
+
+def test_a_text_attribute_whose_text_is_gone_is_refused(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["sensor"] = "a tracker"
+    content = bytearray(path.read_bytes())
+    content[content.index(b"GCOL") + 16] = 238  # the entry's number: HDF5 does not survive its absence
+    path.write_bytes(content)
+    with h5py.File(path) as file, pytest.raises(InvalidInputError, match=r"sensor.*9 bytes"):
+        read_text(file, "sensor")
+
+
+def test_a_text_attribute_written_over_is_read(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for k in range(20):
+            file.attrs[f"text{k}"] = "first"
+    with h5py.File(path, "r+") as file:
+        for k in range(20):
+            file.attrs[f"text{k}"] = f"second, longer, and number {k}"
+        del file.attrs["text3"]
+    with h5py.File(path) as file:
+        assert [read_text(file, f"text{k}") for k in (0, 19)] == [
+            "second, longer, and number 0",
+            "second, longer, and number 19",
+        ]
+
+
+def test_an_attribute_that_is_neither_number_nor_text_is_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs.create("rms", np.zeros(1), dtype=np.dtype([("x", float)]))
+    with h5py.File(tmp_path / "a.h5") as file, pytest.raises(InvalidInputError, match=r"rms.*type"):
+        read_attribute(file, "rms")

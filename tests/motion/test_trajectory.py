@@ -356,6 +356,7 @@ def test_the_chain_takes_the_pair_whose_distance_is_surest_for_its_size():
 # ---- covariance --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_marginal_covariance_is_that_of_many_draws():
     """Errors in each frame's own axes, over draws of all pairs' errors."""
     draws, frames = 400, 6

@@ -72,6 +72,7 @@ def seen_angles(sweep, world_normal=(0.0, 0.0, -1.0)):
     return np.rad2deg(tilt), np.rad2deg(roll), depth
 
 
+@pytest.mark.slow
 def test_the_bars_echo_lies_in_the_plane_that_the_truth_says():
     sweep = plane(reflector="bar", frames=8, snr_db=60.0).sweep
     for i in range(8):

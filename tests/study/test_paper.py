@@ -46,6 +46,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(paper, "SWEEPS", {"beef-1": settings})
 
 
+@pytest.mark.slow
 def test_the_study_simulates_once_and_compares_with_the_tracker_and_the_truth(tiny, shipped, tmp_path):
     told = []
     _, table = paper.paper_study(tmp_path, shipped / "curves.h5", simulated=lambda *at: told.append(at))

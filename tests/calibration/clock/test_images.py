@@ -112,12 +112,14 @@ def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, ch
         delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), 0.4, 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [0.6, -0.6])
 def test_a_delay_far_outside_the_range_is_refused(recording, offset_s):
     with pytest.raises(InsufficientDataError):
         delay_from_images(tracked(recording, offset_s), RigidTransform.identity(), 0.3, 20)
 
 
+@pytest.mark.slow
 def test_noise_twice_the_picture_hides_no_delay(recording):
     whole = tracked(recording, 0.03)
     rough = whole.images + 2.0 * whole.images.std() * noise(whole.images)

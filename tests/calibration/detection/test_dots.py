@@ -155,6 +155,7 @@ def test_a_bad_frame_is_named():
         dots_in_frames(frames, PIXEL_MM)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_real_wires_are_found_where_others_found_them(realdata):
     folder = realdata / "plus"

@@ -26,6 +26,7 @@ def settled(refined):
     return settle(refined)[0]
 
 
+@pytest.mark.slow
 def test_the_similarity_falls_as_its_curvature_says(refined, settled):
     held = dataclasses.replace(settled, weight=refined.weight)
     bend = curvature(held)

@@ -121,6 +121,7 @@ def test_pixel_sizes_are_found():
     assert (held.scale_errors == 0.0).all()
 
 
+@pytest.mark.slow
 def test_published_method_reaches_the_same_from_nearby(others):
     first, second, truth = others
     start = displaced(truth, np.random.default_rng(5), 4.0, 4.0)
