@@ -17,8 +17,8 @@ from .io.reconstructions import read_reconstruction as read_reconstruction
 from .io.sweep_writer import write_sweep as write_sweep
 from .io.volumes import read_volume as read_volume
 from .io.volumes import write_volume as write_volume
+from .phantom_curves import calibrate_curves as calibrate_curves
 from .pipeline import Tracked as Tracked
-from .pipeline import calibrate_curves as calibrate_curves
 from .pipeline import correct as correct
 from .pipeline import track as track
 from .scoring.lengths import ModeError as ModeError

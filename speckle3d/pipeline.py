@@ -7,7 +7,7 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -34,17 +34,15 @@ from speckle3d.matching.blocks import (
     match_block,
     match_sweep,
 )
-from speckle3d.matching.chosen import match_again, match_in_order
+from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import doubt_band, speckle_size
+from speckle3d.matching.texture import doubt_band
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import doubt_depths, doubt_widths
-from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
-from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
@@ -354,50 +352,6 @@ def _rejected_share(pairs: Sequence[SignedPair], used: Sequence[BoolArray]) -> f
 
 def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:
     return poses if direction > 0 else mirrored(poses)
-
-
-def calibrate_curves(
-    sweeps: Sequence[Sweep], config: Config | None = None, progress: Progress | None = None
-) -> DecorrelationCurves:
-    """Measure decorrelation curves on phantom sweeps whose positions are known.
-
-    Parameters
-    ----------
-    sweeps : sequence of Sweep
-        Fully developed speckle in steps or by hand; with some that turn, the curves learn what tilt does.
-    config : Config, optional
-    progress : callable, optional
-        Called with frames done and frames in all.
-
-    Raises
-    ------
-    InsufficientDataError
-        If positions are not known, or the distances do not span the curves.
-    MismatchError
-        If the sweeps differ in probe, frequency or sampling.
-    """
-    settings = config or Config()
-    if not sweeps:
-        raise InsufficientDataError("expected at least one phantom sweep, got none")
-    samples, keys, sizes = [], [], []
-    total, before = sum(len(sweep) for sweep in sweeps), 0
-    for sweep in sweeps:
-        matcher = FrameMatcher(
-            sweep, settings.intensity, settings.patches, settings.inplane, settings.matching
-        )
-        keys.append(matcher.key)
-        keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
-        wanted = phantom_pairs(sweep, settings.curves)
-        matches = match_in_order(sweep, matcher, wanted, _shifted(progress, before, total))
-        samples.append(phantom_samples(sweep, matcher.patches, matches))
-        sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
-        before += len(sweep)
-    curves = fit_curves(keys[0], samples, settings.curves)
-    return replace(curves, speckle=phantom_speckle(curves.depth_mm, sizes))
-
-
-def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
-    return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def correct(

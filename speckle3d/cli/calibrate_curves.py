@@ -30,7 +30,7 @@ def calibrate_curves(
     """Measure decorrelation curves on phantom sweeps with known positions (/truth, or else /tracker)."""
     from speckle3d.io.curves import write_curves
     from speckle3d.io.load import load_sweep
-    from speckle3d.pipeline import calibrate_curves as measure
+    from speckle3d.phantom_curves import calibrate_curves as measure
 
     require_own_place(out, "curves", *phantoms, config_file)
     with progress_bar("correlating phantom frames") as progress:

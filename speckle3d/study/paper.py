@@ -32,7 +32,7 @@ from speckle3d.io.hdf5 import make_folder, one_line
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.pipeline import calibrate_curves
+from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.scoring.lengths import ModeError, compare_modes
 from speckle3d.scoring.statistics import MeanInterval, mean_interval
 from speckle3d.simulation.presets import SimulationSettings, simulate

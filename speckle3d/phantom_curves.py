@@ -1,0 +1,64 @@
+"""Decorrelation curves from phantom sweeps whose positions are known.
+
+RF -> intensity -> in-plane motion -> patch correlation -> correlation against |distance|, by depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from speckle3d.config import Config
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import Sweep
+from speckle3d.matching.chosen import match_in_order
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.texture import speckle_size
+from speckle3d.motion.decorrelation import fit_curves
+from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
+from speckle3d.pipeline import Progress
+
+
+def calibrate_curves(
+    sweeps: Sequence[Sweep], config: Config | None = None, progress: Progress | None = None
+) -> DecorrelationCurves:
+    """Measure decorrelation curves on phantom sweeps whose positions are known.
+
+    Parameters
+    ----------
+    sweeps : sequence of Sweep
+        Fully developed speckle in steps or by hand; with some that turn, the curves learn what tilt does.
+    config : Config, optional
+    progress : callable, optional
+        Called with frames done and frames in all.
+
+    Raises
+    ------
+    InsufficientDataError
+        If positions are not known, or the distances do not span the curves.
+    MismatchError
+        If the sweeps differ in probe, frequency or sampling.
+    """
+    settings = config or Config()
+    if not sweeps:
+        raise InsufficientDataError("expected at least one phantom sweep, got none")
+    samples, keys, sizes = [], [], []
+    total, before = sum(len(sweep) for sweep in sweeps), 0
+    for sweep in sweeps:
+        matcher = FrameMatcher(
+            sweep, settings.intensity, settings.patches, settings.inplane, settings.matching
+        )
+        keys.append(matcher.key)
+        keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
+        wanted = phantom_pairs(sweep, settings.curves)
+        matches = match_in_order(sweep, matcher, wanted, _shifted(progress, before, total))
+        samples.append(phantom_samples(sweep, matcher.patches, matches))
+        sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
+        before += len(sweep)
+    curves = fit_curves(keys[0], samples, settings.curves)
+    return replace(curves, speckle=phantom_speckle(curves.depth_mm, sizes))
+
+
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    return None if progress is None else lambda done, _: progress(before + done, total)
