@@ -52,29 +52,37 @@ class ImagePoints:
         Translation in mm.
     wire : ndarray of int, shape (n,), optional
         The wire each point lies on.
+    time_s : ndarray, shape (n,), optional
+        When each point's frame was taken; without it, frames are taken to be evenly spaced. A sensor's error
+        wanders with it.
     """
 
     pixels: FloatArray
     frame: IntArray
     world_from_sensor: RigidTransform
     wire: IntArray | None = None
+    time_s: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or self.pixels.shape[1] != 2:
             raise InvalidInputError(f"pixels: expected shape (n, 2), got {self.pixels.shape}")
         require_finite(self.pixels, "pixels")
         counts = {len(self.pixels), len(self.frame), len(self.world_from_sensor)}
-        if self.wire is not None:
-            counts.add(len(self.wire))
+        counts |= {len(one) for one in (self.wire, self.time_s) if one is not None}
         if len(counts) > 1:
-            raise MismatchError(f"expected as many points as frames, poses and wires, got {sorted(counts)}")
+            raise MismatchError(
+                f"expected as many points as frames, poses, wires and times, got {sorted(counts)}"
+            )
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def __getitem__(self, chosen: BoolArray | IntArray | slice) -> ImagePoints:
         wire = None if self.wire is None else self.wire[chosen]
-        return ImagePoints(self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire)
+        time_s = None if self.time_s is None else self.time_s[chosen]
+        return ImagePoints(
+            self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire, time_s
+        )
 
     @cached_property
     def turns(self) -> FloatArray:
@@ -96,13 +104,24 @@ class ImagePoints:
         places = np.unique(np.linspace(0, len(self.frames) - 1, count).astype(int))
         return self[np.isin(self.frame, self.frames[places])]
 
+    @property
+    def times(self) -> FloatArray:
+        """`time_s`, or the frames' numbers where times are not known, shape (n,)."""
+        return np.asarray(self.frame, dtype=float) if self.time_s is None else self.time_s
+
     @classmethod
     def of_lines(
-        cls, frame: IntArray, points_px: FloatArray, world_from_sensor: RigidTransform
+        cls,
+        frame: IntArray,
+        points_px: FloatArray,
+        world_from_sensor: RigidTransform,
+        time_s: FloatArray | None = None,
     ) -> ImagePoints:
-        """Two points of a line in each frame: m frames and poses, `points_px` of shape (m, 2, 2)."""
+        """Two points of a line in each frame: m frames, poses and times, `points_px` of shape (m, 2, 2)."""
         twice = np.repeat(np.arange(len(frame)), 2)
-        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], world_from_sensor[twice])
+        times = None if time_s is None else np.asarray(time_s)[twice]
+        poses = world_from_sensor[twice]
+        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], poses, time_s=times)
 
 
 @dataclass(frozen=True)
@@ -138,11 +157,11 @@ class Seen:
         """Whether lines were found, not dots."""
         return self.pixels.ndim == 3
 
-    def points(self, world_from_sensor: RigidTransform) -> ImagePoints:
-        """Join with the sensor's pose at each line or dot."""
+    def points(self, world_from_sensor: RigidTransform, time_s: FloatArray | None = None) -> ImagePoints:
+        """Join with the sensor's pose and the time of each line or dot."""
         if self.are_lines:
-            return ImagePoints.of_lines(self.frame, self.pixels, world_from_sensor)
-        return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire)
+            return ImagePoints.of_lines(self.frame, self.pixels, world_from_sensor, time_s)
+        return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire, time_s)
 
 
 def as_directions(lines: ImagePoints) -> ImagePoints:

@@ -208,7 +208,7 @@ def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoin
     read: RigidTransform | Rotation = recording.readings.at(times[there] - offset_s)
     poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
     below_origin = replace(seen, pixels=seen.pixels + np.array([0.0, recording.first_row]))
-    return below_origin[there].points(poses), {**seen.dropped, **missing}
+    return below_origin[there].points(poses, times[there]), {**seen.dropped, **missing}
 
 
 def _finished(
