@@ -17,8 +17,9 @@ from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
-from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
+from calibration.plane import Stages, calibrate_plane
 from calibration.report import Shot, as_calibration
+from calibration.solver import OUTLIER_SIGMA
 from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
