@@ -24,6 +24,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import Fit
+from speckle3d.core.wander import SensorError, WanderingFit
 
 SeenAs = Literal["line", "direction", "dot"]
 
@@ -232,9 +233,8 @@ class ChainSolution:
     fit : Fit
         Of the points used, in frames that lie on the image and on the phantom: there the angles are
         small rotations about the image's z, y and x, wherever the sensor is mounted.
-    covariance : ndarray, shape (p, p)
-        In the same frames, in the order of `free`; residuals may be correlated within a frame (a sensor's
-        error moves all its points) and from frame to frame (it drifts).
+    noise : WanderingFit
+        What the sensor's errors are like, and the covariance that follows.
     points : ImagePoints
         All that were given.
     used : ndarray of bool, shape (n,)
@@ -250,7 +250,7 @@ class ChainSolution:
     phantom: Phantom
     free: tuple[str, ...]
     fit: Fit
-    covariance: FloatArray
+    noise: WanderingFit
     points: ImagePoints
     used: BoolArray
     residuals: FloatArray
@@ -261,6 +261,15 @@ class ChainSolution:
     def angular(self) -> bool:
         """Whether only directions are known: residuals are sines of angles, and nothing has a length."""
         return self.phantom.seen_as == "direction"
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the free parameters, shape (p, p), in frames that lie on the image and on the phantom.
+
+        Residuals are correlated within a frame, for a sensor's error moves all its points, and from frame to
+        frame, for it wanders.
+        """
+        return self.noise.covariance
 
     @property
     def free_columns(self) -> list[int]:
@@ -325,6 +334,29 @@ def free_jacobian(points: ImagePoints, phantom: Phantom, chain: Chain, free: Seq
     """Derivatives by the free parameters in the sensor's and the world's own frames, shape (n r, p)."""
     _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
     return jacobian.reshape(-1, len(CHAIN))[:, [CHAIN.index(name) for name in free]]
+
+
+_PROPORTIONS_MM = (0.5, 2.0, 8.0)
+"""Errors of position over errors of rotation that are tried, mm per degree: trackers are specified at 0.25 mm
+with 0.5 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
+
+
+def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorError:
+    """How residuals move with small turns of the sensor about the world's axes, rad, and with shifts, mm.
+
+    An orientation sensor's inclination wanders alone: its heading hardly moves lines of a plane that is
+    nearly level.
+    """
+    rows, _ = phantom.vanishing(points)
+    in_world = rows @ chain.target_from_world.rotation.as_matrix()
+    flat = np.column_stack([points.pixels * chain.pixel_mm, np.zeros(len(points))])
+    if phantom.seen_as == "direction":
+        along = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.rotation.apply(flat))
+        turned = in_world @ -skew(along)
+        return SensorError(turned.reshape(-1, 3)[:, :2], (np.ones(2),))
+    arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
+    both = np.concatenate([in_world @ -skew(arm), in_world], axis=2)
+    return SensorError(both.reshape(-1, 6), [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in _PROPORTIONS_MM])
 
 
 def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:

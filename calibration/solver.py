@@ -22,17 +22,18 @@ from calibration.chain import (
     Phantom,
     free_jacobian,
     residuals_and_jacobian,
+    sensor_error,
 )
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (
     Fit,
-    clustered_covariance,
     condition_number,
     huber_weights,
     levenberg_marquardt,
     robust_sigma,
 )
+from speckle3d.core.wander import JITTER, WanderingFit, wandering_fit
 
 SOME_FRAMES = 100
 """Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
@@ -46,6 +47,8 @@ _NEARLY_ABSOLUTE = 0.06745
 _REWEIGHTINGS = 8
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
+_WANDERING_STEPS = 2
+"""The first finds the answer, the second its covariance there."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -83,7 +86,7 @@ def solve_chain(
     used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
     for round_ in itertools.count():
         _require_majority(used, points)
-        chain, fit, jacobian = refined(points[used], phantom, chain, free)
+        chain, _, _ = refined(points[used], phantom, chain, free)
         residuals = residuals_of(points, phantom, chain)
         sigma = sigma_of(residuals[used])
         agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
@@ -92,20 +95,41 @@ def solve_chain(
         if (agreeing == used).all():
             break
         used = agreeing
+    chain, noise = _with_wandering_errors(points[used], phantom, chain, free)
+    residuals = residuals_of(points, phantom, chain)
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit, jacobian = refined(points[used], phantom, chain, free)
+    _, fit, _ = refined(points[used], phantom, chain, free)
     return ChainSolution(
         chain,
         phantom,
         free,
         fit,
-        clustered_covariance(jacobian, fit.residuals, points.frame[used]),
+        noise,
         points,
         used,
         residuals,
-        sigma,
+        sigma_of(residuals[used]),
         condition_number(free_jacobian(points[used], phantom, chain, free)),
     )
+
+
+def _with_wandering_errors(
+    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
+) -> tuple[Chain, WanderingFit]:
+    """Steps from a least-squares solution to the one that knows that the sensor's errors wander."""
+    for _ in range(_WANDERING_STEPS):
+        residuals, jacobian = near_jacobian(points, phantom, chain, free)
+        several = residuals.size // len(points)
+        noise = wandering_fit(
+            jacobian,
+            residuals,
+            np.repeat(points.frame, several),
+            np.repeat(points.times, several),
+            sensor_error(points, phantom, chain),
+            (0.0,) if residuals.size == len(points.frames) else JITTER,
+        )
+        chain = moved_by(chain, free, noise.step)
+    return chain, noise
 
 
 def sigma_of(residuals: FloatArray) -> float:
@@ -162,7 +186,7 @@ def refined(
     """
     near = replace(points, world_from_sensor=chain.target_from_image(points))
     columns = np.array([CHAIN.index(name) for name in free])
-    origin = np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
+    origin = _origin(chain)
     scale = 1.0 if weights is None else weights
 
     @lru_cache(maxsize=2)
@@ -181,13 +205,37 @@ def refined(
     )
     found = origin.copy()
     found[columns] = fit.parameters
-    step = Chain.from_parameters(found)
-    moved = Chain(
+    return _moved_to(chain, found), fit, both(fit.parameters)[1]
+
+
+def near_jacobian(
+    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals, shape (n r,), and Jacobian, (n r, p), in frames that lie on the image and on the phantom."""
+    near = replace(points, world_from_sensor=chain.target_from_image(points))
+    residuals, jacobian = residuals_and_jacobian(_origin(chain), near, phantom)
+    columns = [CHAIN.index(name) for name in free]
+    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
+
+
+def moved_by(chain: Chain, free: tuple[str, ...], step: FloatArray) -> Chain:
+    """Add a step in the free parameters, in frames that lie on the image and on the phantom."""
+    parameters = _origin(chain)
+    parameters[[CHAIN.index(name) for name in free]] += step
+    return _moved_to(chain, parameters)
+
+
+def _origin(chain: Chain) -> FloatArray:
+    return np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
+
+
+def _moved_to(chain: Chain, parameters: FloatArray) -> Chain:
+    step = Chain.from_parameters(parameters)
+    return Chain(
         step.pixel_mm,
         chain.sensor_from_image * step.sensor_from_image,
         step.target_from_world * chain.target_from_world,
     )
-    return moved, fit, both(fit.parameters)[1]
 
 
 def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:

@@ -1,4 +1,4 @@
-"""Least squares whose residuals carry a sensor's wandering error: Ornstein-Uhlenbeck processes plus white noise.
+"""Least squares whose residuals carry a sensor's wandering error: Ornstein-Uhlenbeck and white noise.
 
 A sensor's error drifts over seconds, so that neighbouring residuals err alike and many of them say no more
 than a few. The errors are the states of a Kalman filter that passes through the recording once for a whole
@@ -114,7 +114,8 @@ def wandering_fit(
         Of each residual's frame.
     error : SensorError
     jitter : sequence of float
-        Sizes of the error that is new in each frame to try (`JITTER`); zero alone where a frame has one residual.
+        Sizes of the error that is new in each frame to try (`JITTER`); zero alone where a frame has one
+        residual.
     prior : ndarray, shape (p, p), optional
         Inverse covariance of what is known of the parameters besides, in the units of the parameters, about
         the present ones.
@@ -187,7 +188,7 @@ def _grid(error: SensorError, frame_time_s: FloatArray, jitter: Sequence[float])
 def _innovations(
     columns: FloatArray, effects: FloatArray, starts: IntArray, time_s: FloatArray, grid: _Grid
 ) -> tuple[FloatArray, FloatArray]:
-    """Products of the columns' innovations over their variance, (g, p + 1, p + 1), and log determinants, (g,)."""
+    """Products of the columns' innovations, (g, p + 1, p + 1), and logarithms of their variance, (g,)."""
     count, k = grid.unit.shape
     stationary = grid.unit * (grid.wander**2)[:, None]
     shaken = grid.unit * (grid.jitter**2)[:, None]
