@@ -21,9 +21,11 @@ from calibration.chain import (
     ImagePoints,
     Phantom,
     free_jacobian,
+    moved_to,
+    on_image,
     residuals_and_jacobian,
-    sensor_error,
 )
+from calibration.wandering import settle
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (
@@ -33,7 +35,6 @@ from speckle3d.core.leastsquares import (
     levenberg_marquardt,
     robust_sigma,
 )
-from speckle3d.core.wander import JITTER, WanderingFit, wandering_fit
 
 SOME_FRAMES = 100
 """Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
@@ -47,8 +48,6 @@ _NEARLY_ABSOLUTE = 0.06745
 _REWEIGHTINGS = 8
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
-_WANDERING_STEPS = 2
-"""The first finds the answer, the second its covariance there."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -95,7 +94,7 @@ def solve_chain(
         if (agreeing == used).all():
             break
         used = agreeing
-    chain, noise = _with_wandering_errors(points[used], phantom, chain, free)
+    chain, noise = settle(points[used], phantom, chain, free)
     residuals = residuals_of(points, phantom, chain)
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
     _, fit, _ = refined(points[used], phantom, chain, free)
@@ -111,25 +110,6 @@ def solve_chain(
         sigma_of(residuals[used]),
         condition_number(free_jacobian(points[used], phantom, chain, free)),
     )
-
-
-def _with_wandering_errors(
-    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
-) -> tuple[Chain, WanderingFit]:
-    """Steps from a least-squares solution to the one that knows that the sensor's errors wander."""
-    for _ in range(_WANDERING_STEPS):
-        residuals, jacobian = near_jacobian(points, phantom, chain, free)
-        several = residuals.size // len(points)
-        noise = wandering_fit(
-            jacobian,
-            residuals,
-            np.repeat(points.frame, several),
-            np.repeat(points.times, several),
-            sensor_error(points, phantom, chain),
-            (0.0,) if residuals.size == len(points.frames) else JITTER,
-        )
-        chain = moved_by(chain, free, noise.step)
-    return chain, noise
 
 
 def sigma_of(residuals: FloatArray) -> float:
@@ -186,7 +166,7 @@ def refined(
     """
     near = replace(points, world_from_sensor=chain.target_from_image(points))
     columns = np.array([CHAIN.index(name) for name in free])
-    origin = _origin(chain)
+    origin = on_image(chain)
     scale = 1.0 if weights is None else weights
 
     @lru_cache(maxsize=2)
@@ -205,37 +185,7 @@ def refined(
     )
     found = origin.copy()
     found[columns] = fit.parameters
-    return _moved_to(chain, found), fit, both(fit.parameters)[1]
-
-
-def near_jacobian(
-    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals, shape (n r,), and Jacobian, (n r, p), in frames that lie on the image and on the phantom."""
-    near = replace(points, world_from_sensor=chain.target_from_image(points))
-    residuals, jacobian = residuals_and_jacobian(_origin(chain), near, phantom)
-    columns = [CHAIN.index(name) for name in free]
-    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
-
-
-def moved_by(chain: Chain, free: tuple[str, ...], step: FloatArray) -> Chain:
-    """Add a step in the free parameters, in frames that lie on the image and on the phantom."""
-    parameters = _origin(chain)
-    parameters[[CHAIN.index(name) for name in free]] += step
-    return _moved_to(chain, parameters)
-
-
-def _origin(chain: Chain) -> FloatArray:
-    return np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-
-
-def _moved_to(chain: Chain, parameters: FloatArray) -> Chain:
-    step = Chain.from_parameters(parameters)
-    return Chain(
-        step.pixel_mm,
-        chain.sensor_from_image * step.sensor_from_image,
-        step.target_from_world * chain.target_from_world,
-    )
+    return moved_to(chain, found), fit, both(fit.parameters)[1]
 
 
 def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
