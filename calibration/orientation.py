@@ -44,6 +44,7 @@ def calibrate_orientation(
     level: bool = False,
     viewed_from: Viewed = "above",
     outlier_sigma: float = OUTLIER_SIGMA,
+    time_s: FloatArray | None = None,
 ) -> ChainSolution:
     """Calibrate an orientation sensor: find the rotation ``sensor_from_image`` from lines of a plane.
 
@@ -61,6 +62,8 @@ def calibrate_orientation(
     viewed_from : str
         ``"above"``: on average the beam points down, as over the floor of a water bath; ``"below"``: up. It
         tells the image from its in-plane mirror, which the lines alone cannot.
+    time_s : ndarray, shape (m,), optional
+        Of each line; without it, frames are taken to be evenly spaced.
 
     Raises
     ------
@@ -75,7 +78,9 @@ def calibrate_orientation(
     size = np.array([float(pixel_mm[0] / pixel_mm[1]), 1.0])
     normals = hemisphere()
     normals = normals[:1] if level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
-    lines = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
+    lines = ImagePoints(
+        directions_px, frame, RigidTransform.from_rotation(world_from_sensor), time_s=time_s
+    )
     start = settled_angles(lines.of_some_frames(SOME_FRAMES), size[0], normals, level=level)
     best = require_adequate(solve_chain(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
     _require_floor(best)
