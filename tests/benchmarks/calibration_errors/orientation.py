@@ -54,7 +54,7 @@ def scan(trial: Trial) -> tuple[np.ndarray, Rotation, Rotation, np.ndarray, Rota
     count, rate = int(rng.integers(40, 240)), float(rng.uniform(4.0, 12.0))
     time_s = np.arange(count) / rate
     if trial.odd:
-        reaches = rng.uniform([5.0, 3.0, 0.0], [30.0, 25.0, 60.0])
+        reaches = rng.uniform([12.0, 8.0, 0.0], [30.0, 25.0, 60.0])
         lean = Rotation.from_rotvec(np.deg2rad(rng.uniform(0.0, 90.0)) * axes[0])
         slope = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, 12)) * _level(rng))
     else:
