@@ -14,7 +14,17 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ANGLES, POSE, PROBE, Chain, ChainSolution, ImagePoints, SeenAs, as_directions
+from calibration.alternatives import best_solution
+from calibration.chain import (
+    ANGLES,
+    PROBE,
+    Chain,
+    ChainSolution,
+    ImagePoints,
+    PixelPrior,
+    SeenAs,
+    as_directions,
+)
 from calibration.identifiability import judge, require_adequate
 from calibration.solver import (
     OUTLIER_SIGMA,
@@ -23,11 +33,10 @@ from calibration.solver import (
     probe_parameters,
     residuals_of,
     sigma_of,
-    solve_chain,
 )
 from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
@@ -37,6 +46,11 @@ _PIXEL_MM = 0.15
 
 _SAME = 0.02
 """Two starts that settle at residuals as close as this share have found the same; no more are tried."""
+PIXEL_ERROR = 0.02
+"""Standard error of a pixel size from a scanner's calipers, as a share of it: of distances they show."""
+_CONTRADICTS = 3.0
+"""Standard errors by which lines must move the pixel size given for it to be doubted."""
+
 Stages = Literal["three", "one"]
 
 
@@ -90,6 +104,7 @@ def calibrate_plane(
     fit_pixels: bool = True,
     stages: Stages = "three",
     outlier_sigma: float = OUTLIER_SIGMA,
+    pixel_error: float = PIXEL_ERROR,
 ) -> ChainSolution:
     """Calibrate a 6-DOF sensor from lines of a plane: the floor of a water bath, or the Cambridge phantom.
 
@@ -104,38 +119,71 @@ def calibrate_plane(
     stages : str
         ``"three"``: angles from line directions, then distances, then all. ``"one"``: all at once, from
         several mountings.
+    pixel_error : float
+        Standard error of the pixel size given, as a share of it; infinite if it is a guess.
 
     Raises
     ------
     InsufficientDataError
-        If there are too few lines, they contradict each other, or the motion does not determine the answer;
-        then the missing motion is named.
+        If there are too few lines, they contradict each other or the pixel size, or the motion does not
+        determine the answer; then the missing motions are named.
     """
     if len(lines) < 2 * _FEWEST_LINES:
         raise InsufficientDataError(
             f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
         )
+    if not pixel_error > 0:
+        raise InvalidInputError(f"pixel_error: expected a positive share, got {pixel_error:g}")
     probe, held = probe_parameters(fit_pixels, pixel_mm)
-    start = _three_stages(lines, held) if stages == "three" else _one_stage(lines, held, probe)
-    solution = solve_chain(lines, Plane(), start, probe, outlier_sigma)
-    if fit_pixels and judge(solution).refused:
-        size = np.full(2, _PIXEL_MM) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
-        solution = _from_plausible_pixels(lines, size, outlier_sigma)
+    prior = None
+    if fit_pixels and pixel_mm is not None and np.isfinite(pixel_error):
+        prior = PixelPrior(np.asarray(pixel_mm, dtype=float), pixel_error)
+    solution = _solved(lines, held, prior, stages, probe, outlier_sigma)
+    if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
+        solution = _without_prior(lines, solution, stages, outlier_sigma)
     return facing_up(require_adequate(solution))
 
 
-def _from_plausible_pixels(lines: ImagePoints, pixel_mm: FloatArray, outlier_sigma: float) -> ChainSolution:
-    """Solve again with the pixels held at first: free ones may shrink to nothing where the motion is poor.
+def _solved(
+    lines: ImagePoints,
+    held: FloatArray | None,
+    prior: PixelPrior | None,
+    stages: Stages,
+    probe: tuple[str, ...],
+    outlier_sigma: float,
+) -> ChainSolution:
+    if stages == "one":
+        given = held if prior is None else prior.pixel_mm
+        starts = _one_stage(lines, given)
+    elif held is not None or prior is not None:
+        starts = [_three_stages(lines, held if prior is None else prior.pixel_mm)]
+    else:
+        starts = [_three_stages(lines, size) for size in (None, np.full(2, _PIXEL_MM))]
+    return best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
 
-    If they shrink again, the solution with held pixels is returned as if they were free, for `judge`.
+
+def _without_prior(
+    lines: ImagePoints, solution: ChainSolution, stages: Stages, outlier_sigma: float
+) -> ChainSolution:
+    """Believe lines that contradict the pixel size given if they determine it by themselves.
+
+    Raises
+    ------
+    InsufficientDataError
+        If they do not.
     """
-    start = _three_stages(lines, pixel_mm)
-    held = solve_chain(lines, Plane(), start, POSE, outlier_sigma)
-    again = solve_chain(lines, Plane(), held.chain, PROBE, outlier_sigma)
-    if not judge(again).refused:
-        return again
-    shown = replace(held, free=again.free, fit=again.fit)
-    return shown if judge(shown).refused else again
+    alone = _solved(lines, None, None, stages, PROBE, outlier_sigma)
+    verdict = judge(alone)
+    if not verdict.refused:
+        return alone
+    if judge(solution).refused or solution.prior is None:
+        return solution
+    given, found = solution.prior.pixel_mm, solution.chain.pixel_mm
+    raise InsufficientDataError(
+        f"expected lines that agree with pixels of {given[0]:.4g} x {given[1]:.4g} mm to "
+        f"{100 * solution.prior.error:g} %, got {found[0]:.4g} x {found[1]:.4g} mm with them, and without "
+        f"them {verdict.verdict}"
+    )
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
@@ -145,17 +193,13 @@ def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
     return _with_distances(lines, chain, pixel_mm)
 
 
-def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
-    """The best solution for all parameters at once of some lines, from several mountings."""
+def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:
+    """Starts of all parameters at once, from several mountings."""
     few = lines.of_some_frames(SOME_FRAMES)
     directions = as_directions(few)
     turns = directions.world_from_sensor.rotation
     starts = angle_starts(directions.pixels, turns, _ratio(pixel_mm), hemisphere())
-    settled = [
-        solve_chain(few, Plane(), _with_distances(few, start, pixel_mm), probe, outlier_sigma=np.inf)
-        for start in starts
-    ]
-    return min(settled, key=lambda solution: solution.sigma).chain
+    return [_with_distances(few, start, pixel_mm) for start in starts]
 
 
 def _ratio(pixel_mm: FloatArray | None) -> float:
