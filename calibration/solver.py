@@ -15,16 +15,17 @@ from calibration.chain import (
     CHAIN,
     POSE,
     PROBE,
-    SCALES,
     Chain,
     ChainSolution,
     ImagePoints,
     Phantom,
     PixelPrior,
     free_jacobian,
+    moved_to,
+    on_image,
     residuals_and_jacobian,
-    sensor_error,
 )
+from calibration.wandering import settle
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (
@@ -34,7 +35,6 @@ from speckle3d.core.leastsquares import (
     levenberg_marquardt,
     robust_sigma,
 )
-from speckle3d.core.wander import JITTER, WanderingFit, wandering_fit
 
 SOME_FRAMES = 100
 """Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
@@ -48,8 +48,6 @@ _NEARLY_ABSOLUTE = 0.06745
 _REWEIGHTINGS = 8
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
-_WANDERING_STEPS = 2
-"""The first finds the answer, the second its covariance there."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -87,7 +85,7 @@ def solve_chain(
     free = (*probe, *phantom.determined)
     prior = prior if "s_x" in free else None
     chain, used = agreed(points, phantom, start, free, outlier_sigma, prior)
-    chain, noise = _with_wandering_errors(points[used], phantom, chain, free, prior)
+    chain, noise = settle(points[used], phantom, chain, free, prior)
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
@@ -131,43 +129,6 @@ def agreed(
         if (agreeing == used).all():
             return chain, used
         used, round_ = agreeing, round_ + 1
-
-
-def _with_wandering_errors(
-    points: ImagePoints,
-    phantom: Phantom,
-    chain: Chain,
-    free: tuple[str, ...],
-    prior: PixelPrior | None,
-) -> tuple[Chain, WanderingFit]:
-    """Steps from a least-squares solution to the one that knows that the sensor's errors wander."""
-    for _ in range(_WANDERING_STEPS):
-        residuals, jacobian = near_jacobian(points, phantom, chain, free)
-        several = residuals.size // len(points)
-        noise = wandering_fit(
-            jacobian,
-            residuals,
-            np.repeat(points.frame, several),
-            np.repeat(points.times, several),
-            sensor_error(points, phantom, chain),
-            (0.0,) if residuals.size == len(points.frames) else JITTER,
-            *_known(prior, chain, free),
-        )
-        chain = moved_by(chain, free, noise.step)
-    return chain, noise
-
-
-def _known(
-    prior: PixelPrior | None, chain: Chain, free: tuple[str, ...]
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """Inverse covariance of a prior, and by how much the parameters exceed it."""
-    if prior is None:
-        return None, None
-    inverse, excess = np.zeros(len(free)), np.zeros(len(free))
-    columns = [free.index(name) for name in SCALES]
-    inverse[columns] = (prior.pixel_mm * prior.error) ** -2.0
-    excess[columns] = chain.pixel_mm - prior.pixel_mm
-    return np.diag(inverse), excess
 
 
 def sigma_of(residuals: FloatArray) -> float:
@@ -236,7 +197,7 @@ def refined(
     """
     near = replace(points, world_from_sensor=chain.target_from_image(points))
     columns = np.array([CHAIN.index(name) for name in free])
-    origin = _origin(chain)
+    origin = on_image(chain)
     scale = 1.0 if weights is None else weights
 
     @lru_cache(maxsize=2)
@@ -259,37 +220,111 @@ def refined(
     )
     found = origin.copy()
     found[columns] = fit.parameters
-    return _moved_to(chain, found), fit, both(fit.parameters)[1]
+    return moved_to(chain, found), fit, both(fit.parameters)[1]
 
 
-def near_jacobian(
-    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals, shape (n r,), and Jacobian, (n r, p), in frames that lie on the image and on the phantom."""
+def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
+    """Points of the frames none of whose residuals exceeds `limit`."""
+    wrong = np.unique(frame[(np.abs(residuals) > limit).any(axis=1)])
+    return ~np.isin(frame, wrong)
+
+
+def _require_majority(used: BoolArray, points: ImagePoints) -> None:
+    frames, agreeing = len(points.frames), len(points[used].frames)
+    if 2 * agreeing <= frames:
+        raise InsufficientDataError(
+            f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the images "
+            "and the sensor readings belong together, and is the phantom the one named?"
+        )def sigma_of(residuals: FloatArray) -> float:
+    """Robust standard deviation of residuals, not less than rounding."""
+    return robust_sigma(residuals, _SMALLEST_SIGMA)
+
+
+def probe_parameters(
+    fit_pixels: bool, pixel_mm: FloatArray | None
+) -> tuple[tuple[str, ...], FloatArray | None]:
+    """Which of `PROBE` to estimate, and the pixel size to hold, if any.
+
+    Raises
+    ------
+    InvalidInputError
+        If the pixel size is neither fitted nor given.
+    """
+    if fit_pixels:
+        return PROBE, None
+    if pixel_mm is None:
+        raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
+    return POSE, np.asarray(pixel_mm, dtype=float)
+
+
+def first_guess(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    free: tuple[str, ...],
+    prior: PixelPrior | None = None,
+) -> Chain:
+    """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
+    chain, before = start, np.inf
+    for _ in range(_REWEIGHTINGS):
+        size = np.abs(residuals_of(points, phantom, chain))
+        if size.mean() > _SETTLED * before:
+            break
+        before = size.mean()
+        sigma = sigma_of(size)
+        weights = np.sqrt(huber_weights(size / sigma, _NEARLY_ABSOLUTE))
+        # A prior weighs as much against the residuals as they weigh on average.
+        fair = sigma * float(np.sqrt(np.mean(weights**2)))
+        chain, _, _ = refined(points, phantom, chain, free, weights, 1e-3, prior, fair)
+    return chain
+
+
+def residuals_of(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatArray:
+    """Return what does not vanish in the phantom's frame, shape (n, r)."""
+    return residuals_and_jacobian(chain.parameters(), points, phantom)[0]
+
+
+def refined(
+    points: ImagePoints,
+    phantom: Phantom,
+    chain: Chain,
+    free: tuple[str, ...],
+    weights: FloatArray | None = None,
+    tolerance: float = 1e-9,
+    prior: PixelPrior | None = None,
+    sigma: float = 1.0,
+) -> tuple[Chain, Fit, FloatArray]:
+    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
+
+    There all angles start at zero: far from where fixed angles become singular, and well scaled. The prior's
+    deviations are weighed against residuals of standard deviation `sigma`, and follow them in the fit.
+    """
     near = replace(points, world_from_sensor=chain.target_from_image(points))
-    residuals, jacobian = residuals_and_jacobian(_origin(chain), near, phantom)
-    columns = [CHAIN.index(name) for name in free]
-    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
+    columns = np.array([CHAIN.index(name) for name in free])
+    origin = on_image(chain)
+    scale = 1.0 if weights is None else weights
 
+    @lru_cache(maxsize=2)
+    def at(x: bytes) -> tuple[FloatArray, FloatArray]:
+        full = origin.copy()
+        full[columns] = np.frombuffer(x)
+        values, jacobian = residuals_and_jacobian(full, near, phantom)
+        kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
+        kept, values = kept.reshape(-1, len(columns)), (values * scale).ravel()
+        if prior is None:
+            return values, kept
+        extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
+        return np.append(values, sigma * prior.deviation(full[:2])), np.vstack([kept, extra])
 
-def moved_by(chain: Chain, free: tuple[str, ...], step: FloatArray) -> Chain:
-    """Add a step in the free parameters, in frames that lie on the image and on the phantom."""
-    parameters = _origin(chain)
-    parameters[[CHAIN.index(name) for name in free]] += step
-    return _moved_to(chain, parameters)
+    def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return at(x.tobytes())
 
-
-def _origin(chain: Chain) -> FloatArray:
-    return np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-
-
-def _moved_to(chain: Chain, parameters: FloatArray) -> Chain:
-    step = Chain.from_parameters(parameters)
-    return Chain(
-        step.pixel_mm,
-        chain.sensor_from_image * step.sensor_from_image,
-        step.target_from_world * chain.target_from_world,
+    fit = levenberg_marquardt(
+        lambda x: both(x)[0].copy(), origin[columns], lambda x: both(x)[1].copy(), free, tolerance=tolerance
     )
+    found = origin.copy()
+    found[columns] = fit.parameters
+    return moved_to(chain, found), fit, both(fit.parameters)[1]
 
 
 def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
