@@ -23,7 +23,8 @@ MAX_CONDITION = 1000.0
 _TWO_SIDED = 1.96
 REFUSED_MM, REFUSED_RAD = 5.0 / _TWO_SIDED, np.deg2rad(5.0) / _TWO_SIDED
 """Standard error of the image's worst corner, and of its rotation about the worst axis, above which a
-solution is refused: 95 % intervals of 5 mm and 5 degrees, what a ruler and a protractor on the probe achieve."""
+solution is refused: 95 % intervals of 5 mm and 5 degrees, which a ruler and a protractor on the probe
+achieve."""
 
 WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
 """Standard error of a weakly determined solution; 1 degree is the published precision (Housden 2008)."""

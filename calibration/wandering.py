@@ -72,6 +72,19 @@ def settle(
     return chain, noise
 
 
+def _known(
+    prior: PixelPrior | None, chain: Chain, free: tuple[str, ...]
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Inverse covariance of a prior, and by how much the parameters exceed it."""
+    if prior is None:
+        return None, None
+    inverse, excess = np.zeros(len(free)), np.zeros(len(free))
+    columns = [free.index(name) for name in SCALES]
+    inverse[columns] = (prior.pixel_mm * prior.error) ** -2.0
+    excess[columns] = chain.pixel_mm - prior.pixel_mm
+    return np.diag(inverse), excess
+
+
 def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorError:
     """How residuals move with small turns of the sensor about the world's axes, rad, and with shifts, mm.
 

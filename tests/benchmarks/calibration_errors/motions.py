@@ -99,18 +99,15 @@ def drift(rng, time_s: np.ndarray, size: float, columns: int) -> np.ndarray:
 
 
 def moves_of(rng, time_s, reaches: dict[str, float], wobbles: dict[str, float]) -> dict[str, np.ndarray]:
-    """All motions at once, or one after the other, with the wobble of a hand always."""
+    """All motions at once, or each more in its turn and less otherwise; always with the wobble of a hand."""
     found = {}
-    one_by_one = rng.random() < 0.4
+    in_turn = rng.random() < 0.5
     order = rng.permutation(len(reaches))
     share = time_s / time_s[-1] * len(reaches)
     for place, (name, reach) in zip(order, reaches.items(), strict=True):
         moved = by_hand(rng, time_s, max(reach - wobbles[name], 0.0))
-        if one_by_one:
-            # The window has slopes of a fifth of its length.
-            moved = moved * np.clip(5 * np.minimum(share - place + 0.1, place + 1.1 - share), 0.0, 1.0)
-            most = np.abs(moved).max()
-            moved *= max(reach - wobbles[name], 0.0) / most if most > 0 else 1.0
+        if in_turn:
+            moved = moved * np.clip(5 * np.minimum(share - place + 0.1, place + 1.1 - share), 0.6, 1.0)
         found[name] = moved + by_hand(rng, time_s, wobbles[name])
     return found
 
@@ -127,8 +124,8 @@ def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     pixel_mm = np.array([width / columns, depth / rows])
     middle = rng.uniform(0.4, 0.6) * depth
     reaches = {
-        "tilt": rng.uniform(20, 35),
-        "roll": rng.uniform(9, 20),
+        "tilt": rng.uniform(25, 35),
+        "roll": rng.uniform(12, 20),
         "yaw": rng.uniform(20, 90),
         "depth": rng.uniform(0.2, 0.33) * depth,
     }
