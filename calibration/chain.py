@@ -222,6 +222,42 @@ class Chain:
 
 
 @dataclass(frozen=True)
+class PixelPrior:
+    """What is known of the pixel size before anything is measured.
+
+    Parameters
+    ----------
+    pixel_mm : ndarray, shape (2,)
+        Column pitch and row spacing, as the scanner's calipers have them.
+    error : float
+        Their standard error, as a share of them.
+    """
+
+    pixel_mm: FloatArray
+    error: float
+
+    def deviation(self, pixel_mm: FloatArray) -> FloatArray:
+        """Deviation of other sizes, in standard errors, shape (2,)."""
+        return np.asarray((pixel_mm / self.pixel_mm - 1.0) / self.error)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another answer, far away, to which a discrete ambiguity of the phantom leads.
+
+    Attributes
+    ----------
+    chain : Chain
+    evidence : float
+        By how much the sum of its squared residuals exceeds that of the solution, in variances of a residual
+        that is independent of the others.
+    """
+
+    chain: Chain
+    evidence: float
+
+
+@dataclass(frozen=True)
 class ChainSolution:
     """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.
 
@@ -244,6 +280,10 @@ class ChainSolution:
         Robust standard deviation of the residuals of the points used.
     condition_number : float
         Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2).
+    prior : PixelPrior, optional
+        That the solution takes into account.
+    rival : Rival, optional
+        The other answer that explains the points best.
     """
 
     chain: Chain
@@ -256,6 +296,8 @@ class ChainSolution:
     residuals: FloatArray
     sigma: float
     condition_number: float
+    prior: PixelPrior | None = None
+    rival: Rival | None = None
 
     @property
     def angular(self) -> bool:

@@ -6,7 +6,6 @@ frames that contradict the others are left out.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from functools import lru_cache
 
@@ -20,6 +19,7 @@ from calibration.chain import (
     ChainSolution,
     ImagePoints,
     Phantom,
+    PixelPrior,
     free_jacobian,
     moved_to,
     on_image,
@@ -60,6 +60,7 @@ def solve_chain(
     start: Chain,
     probe: tuple[str, ...] = PROBE,
     outlier_sigma: float = OUTLIER_SIGMA,
+    prior: PixelPrior | None = None,
 ) -> ChainSolution:
     """Refine a chain until the phantom's residuals are least, leaving out frames that contradict the others.
 
@@ -73,6 +74,8 @@ def solve_chain(
         Which of `PROBE` to estimate; all that the phantom determines of `TARGET` are estimated besides.
     outlier_sigma : float
         Frames whose largest residual exceeds so many robust standard deviations are dropped.
+    prior : PixelPrior, optional
+        Counts as further residuals where the pixel size is estimated.
 
     Raises
     ------
@@ -80,24 +83,13 @@ def solve_chain(
         If there are too few points, or fewer than half of them agree.
     """
     free = (*probe, *phantom.determined)
-    chain = first_guess(points, phantom, start, free)
+    prior = prior if "s_x" in free else None
+    chain, used = agreed(points, phantom, start, free, outlier_sigma, prior)
+    chain, noise = settle(points[used], phantom, chain, free, prior)
     residuals = residuals_of(points, phantom, chain)
-    used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
-    for round_ in itertools.count():
-        _require_majority(used, points)
-        chain, _, _ = refined(points[used], phantom, chain, free)
-        residuals = residuals_of(points, phantom, chain)
-        sigma = sigma_of(residuals[used])
-        agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
-        if round_ >= _FREE_ROUNDS:
-            agreeing &= used
-        if (agreeing == used).all():
-            break
-        used = agreeing
-    chain, noise = settle(points[used], phantom, chain, free)
-    residuals = residuals_of(points, phantom, chain)
+    sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit, _ = refined(points[used], phantom, chain, free)
+    _, fit, _ = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
     return ChainSolution(
         chain,
         phantom,
@@ -107,9 +99,36 @@ def solve_chain(
         points,
         used,
         residuals,
-        sigma_of(residuals[used]),
+        sigma,
         condition_number(free_jacobian(points[used], phantom, chain, free)),
+        prior,
     )
+
+
+def agreed(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    free: tuple[str, ...],
+    outlier_sigma: float,
+    prior: PixelPrior | None = None,
+) -> tuple[Chain, BoolArray]:
+    """Least squares of the frames that do not contradict the others, and which points those are."""
+    chain = first_guess(points, phantom, start, free, prior)
+    residuals = residuals_of(points, phantom, chain)
+    used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
+    round_ = 0
+    while True:
+        _require_majority(used, points)
+        sigma = sigma_of(residuals[used])
+        chain, _, _ = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
+        residuals = residuals_of(points, phantom, chain)
+        agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals[used]))
+        if round_ >= _FREE_ROUNDS:
+            agreeing &= used
+        if (agreeing == used).all():
+            return chain, used
+        used, round_ = agreeing, round_ + 1
 
 
 def sigma_of(residuals: FloatArray) -> float:
@@ -134,7 +153,13 @@ def probe_parameters(
     return POSE, np.asarray(pixel_mm, dtype=float)
 
 
-def first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
+def first_guess(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    free: tuple[str, ...],
+    prior: PixelPrior | None = None,
+) -> Chain:
     """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
     chain, before = start, np.inf
     for _ in range(_REWEIGHTINGS):
@@ -142,8 +167,11 @@ def first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple
         if size.mean() > _SETTLED * before:
             break
         before = size.mean()
-        weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
-        chain, _, _ = refined(points, phantom, chain, free, weights, tolerance=1e-3)
+        sigma = sigma_of(size)
+        weights = np.sqrt(huber_weights(size / sigma, _NEARLY_ABSOLUTE))
+        # A prior weighs as much against the residuals as they weigh on average.
+        fair = sigma * float(np.sqrt(np.mean(weights**2)))
+        chain, _, _ = refined(points, phantom, chain, free, weights, 1e-3, prior, fair)
     return chain
 
 
@@ -159,10 +187,13 @@ def refined(
     free: tuple[str, ...],
     weights: FloatArray | None = None,
     tolerance: float = 1e-9,
+    prior: PixelPrior | None = None,
+    sigma: float = 1.0,
 ) -> tuple[Chain, Fit, FloatArray]:
     """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
 
-    There all angles start at zero: far from where fixed angles become singular, and well scaled.
+    There all angles start at zero: far from where fixed angles become singular, and well scaled. The prior's
+    deviations are weighed against residuals of standard deviation `sigma`, and follow them in the fit.
     """
     near = replace(points, world_from_sensor=chain.target_from_image(points))
     columns = np.array([CHAIN.index(name) for name in free])
@@ -175,7 +206,11 @@ def refined(
         full[columns] = np.frombuffer(x)
         values, jacobian = residuals_and_jacobian(full, near, phantom)
         kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
-        return (values * scale).ravel(), kept.reshape(-1, len(columns))
+        kept, values = kept.reshape(-1, len(columns)), (values * scale).ravel()
+        if prior is None:
+            return values, kept
+        extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
+        return np.append(values, sigma * prior.deviation(full[:2])), np.vstack([kept, extra])
 
     def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         return at(x.tobytes())

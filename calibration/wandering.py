@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Chain, ImagePoints, Phantom, moved_by, near_jacobian
+from calibration.chain import SCALES, Chain, ImagePoints, Phantom, PixelPrior, moved_by, near_jacobian
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
 from speckle3d.core.wander import JITTER, SensorError, WanderingFit, attributed, wandering_fit
@@ -32,7 +32,11 @@ with 0.5 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
 
 
 def settle(
-    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
+    points: ImagePoints,
+    phantom: Phantom,
+    chain: Chain,
+    free: tuple[str, ...],
+    prior: PixelPrior | None = None,
 ) -> tuple[Chain, WanderingFit]:
     """Go from a least-squares solution to the one that knows that the sensor's errors wander.
 
@@ -44,6 +48,7 @@ def settle(
         The least-squares solution.
     free : tuple of str, length p
         The parameters estimated.
+    prior : PixelPrior, optional
 
     Returns
     -------
@@ -60,11 +65,24 @@ def settle(
         error = sensor_error(corrected, phantom, chain)
         # What was taken out of the points, put back as the small thing that it is.
         residuals = residuals + expected
-        noise = wandering_fit(jacobian, residuals, group, time_s, error, jitter)
+        noise = wandering_fit(jacobian, residuals, group, time_s, error, jitter, *_known(prior, chain, free))
         sensor, image = attributed(residuals + jacobian @ noise.step, group, error, noise)
         chain = moved_by(chain, free, noise.step)
         corrected, expected = _corrected(points, phantom, chain, sensor, image)
     return chain, noise
+
+
+def _known(
+    prior: PixelPrior | None, chain: Chain, free: tuple[str, ...]
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Inverse covariance of a prior, and by how much the parameters exceed it."""
+    if prior is None:
+        return None, None
+    inverse, excess = np.zeros(len(free)), np.zeros(len(free))
+    columns = [free.index(name) for name in SCALES]
+    inverse[columns] = (prior.pixel_mm * prior.error) ** -2.0
+    excess[columns] = chain.pixel_mm - prior.pixel_mm
+    return np.diag(inverse), excess
 
 
 def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorError:

@@ -111,6 +111,7 @@ def wandering_fit(
     error: SensorError,
     jitter: Sequence[float] = JITTER,
     prior: FloatArray | None = None,
+    excess: FloatArray | None = None,
 ) -> WanderingFit:
     """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
 
@@ -127,8 +128,9 @@ def wandering_fit(
         Sizes of the error that is new in each frame to try (`JITTER`); zero alone where a frame has one
         residual.
     prior : ndarray, shape (p, p), optional
-        Inverse covariance of what is known of the parameters besides, in the units of the parameters, about
-        the present ones.
+        Inverse covariance of what is known of the parameters besides, in the units of the parameters.
+    excess : ndarray, shape (p,), optional
+        By how much the present parameters exceed what is known; by default not at all.
 
     Raises
     ------
@@ -151,7 +153,8 @@ def wandering_fit(
     left = np.maximum(energy - np.einsum("gi,gij,gj->g", pull, inverse, pull), 0.0)
     variance = np.maximum(left / free, _SMALLEST**2)
     spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=_SINGULAR, hermitian=True)
-    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None])
+    back = np.zeros(len(scale)) if excess is None else known @ (excess * scale)
+    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
     sizes = np.linalg.eigvalsh(matrix)
     volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)

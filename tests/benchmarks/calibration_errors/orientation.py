@@ -130,7 +130,9 @@ def measure(share: float, first_seed: int) -> list[Row]:
         held = [Trial(first_seed + n, False, degrees, seconds) for n in range(max(10, round(HELD * share)))]
         good = [one for one in trials(judged, held) if not one.refused]
         scores = np.array([one.scores for one in good])
-        row = coverage_row(f"orientation, wander {degrees:g} deg, {seconds:g} s", scores, np.ones_like(scores))
+        row = coverage_row(
+            f"orientation, wander {degrees:g} deg, {seconds:g} s", scores, np.ones_like(scores)
+        )
         tilt = np.sqrt(np.mean([one.wrong_deg**2 for one in good]))
         refusals = len(held) - len(good)
         more = f"{row.found}, RMS {tilt:.2f} degrees, {refusals} refused"
