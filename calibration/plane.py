@@ -44,7 +44,7 @@ _PIXEL_MM = 0.15
 """Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
 _HOPELESS = 3.0
-"""Ends of iterations whose mean absolute residual is as many times the least one's are not looked at again."""
+"""Ends of iterations whose mean absolute residual is as many times the least are not looked at again."""
 PIXEL_ERROR = 0.02
 """Standard error of a pixel size from a scanner's calipers, as a share of it: of distances they show."""
 _CONTRADICTS = 3.0

@@ -1,4 +1,4 @@
-"""Orientation sensors: wrong minima over set-ups at random, and errors within those claimed where they wander."""
+"""Orientation sensors: wrong minima over set-ups at random, and whether claimed errors are true."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Trial:
     Attributes
     ----------
     odd : bool
-        Beams from level to vertical, a plane up to 12 degrees off level; otherwise a floor scanned from above.
+        Beams from level to vertical, a plane up to 12 degrees off level; else a floor scanned from above.
     wander_deg, wander_s : float
         Of the inclination, each axis.
     """
@@ -141,4 +141,4 @@ def measure(share: float, first_seed: int) -> list[Row]:
 
 
 LEVEL_DEG = 25.0
-"""Beams nearer to level than this, on average, may be refused: gravity hardly tells them from their mirror."""
+"""Beams nearer to level than this may be refused: gravity hardly tells them from their mirror."""
