@@ -42,8 +42,8 @@ _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
 _HELPS, _MATTERS = 1.5, 0.5
 """A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
 _HOPELESS = 10.0
-"""Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are: all
-motions that a scan of a plane has not are named."""
+"""Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are:
+all motions that a scan of a plane has not are named."""
 _INFLATION = 4.0
 """Most that errors that wander are taken to enlarge those of a scan in which nothing is missing."""
 
