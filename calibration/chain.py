@@ -410,6 +410,21 @@ def moved_to(chain: Chain, parameters: FloatArray) -> Chain:
     )
 
 
+def corners_moved(chain: Chain, points: ImagePoints) -> FloatArray:
+    """Derivatives of the image's corners, mm, by all parameters, in frames that lie on the image and phantom.
+
+    The image is taken to reach as far as points are in it. Shape (4, 3, 14).
+    """
+    right, bottom = points.pixels.max(axis=0)
+    corners_px = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+    flat = np.column_stack([corners_px * chain.pixel_mm, np.zeros(len(corners_px))])
+    moved = np.zeros((len(corners_px), 3, len(CHAIN)))
+    moved[:, 0, 0], moved[:, 1, 1] = corners_px.T
+    moved[:, :, 2:5] = np.eye(3)
+    moved[:, :, 7:4:-1] = -skew(flat)
+    return moved
+
+
 def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotation by x-y-z fixed angles (alpha, beta, gamma), and its derivatives, shape (3, 3, 3)."""
     x, y, z = skew(np.eye(3))

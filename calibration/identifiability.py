@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.chain import CHAIN, ChainSolution, ImagePoints, residuals_and_jacobian
+from calibration.chain import CHAIN, ChainSolution, ImagePoints, corners_moved, residuals_and_jacobian
 from calibration.motions import Motion, absent, extents, on_phantom, with_motion
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import skew
 
 MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
@@ -193,13 +192,7 @@ def _errors(solution: ChainSolution, covariance: FloatArray) -> _Errors:
     angle = float(np.sqrt(np.linalg.eigvalsh(covariance[5:8, 5:8])[-1]))
     if solution.angular:
         return _Errors(0.0, angle)
-    right, bottom = solution.points_used.pixels.max(axis=0)
-    corners_px = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
-    flat = np.column_stack([corners_px * solution.chain.pixel_mm, np.zeros(len(corners_px))])
-    moved = np.zeros((len(corners_px), 3, len(CHAIN)))
-    moved[:, 0, 0], moved[:, 1, 1] = corners_px.T
-    moved[:, :, 2:5] = np.eye(3)
-    moved[:, :, 7:4:-1] = -skew(flat)
+    moved = corners_moved(solution.chain, solution.points_used)
     corners = np.einsum("kip,pq,kiq->k", moved, covariance, moved)
     return _Errors(float(np.sqrt(corners.max())), angle)
 

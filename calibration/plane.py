@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.alternatives import best_solution
+from calibration.alternatives import apart, best_solution
 from calibration.chain import (
     ANGLES,
     PROBE,
@@ -32,7 +32,6 @@ from calibration.solver import (
     first_guess,
     probe_parameters,
     residuals_of,
-    sigma_of,
 )
 from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray
@@ -44,8 +43,8 @@ _FEWEST_LINES = 6
 _PIXEL_MM = 0.15
 """Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
-_SAME = 0.02
-"""Two starts that settle at residuals as close as this share have found the same; no more are tried."""
+_HOPELESS = 3.0
+"""Ends of iterations whose mean absolute residual is as many times the least are not looked at again."""
 PIXEL_ERROR = 0.02
 """Standard error of a pixel size from a scanner's calipers, as a share of it: of distances they show."""
 _CONTRADICTS = 3.0
@@ -189,8 +188,8 @@ def _without_prior(
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
     """The first two stages: angles from some directions, then distances. The caller refines all together."""
     directions = as_directions(lines.of_some_frames(SOME_FRAMES))
-    chain = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
-    return _with_distances(lines, chain, pixel_mm)
+    found = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
+    return _with_distances(lines, found[0], pixel_mm)
 
 
 def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:
@@ -216,28 +215,34 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
 
 def settled_angles(
     lines: ImagePoints, ratio: float, normals: FloatArray, fit_ratio: bool = False, level: bool = False
-) -> Chain:
+) -> list[Chain]:
     """First stage: find the angles that make line directions lie in the plane, robustly.
 
     Parameters
     ----------
     lines : ImagePoints
         With directions for pixels (`as_directions`).
+
+    Returns
+    -------
+    list of Chain
+        Where iterations end, the one that leaves least first; those that leave more than the best by a
+        factor of `_HOPELESS` are left out.
     """
     phantom = LineDirections(np.array([ratio, 1.0]), level)
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
-    best, least = None, np.inf
-    for start in angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals):
-        chain = first_guess(lines, phantom, start, free)
-        sigma = sigma_of(residuals_of(lines, phantom, chain))
-        agreed = abs(sigma - least) < _SAME * least
-        if sigma < least:
-            best, least = chain, sigma
-        if agreed:
-            break
-    if best is None:
+    starts = angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals)
+    settled = [first_guess(lines, phantom, start, free) for start in starts]
+    if not settled:
         raise InsufficientDataError("expected line directions that are finite, got others")
-    return best
+    left = [float(np.abs(residuals_of(lines, phantom, chain)).mean()) for chain in settled]
+    order = sorted(range(len(left)), key=lambda k: left[k])
+    found: list[Chain] = []
+    for k in order:
+        near = any(not apart(other, settled[k], lines, phantom) for other in found)
+        if not near and left[k] <= _HOPELESS * left[order[0]]:
+            found.append(settled[k])
+    return found
 
 
 def facing_up(solution: ChainSolution) -> ChainSolution:

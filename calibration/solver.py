@@ -25,6 +25,7 @@ from calibration.chain import (
     on_image,
     residuals_and_jacobian,
 )
+from calibration.profile import widened
 from calibration.wandering import settle
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -86,6 +87,7 @@ def solve_chain(
     prior = prior if "s_x" in free else None
     chain, used = agreed(points, phantom, start, free, outlier_sigma, prior)
     chain, noise = settle(points[used], phantom, chain, free, prior)
+    noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.

@@ -40,6 +40,9 @@ _SHORTEST, _LONGEST = 4.0, 2.0
 """Shortest and longest time constant tried: four frames, of which fewer look like white noise; twice the
 recording, which looks like a straight line."""
 
+_SINGULAR = 1e-15
+"""Ratio of eigenvalues below which a direction counts as not determined."""
+
 _SMALLEST = 1e-12
 """Residuals below are rounding: nothing wanders in them."""
 
@@ -146,13 +149,14 @@ def wandering_fit(
     normal, log_determinant = _innovations(columns, error.effects, starts, time_s, grid)
     matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
     free = max(len(residuals) - len(scale), 1)
-    inverse = np.linalg.pinv(matrix, rcond=1e-15, hermitian=True)
+    inverse = np.linalg.pinv(matrix, rcond=_SINGULAR, hermitian=True)
     left = np.maximum(energy - np.einsum("gi,gij,gj->g", pull, inverse, pull), 0.0)
     variance = np.maximum(left / free, _SMALLEST**2)
-    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=1e-15, hermitian=True)
+    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=_SINGULAR, hermitian=True)
     back = np.zeros(len(scale)) if excess is None else known @ (excess * scale)
     steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
-    _, volume = np.linalg.slogdet(matrix)
+    sizes = np.linalg.eigvalsh(matrix)
+    volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
     weight = grid.prior * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
