@@ -38,8 +38,13 @@ TIE = 25.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
-_HELPS = 1.5
-"""A motion matters if without it the error stays as many times larger."""
+_HELPS, _MATTERS = 1.5, 0.5
+"""A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
+_HOPELESS = 10.0
+"""Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are:
+all motions that a scan of a plane has not are named."""
+_INFLATION = 4.0
+"""Most that errors that wander are taken to enlarge those of a scan in which nothing is missing."""
 
 _UNKNOWN = 0.3
 """Standard deviation of a pixel size before anything is measured or given, as a share of it."""
@@ -125,8 +130,8 @@ def judge(solution: ChainSolution) -> Adequacy:
     weak = errors.of_limit(WEAK_MM, WEAK_RAD) > 1
     missing: list[Motion] = []
     if weak or refused:
-        scale = max(1.0, errors.of_limit(WEAK_MM, WEAK_RAD) / white.of_limit(WEAK_MM, WEAK_RAD)) ** 2
-        missing = _uncertain(solution, information, scale)
+        scale = errors.of_limit(WEAK_MM, WEAK_RAD) / white.of_limit(WEAK_MM, WEAK_RAD)
+        missing = _uncertain(solution, information, min(max(scale, 1.0), _INFLATION) ** 2)
     if tied:
         missing += [motion for motion in _telling(solution) if motion not in missing]
     where = "" if angular else " at the image's corners"
@@ -231,8 +236,10 @@ def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float])
     """
     lacking = absent(solution)
     least, now = error(lacking), error([])
+    if now > _HOPELESS and solution.phantom.seen_as != "dot":
+        return lacking
     without = {one: error([other for other in lacking if other is not one]) for one in lacking}
-    needed = [one for one in lacking if without[one] > max(_HELPS * least, 1.0)]
+    needed = [one for one in lacking if without[one] > max(_HELPS * least, _MATTERS)]
     if needed:
         return sorted(needed, key=lambda one: -without[one])
     if lacking and now > _HELPS * least:
