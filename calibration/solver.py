@@ -87,6 +87,9 @@ def solve_chain(
     prior = prior if "s_x" in free else None
     chain, used = agreed(points, phantom, start, free, outlier_sigma, prior)
     chain, noise = settle(points[used], phantom, chain, free, prior)
+    if phantom.determined:
+        # Where the phantom is, as the readings say on average: what wanders is not in its place.
+        chain, _, _ = refined(points[used], phantom, chain, phantom.determined)
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])

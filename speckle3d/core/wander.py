@@ -24,7 +24,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
 
-WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
+WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
 
 JITTER = (0.0, 0.5, 1.5)
