@@ -51,6 +51,8 @@ _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
 _RUNAWAY = 2.0
 """Steps that take errors for wandering leave residuals larger by a tenth, rarely by a half."""
+_RESIZED = 0.1
+"""And they change pixel sizes by a few percent."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -91,7 +93,8 @@ def solve_chain(
     least = sigma_of(residuals_of(points[used], phantom, chain))
     settled, noise = settle(points[used], phantom, chain, free, prior)
     # Where the motion leaves the answer open, linear steps run away; the covariance says how open it is.
-    if sigma_of(residuals_of(points[used], phantom, settled)) < _RUNAWAY * least:
+    bigger = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
+    if sigma_of(residuals_of(points[used], phantom, settled)) < _RUNAWAY * least and bigger < _RESIZED:
         chain = settled
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
@@ -207,7 +210,7 @@ def refined(
     columns = np.array([CHAIN.index(name) for name in free])
     origin = on_image(chain)
     scale = 1.0 if weights is None else weights
-    in_rows = phantom.seen_as == "line" and "s_y" in free
+    in_rows = phantom.seen_as == "line" and prior is not None
 
     @lru_cache(maxsize=2)
     def at(x: bytes) -> tuple[FloatArray, FloatArray]:
