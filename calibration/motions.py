@@ -15,6 +15,8 @@ _SHIFT = 0.2
 """Imagined frames are turned by as much, and shifted by as much of the image, to either side."""
 _LEAST_SHIFT_MM = 8.0
 """And by as much at least, even of a small image: a hand wobbles by millimetres whatever the image's size."""
+_OBLONG = 3.0
+"""Pixels found to be so oblong, or more, are taken for square: their shape was not determined."""
 _ABSENT = 0.25
 """A motion whose standard deviation is below this share of that step is absent: a hand that means to hold
 still wobbles by a degree or two, 0.7 to 1.4 as a standard deviation; one that moves on purpose moves by five.
@@ -64,6 +66,8 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
     up = points.turns.transpose(0, 2, 1) @ solution.chain.target_from_world.rotation.as_matrix()[2]
     middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
+    if not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
+        size = np.full(2, size[1])
     if solution.angular:
         along, depth = points.pixels * size, None
     else:
