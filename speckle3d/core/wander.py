@@ -223,7 +223,7 @@ def _grid(error: SensorError, frame_time_s: FloatArray, jitter: Sequence[float])
     ]
     wander, shake, time, unit = (np.array(column) for column in zip(*rows, strict=True))
     still = wander == 0
-    prior = np.where(still, STEADY / still.sum(), (1.0 - STEADY) / np.maximum((~still).sum(), 1))
+    prior = np.where(still, STEADY / max(still.sum(), 1), (1.0 - STEADY) / max((~still).sum(), 1))
     return _Grid(wander, shake, time, unit, prior)
 
 
