@@ -184,36 +184,114 @@ def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     )
 
 
+def directions_of(made: Scan) -> tuple:
+    """What an orientation sensor has of a scan of a level floor, and the ratio of its pixels."""
+    along = made.ends_px[:, 1] - made.ends_px[:, 0]
+    return along, np.arange(len(along)), made.readings.rotation, made.pixel_mm
+
+
+def crossing(seed, still: tuple[str, ...]) -> tuple[ImagePoints, Scan]:
+    """A crossing of wires seen at places all over the image, from a probe that turns about few axes."""
+    made = scan([seed, 4], tuple(name for name in still if name != "depth"))
+    rng = np.random.default_rng([seed, 5])
+    count = len(made.ends_px)
+    places = [by_hand(rng, made.time_s, 0.4) * length for length in made.size_mm]
+    if "depth" in still:
+        places[1] = by_hand(rng, made.time_s, WOBBLE_MM)
+    at = np.column_stack(places) + made.size_mm / 2
+    turn = (made.readings * made.mounting).rotation
+    flat = np.column_stack([at, np.zeros(count)])
+    world_from_image = RigidTransform.from_components(-turn.apply(flat), turn)
+    readings = world_from_image * made.mounting.inv()
+    shift, rotation = readings.as_components()
+    shift = shift + drift(rng, made.time_s, 0.2, 3) + 0.1 * rng.standard_normal((count, 3))
+    pixels = (at + 0.2 * rng.standard_normal((count, 2))) / made.pixel_mm
+    poses = RigidTransform.from_components(shift, rotation)
+    return ImagePoints(pixels, np.arange(count), poses, time_s=made.time_s), made
+
+
+def with_wrong_lines(made: Scan, seed: int, share: float = 0.08) -> ImagePoints:
+    """Lines with wrong ones among them: anywhere, at the probe's face, or at twice the depth."""
+    rng = np.random.default_rng([seed, 6])
+    ends = made.ends_px.copy()
+    wrong = rng.choice(len(ends), round(share * len(ends)), replace=False)
+    rows = made.size_mm[1] / made.pixel_mm[1]
+    kinds = rng.choice(3) if rng.random() < 0.5 else rng.integers(0, 3, len(wrong))
+    anywhere = (
+        rng.uniform(0.05, 0.95, (len(wrong), 1)) * rows + rng.uniform(-0.15, 0.15, (len(wrong), 2)) * rows
+    )
+    face = rng.uniform(0.02, 0.06) * rows + 0.005 * rows * rng.standard_normal((len(wrong), 2))
+    twice = np.minimum(2.0 * ends[wrong, :, 1], rows)
+    ends[wrong, :, 1] = np.choose(np.broadcast_to(kinds, len(wrong))[:, None], [anywhere * rows, face, twice])
+    return ImagePoints.of_lines(np.arange(len(ends)), ends, made.readings, made.time_s)
+
+
 def judged(trial) -> tuple[float, float, frozenset[str] | None]:
     """Errors in mm and degrees, and the motions named if refused."""
     kind, mode, seed = trial
     missing = MISSING.get(kind, ())
-    made = scan([seed, sorted(MISSING).index(kind) if kind in MISSING else 9], missing, mode == "directions")
+    place = sorted(MISSING).index(kind) if kind in MISSING else 9
     try:
-        if mode == "prior":
-            solution = calibrate_plane(made.lines, made.given_mm)
-        elif mode == "held":
-            solution = calibrate_plane(made.lines, made.pixel_mm, fit_pixels=False)
-        elif mode == "unknown":
-            solution = calibrate_plane(made.lines)
+        if mode == "directions":
+            made = scan([seed, place], missing, level=True)
+            solution = calibrate_orientation(*directions_of(made), level=seed % 2 == 0)
+            return 0.0, made.error(solution)[1], None
+        if mode == "crossing":
+            points, made = crossing([seed, place], missing)
+            solution = calibrate_cross_wire(points)
+        elif kind == "recipe":
+            rng = np.random.default_rng([seed, 7])
+            lines = scan_plane(
+                rng, int(rng.choice([80, 150, 300])), line_noise_mm=rng.uniform(0.05, 0.4)
+            ).lines
+            calibrate_plane(lines)
+            return 0.0, 0.0, None
         else:
-            raise ValueError(mode)
+            made = scan([seed, place], missing)
+            lines = with_wrong_lines(made, seed) if kind == "wrong lines" else made.lines
+            given = {"prior": (made.given_mm,), "held": (made.pixel_mm, False), "unknown": ()}[mode]
+            solution = calibrate_plane(lines, *given)
     except InsufficientDataError as refusal:
         return np.nan, np.nan, frozenset(word for word, text in WORDS.items() if text in str(refusal))
     return *made.error(solution), None
 
 
+def missing_row(mode: str, kind: str, found: list) -> Row:
+    errors = np.array([one[:2] for one in found])
+    wrong = int(((errors[:, 0] > WRONG_MM) | (errors[:, 1] > WRONG_DEG)).sum())
+    refused = [one[2] for one in found if one[2] is not None]
+    # A direction has no depth; a crossing does not say which two axes it was not turned about.
+    needed = frozenset(MISSING[kind]) - ({"depth"} if mode == "directions" else set())
+    named = sum(one == needed for one in refused)
+    share = named / len(refused) if refused else 1.0
+    worst = np.nanmax(errors, axis=0) if len(refused) < len(found) else np.zeros(2)
+    text = (
+        f"{wrong} wrong of {len(found) - len(refused)} accepted (worst {worst[0]:.1f} mm, {worst[1]:.1f} "
+        f"deg), {len(refused)} refused, motions named in {100 * share:.0f} %"
+    )
+    return Row(f"{kind}, {mode}", text, "0 wrong; 95 % named", wrong == 0 and share >= 0.95)
+
+
 def measure(share: float, first_seed: int) -> list[Row]:
+    """Missing motions (100 scans of each kind), good scans (400), and wrong lines (100)."""
     rows = []
-    for mode in ("prior", "held", "unknown"):
-        for kind in (*MISSING, "good"):
-            todo = [(kind, mode, first_seed + k) for k in range(max(1, round(400 * share)))]
-            found = trials(judged, todo)
-            errors = np.array([one[:2] for one in found])
-            refused = [one[2] for one in found if one[2] is not None]
-            wrong = int(((errors[:, 0] > WRONG_MM) | (errors[:, 1] > WRONG_DEG)).sum())
-            rows.append((mode, kind, len(found), len(refused), wrong))
+    count = max(1, round(100 * share))
+    seeds = [first_seed + k for k in range(count)]
+    for mode in ("prior", "held", "unknown", "directions"):
+        for kind in MISSING:
+            if mode == "directions" and kind == "constant depth":
+                continue
+            rows.append(missing_row(mode, kind, trials(judged, [(kind, mode, seed) for seed in seeds])))
+    for kind, mode in (("good", "prior"), ("good", "held"), ("recipe", "prior"), ("good", "crossing")):
+        found = trials(judged, [(kind, mode, seed) for seed in seeds])
+        refused = sum(one[2] is not None for one in found)
+        worst = np.nanmax([one[:2] for one in found], axis=0)
+        text = f"{refused} of {len(found)} refused, worst {worst[0]:.1f} mm, {worst[1]:.1f} deg"
+        rows.append(Row(f"{kind} scans, {mode}", text, "0 refused", refused == 0))
+    for mode in ("prior", "unknown"):
+        found = trials(judged, [("wrong lines", mode, seed) for seed in seeds])
+        worst = np.nanmax([one[0] for one in found])
+        refused = sum(one[2] is not None for one in found)
+        text = f"worst corner {worst:.1f} mm, {refused} of {len(found)} refused"
+        rows.append(Row(f"8 % wrong lines, {mode}", text, "8 mm, or refused", worst <= 8.0))
     return rows
-
-
-USED = (Row, calibrate_cross_wire, calibrate_orientation, scan_plane)
