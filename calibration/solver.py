@@ -173,10 +173,11 @@ def first_guess(
     start: Chain,
     free: tuple[str, ...],
     prior: PixelPrior | None = None,
+    rounds: int = _REWEIGHTINGS,
 ) -> Chain:
-    """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
+    """Nearly least absolute residuals, by reweighting at most so often, so that wrong frames pull little."""
     chain, before = start, np.inf
-    for _ in range(_REWEIGHTINGS):
+    for _ in range(rounds):
         size = np.abs(residuals_of(points, phantom, chain))
         if size.mean() > _SETTLED * before:
             break
