@@ -55,7 +55,7 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
 
     Lines tell roll and depth by themselves, and the sensor alone tells how far the plane's normal moved in
     its frame: the mounting, which is not known well where a motion is missing, hardly enters. Motions that
-    cannot help are left out: a plane looks the same from every side.
+    cannot help are left out: a plane whose lines have a place looks the same from every side.
     """
     points, size = solution.points_used, solution.chain.pixel_mm
     if solution.phantom.seen_as == "dot":
@@ -80,6 +80,10 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
         # The slope depends on the pixels' shape, which may be wrong; the normal swings as far at least.
         ROLL: min(slope.std(), np.sqrt(swing)) / _TURN_RAD,
     }
+    if solution.angular and solution.phantom.determined:
+        # A plane that is not known to be level has a slope, which turning about its normal tells apart.
+        turns = points.world_from_sensor.rotation
+        found[YAW] = ((turns.mean().inv() * turns).as_rotvec() @ middle).std() / _TURN_RAD
     if depth is not None:
         # About the column at which the lines cross: turning the probe there does not change the depth.
         steps = np.column_stack([np.ones(len(slope)), np.tan(slope)])

@@ -15,6 +15,7 @@ from calibration.chain import (
     CHAIN,
     POSE,
     PROBE,
+    SCALES,
     Chain,
     ChainSolution,
     ImagePoints,
@@ -125,7 +126,9 @@ def agreed(
     prior: PixelPrior | None = None,
 ) -> tuple[Chain, BoolArray]:
     """Least squares of the frames that do not contradict the others, and which points those are."""
-    chain = first_guess(points, phantom, start, free, prior)
+    # Pixel sizes that are known somewhat are held while wrong frames still pull.
+    held = tuple(name for name in free if prior is None or name not in SCALES)
+    chain = first_guess(points, phantom, start, held)
     residuals = residuals_of(points, phantom, chain)
     used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
     round_ = 0
@@ -164,13 +167,7 @@ def probe_parameters(
     return POSE, np.asarray(pixel_mm, dtype=float)
 
 
-def first_guess(
-    points: ImagePoints,
-    phantom: Phantom,
-    start: Chain,
-    free: tuple[str, ...],
-    prior: PixelPrior | None = None,
-) -> Chain:
+def first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
     """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
     chain, before = start, np.inf
     for _ in range(_REWEIGHTINGS):
@@ -178,11 +175,8 @@ def first_guess(
         if size.mean() > _SETTLED * before:
             break
         before = size.mean()
-        sigma = sigma_of(size)
-        weights = np.sqrt(huber_weights(size / sigma, _NEARLY_ABSOLUTE))
-        # A prior weighs as much against the residuals as they weigh on average.
-        fair = sigma * float(np.sqrt(np.mean(weights**2)))
-        chain, _, _ = refined(points, phantom, chain, free, weights, 1e-3, prior, fair)
+        weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
+        chain, _, _ = refined(points, phantom, chain, free, weights, tolerance=1e-3)
     return chain
 
 
