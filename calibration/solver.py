@@ -97,6 +97,9 @@ def solve_chain(
     bigger = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
     if sigma_of(residuals_of(points[used], phantom, settled)) < _RUNAWAY * least and bigger < _RESIZED:
         chain = settled
+    if phantom.determined:
+        # Where the phantom is, as the readings say on average: what wanders is not in its place.
+        chain, _, _ = refined(points[used], phantom, chain, phantom.determined)
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])

