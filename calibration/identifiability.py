@@ -42,6 +42,9 @@ _ALLOWED_LACKING, _ALLOWED_FULL = 0.65, 1.5
 """Shares of what is allowed. Where a motion is absent, the standard error is itself uncertain, and three of
 it are to stay below 5 mm and 5 degrees. Where none is, and errors are large only because they wander, the
 motion is not to blame, and half as much again is let pass."""
+_LET_PASS = 2.0
+"""Share of what is allowed that errors may reach, were residuals those of a phantom that fits, for a misfit
+to be the phantom's."""
 _HELPS, _MATTERS = 1.5, 0.5
 """A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
 _HOPELESS = 10.0
@@ -122,7 +125,7 @@ def judge(solution: ChainSolution) -> Adequacy:
     share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * white.of_limit(REFUSED_MM, REFUSED_RAD) <= 1:
+    if share < 1 and share * white.of_limit(REFUSED_MM, REFUSED_RAD) <= _LET_PASS:
         misfit = (
             f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
