@@ -47,6 +47,7 @@ _LET_PASS = 2.0
 to be the phantom's."""
 _HELPS, _MATTERS = 1.5, 0.5
 """A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
+_HELPS_LITTLE = 1.05
 _HOPELESS = 10.0
 """Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are:
 all motions that a scan of a plane has not are named."""
@@ -242,7 +243,8 @@ def _uncertain(solution: ChainSolution, information: FloatArray, inflation: floa
 def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float]) -> list[Motion]:
     """Of the motions that a scan has not, those without which its error would stay larger.
 
-    If none is absent, the one that helps most: it was there, and not far enough.
+    If none of them is, the one that helps at all; if none is absent, that which helps most: it was there, and
+    not far enough.
     """
     lacking = absent(solution)
     least, now = error(lacking), error([])
@@ -257,9 +259,9 @@ def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float])
         needed.append(min(others, key=lambda one: error([*needed, one])))
     if needed:
         return needed
-    some = list(extents(solution))
+    some = [one for one in lacking if without[one] > _HELPS_LITTLE * least] or list(extents(solution))
     best = min(some, key=lambda one: error([one]))
-    return [best] if now > _HELPS * error([best]) else []
+    return [best] if best in lacking or now > _HELPS * error([best]) else []
 
 
 def _telling(solution: ChainSolution) -> list[Motion]:

@@ -66,7 +66,9 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
     up = points.turns.transpose(0, 2, 1) @ solution.chain.target_from_world.rotation.as_matrix()[2]
     middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
-    if not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
+    if solution.prior is not None:
+        size = solution.prior.pixel_mm
+    elif "s_x" in solution.free and not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
         size = np.full(2, size[1])
     if solution.angular:
         along, depth = points.pixels * size, None
