@@ -38,12 +38,16 @@ TIE = 25.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
-_ALLOWED_LACKING, _ALLOWED_FULL = 0.65, 2.0
+_ALLOWED_LACKING, _ALLOWED_FULL = 0.65, 1.5
 """Shares of what is allowed. Where a motion is absent, the standard error is itself uncertain, and three of
 it are to stay below 5 mm and 5 degrees. Where none is, and errors are large only because they wander, the
-motion is not to blame: then 5 mm and 5 degrees are the limits of the standard error."""
+motion is not to blame, and half as much again is let pass."""
+_LET_PASS = 2.0
+"""Share of what is allowed that errors may reach, were residuals those of a phantom that fits, for a misfit
+to be the phantom's."""
 _HELPS, _MATTERS = 1.5, 0.5
 """A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
+_HELPS_LITTLE = 1.05
 _HOPELESS = 10.0
 """Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are:
 all motions that a scan of a plane has not are named."""
@@ -122,7 +126,7 @@ def judge(solution: ChainSolution) -> Adequacy:
     share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * white.of_limit(REFUSED_MM, REFUSED_RAD) <= 1:
+    if share < 1 and share * white.of_limit(REFUSED_MM, REFUSED_RAD) <= _LET_PASS:
         misfit = (
             f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
@@ -131,7 +135,7 @@ def judge(solution: ChainSolution) -> Adequacy:
         return Adequacy(error, condition, (), True, misfit)
     tied = solution.rival is not None and solution.rival.evidence < TIE
     allowed = _ALLOWED_LACKING if absent(solution) else 1.0
-    if not absent(solution) and white.of_limit(WEAK_MM, WEAK_RAD) <= 1:
+    if not absent(solution) and white.of_limit(WEAK_MM, WEAK_RAD) <= 2:
         allowed = _ALLOWED_FULL
     refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied)
     weak = errors.of_limit(WEAK_MM, WEAK_RAD) > 1
@@ -239,7 +243,8 @@ def _uncertain(solution: ChainSolution, information: FloatArray, inflation: floa
 def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float]) -> list[Motion]:
     """Of the motions that a scan has not, those without which its error would stay larger.
 
-    If none is absent, the one that helps most: it was there, and not far enough.
+    If none of them is, the one that helps at all; if none is absent, that which helps most: it was there, and
+    not far enough.
     """
     lacking = absent(solution)
     least, now = error(lacking), error([])
@@ -254,9 +259,9 @@ def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float])
         needed.append(min(others, key=lambda one: error([*needed, one])))
     if needed:
         return needed
-    some = list(extents(solution))
+    some = [one for one in lacking if without[one] > _HELPS_LITTLE * least] or list(extents(solution))
     best = min(some, key=lambda one: error([one]))
-    return [best] if now > _HELPS * error([best]) else []
+    return [best] if best in lacking or now > _HELPS * error([best]) else []
 
 
 def _telling(solution: ChainSolution) -> list[Motion]:

@@ -55,7 +55,7 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
 
     Lines tell roll and depth by themselves, and the sensor alone tells how far the plane's normal moved in
     its frame: the mounting, which is not known well where a motion is missing, hardly enters. Motions that
-    cannot help are left out: a plane looks the same from every side.
+    cannot help are left out: a plane whose lines have a place looks the same from every side.
     """
     points, size = solution.points_used, solution.chain.pixel_mm
     if solution.phantom.seen_as == "dot":
@@ -66,7 +66,9 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
     up = points.turns.transpose(0, 2, 1) @ solution.chain.target_from_world.rotation.as_matrix()[2]
     middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
-    if not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
+    if solution.prior is not None:
+        size = solution.prior.pixel_mm
+    elif "s_x" in solution.free and not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
         size = np.full(2, size[1])
     if solution.angular:
         along, depth = points.pixels * size, None
@@ -80,6 +82,10 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
         # The slope depends on the pixels' shape, which may be wrong; the normal swings as far at least.
         ROLL: min(slope.std(), np.sqrt(swing)) / _TURN_RAD,
     }
+    if solution.angular and solution.phantom.determined:
+        # A plane that is not known to be level has a slope, which turning about its normal tells apart.
+        turns = points.world_from_sensor.rotation
+        found[YAW] = ((turns.mean().inv() * turns).as_rotvec() @ middle).std() / _TURN_RAD
     if depth is not None:
         # About the column at which the lines cross: turning the probe there does not change the depth.
         steps = np.column_stack([np.ones(len(slope)), np.tan(slope)])

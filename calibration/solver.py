@@ -15,6 +15,7 @@ from calibration.chain import (
     CHAIN,
     POSE,
     PROBE,
+    SCALES,
     Chain,
     ChainSolution,
     ImagePoints,
@@ -128,7 +129,9 @@ def agreed(
     prior: PixelPrior | None = None,
 ) -> tuple[Chain, BoolArray]:
     """Least squares of the frames that do not contradict the others, and which points those are."""
-    chain = first_guess(points, phantom, start, free, prior)
+    # Pixel sizes that are known somewhat are held while wrong frames still pull.
+    held = tuple(name for name in free if prior is None or name not in SCALES)
+    chain = first_guess(points, phantom, start, held)
     residuals = residuals_of(points, phantom, chain)
     used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
     round_ = 0
@@ -172,7 +175,6 @@ def first_guess(
     phantom: Phantom,
     start: Chain,
     free: tuple[str, ...],
-    prior: PixelPrior | None = None,
     rounds: int = _REWEIGHTINGS,
 ) -> Chain:
     """Nearly least absolute residuals, by reweighting at most so often, so that wrong frames pull little."""
@@ -182,11 +184,8 @@ def first_guess(
         if size.mean() > _SETTLED * before:
             break
         before = size.mean()
-        sigma = sigma_of(size)
-        weights = np.sqrt(huber_weights(size / sigma, _NEARLY_ABSOLUTE))
-        # A prior weighs as much against the residuals as they weigh on average.
-        fair = sigma * float(np.sqrt(np.mean(weights**2)))
-        chain, _, _ = refined(points, phantom, chain, free, weights, 1e-3, prior, fair)
+        weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
+        chain, _, _ = refined(points, phantom, chain, free, weights, tolerance=1e-3)
     return chain
 
 

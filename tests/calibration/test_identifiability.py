@@ -131,13 +131,13 @@ def test_the_first_advice_is_the_motion_that_is_missing():
 
 def test_pixels_that_shrink_to_nothing_are_refused():
     # About a point at one depth any probe that is one point big hovers at one height: no residual at all.
-    with pytest.raises(InsufficientDataError, match=r"pixel size.*up and down"):
+    with pytest.raises(InsufficientDataError, match="up and down"):
         calibrate_lines({"tilt": 25.0, "roll": 15.0, "rotate": 25.0})
 
 
 def test_three_words_for_three_states():
     moves = {"roll": 15.0, "move": 11.0}
-    good, weak = lines_of(moves | {"tilt": 25.0}), lines_of(moves | {"tilt": 6.0}, noise_mm=0.4)
+    good, weak = lines_of(moves | {"tilt": 25.0}), lines_of(moves | {"tilt": 8.0}, noise_mm=0.4)
     sufficient, weakly = judge(calibrate_plane(good)), judge(calibrate_plane(weak))
     assert not sufficient.refused
     assert sufficient.missing == ()

@@ -154,7 +154,9 @@ def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     seen = (right - left > 0.4 * width) & (rng.random(count) > rng.uniform(0.0, 0.1))
     across = np.column_stack([left, right])
     along = at_sides[:, :1] + slope[:, None] * (across - sides[0])
-    along += rng.choice([0.05, 0.1, 0.2, 0.4]) * rng.standard_normal(along.shape)
+    along += rng.choice([0.05, 0.1, 0.2, 0.4] if missing else [0.05, 0.1, 0.2]) * rng.standard_normal(
+        along.shape
+    )
     ends_px = np.stack([across, along], axis=2) / pixel_mm
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
     floor = RigidTransform.from_components(
