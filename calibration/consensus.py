@@ -1,4 +1,4 @@
-"""Which candidates of which frames show the one point that every frame should show: a consensus by chance's measure.
+"""Which candidates show the one point that all frames should show: a consensus, judged against chance.
 
 A frame may offer several candidates, all of them wrong. Four candidates from four frames give a calibration
 by linear equations; the one with which most frames agree is kept if so much agreement is not to be expected
@@ -13,7 +13,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,13 +36,14 @@ _SAMPLE = 4
 """Frames that give twelve equations, for the image's origin, its two axes and the point."""
 _MOST_FRAMES = 120
 """Frames that vote; more would vote alike."""
-_BATCH = 3000
-_FEWEST_BATCHES, _MOST_BATCHES = 2, 10
-"""With the right candidate first in three frames of ten, one sample in 120 is right, and with it in one of
-ten, every batch still has one within three; ten batches take some two seconds."""
-_KEPT = 25
-_SURE = 1e-8
-"""False alarms at which the search ends."""
+_BATCHES = (300, *[3000] * 10)
+"""Samples drawn at a time. With the right candidate drawn in three frames of ten, one sample in 120 is right;
+in one of ten, one in 10,000. All take some two seconds."""
+_KEPT, _JUDGED = 25, 3
+"""Best samples of a batch that are refined, and best refined ones that are judged."""
+_SURE = -0.5
+"""Logarithm of the false alarms, over the number of frames, at which the search ends: a third of the frames
+agree to within a hundredth of the image, or more to less."""
 _LOOSE_MM = 6.0
 """Samples of four are as uncertain as this where frames are turned by some ten degrees."""
 _TIGHTER_MM = (6.0, 5.0, 4.0, 3.0, 3.0)
@@ -67,8 +67,8 @@ class Consensus:
         A start for the solver.
     nearest : ndarray of int, shape (f,)
         For each frame, ascending, the candidate nearest to where the point should be, as a row of the points.
-    agreed : ndarray of bool, shape (f,)
-        Frames whose nearest is within `gate_mm`.
+    away_mm : ndarray, shape (f,)
+        How far from it that candidate is.
     gate_mm : float
     false_alarms : float
         Number of calibrations with as much agreement expected among chance candidates.
@@ -76,9 +76,14 @@ class Consensus:
 
     chain: Chain
     nearest: IntArray
-    agreed: BoolArray
+    away_mm: FloatArray
     gate_mm: float
     false_alarms: float
+
+    @property
+    def agreed(self) -> BoolArray:
+        """Frames whose candidate is within `gate_mm`, shape (f,)."""
+        return np.asarray(self.away_mm <= self.gate_mm)
 
     @property
     def believed(self) -> bool:
@@ -89,7 +94,7 @@ class Consensus:
         """Raise `InsufficientDataError` unless it is believed."""
         if not self.believed:
             raise InsufficientDataError(
-                f"expected one point that the frames agree on beyond chance, got at best {self.agreed.sum()} "
+                f"expected one point that the frames agree on beyond chance, got {self.agreed.sum()} "
                 f"of {len(self.agreed)} frames within {self.gate_mm:g} mm, which chance gives "
                 f"{self.false_alarms:.2g} times a recording (limit {FALSE_ALARMS:g}): do the images and the "
                 "sensor readings belong together, and do they show a crossing? Points picked by hand, or a "
@@ -118,10 +123,10 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
     best: tuple[float, float, FloatArray] = (np.inf, GATES_MM[-1], np.zeros(12))
     # Where the motion leaves axes open, no sample is plausible, and any will do to say so.
     for plausible in (True, False):
-        for batch in range(_MOST_BATCHES if plausible else 1):
-            for model in voters.promising(voters.samples(rng, _BATCH), plausible):
+        for count in _BATCHES if plausible else _BATCHES[:2]:
+            for model in voters.promising(voters.samples(rng, count), plausible):
                 best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
-            if batch + 1 >= _FEWEST_BATCHES and best[0] < np.log10(_SURE):
+            if best[0] < _SURE * len(voters.frames):
                 break
         if best[0] < np.log10(FALSE_ALARMS):
             break
@@ -129,7 +134,7 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
     affine = voters.affine(model)
     nearest, away = nearest_candidates(points, *affine)
     alarms = float(10.0 ** min(log_alarms, 300.0))
-    return Consensus(_squared(*affine), nearest, away <= gate, gate, alarms)
+    return Consensus(_squared(*affine), nearest, away, gate, alarms)
 
 
 def nearest_candidates(
@@ -196,7 +201,7 @@ class _Candidates:
         self.prior = np.diag(np.concatenate([np.full(3, _FAR_MM), axes, np.full(3, _FAR_MM)]) ** -2.0)
 
     def samples(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Models of candidates drawn from four frames each, the likelier ones more often, shape (count, 12)."""
+        """Models of candidates drawn from four frames each, the likelier more often, shape (count, 12)."""
         frames = np.argsort(rng.random((count, len(self.frames))), axis=1)[:, :_SAMPLE]
         rank = np.arange(len(self.of_frame)) - self.start[self.of_frame]
         weight = np.cumsum(1.0 / (1.0 + rank))
@@ -208,21 +213,21 @@ class _Candidates:
 
     def _solved(self, matrix: FloatArray, wanted: FloatArray) -> FloatArray:
         turned = np.swapaxes(matrix, -1, -2)
-        return np.asarray(
-            np.linalg.solve(turned @ matrix + self.prior, turned @ wanted[..., None])[..., 0]
-        )
+        return np.asarray(np.linalg.solve(turned @ matrix + self.prior, turned @ wanted[..., None])[..., 0])
 
-    def promising(self, models: FloatArray, plausible: bool) -> Iterator[FloatArray]:
+    def promising(self, models: FloatArray, plausible: bool) -> list[FloatArray]:
         """Refine the models with which most frames agree."""
         if plausible:
             models = models[self._plausible(models)]
-        if not len(models):
-            return
-        cost = np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1)
-        for model in models[np.argsort(cost, kind="stable")[:_KEPT]]:
-            refined = self._refined(model)
-            if not plausible or self._plausible(refined[None])[0]:
-                yield refined
+        best = [self._refined(models[n]) for n in np.argsort(self._cost(models), kind="stable")[:_KEPT]]
+        refined = np.reshape(best, (-1, 12))
+        if plausible:
+            refined = refined[self._plausible(refined)]
+        return list(refined[np.argsort(self._cost(refined), kind="stable")[:_JUDGED]])
+
+    def _cost(self, models: FloatArray) -> FloatArray:
+        """Sum over the frames of their nearest candidate's squared distance, bounded; shape (models,)."""
+        return np.asarray(np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1))
 
     def _plausible(self, models: FloatArray) -> BoolArray:
         axes = models[:, 3:9].reshape(-1, 2, 3)

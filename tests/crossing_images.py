@@ -66,7 +66,10 @@ class Probe:
 
 @dataclass(frozen=True)
 class Look:
-    """How a phantom and a scanner's settings make frames look; decibels are relative to a wire across."""
+    """How a phantom and a scanner's settings make frames look; decibels are relative to a wire across.
+
+    The floor of its bath, so far beyond the crossing, is a long line that wires seem to cross, too.
+    """
 
     elevation_mm: float
     focus_mm: float
@@ -87,6 +90,8 @@ class Look:
     tail: float
     faint_db: float
     lettering: bool
+    floor_db: float
+    floor_mm: float
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,7 @@ def random_look(rng, probe):
         spread_mm=rng.uniform(0.3, 0.6) * probe.depth_mm,
         pulse_mm=rng.uniform(0.2, 0.45) * deep**0.5,
         beam_mm=rng.uniform(0.4, 0.9) * deep**0.5,
-        lobes_db=rng.uniform(-38, -24),
+        lobes_db=rng.uniform(-38, -16),
         lobes_mm=rng.uniform(6, 20),
         slope_db=rng.uniform(3, 10),
         speckle_db=rng.uniform(-42, -20),
@@ -148,15 +153,19 @@ def random_look(rng, probe):
         gain_step_db=rng.uniform(-10, 10),
         skin_db=rng.uniform(-15, 10),
         skin_mm=rng.uniform(2, 9),
-        points_per_cm3=rng.uniform(0.2, 4.0),
-        points_db=rng.uniform(-14, 4),
+        points_per_cm3=np.exp(rng.uniform(np.log(0.1), np.log(4.0))),
+        points_db=rng.uniform(-14, 7),
         tail=rng.uniform(0.0, 0.35),
         faint_db=rng.uniform(-9, 0),
         lettering=bool(rng.random() < 0.8),
+        floor_db=rng.uniform(-15, 8) if rng.random() < 0.4 else -np.inf,
+        floor_mm=rng.uniform(0.15, 0.6) * probe.depth_mm,
     )
 
 
-def crossing_world(seed, frames=54, recorded=None, absent=0.12, probe=None, look=None, noise=(0.25, 0.15, 0.3)):
+def crossing_world(
+    seed, frames=54, recorded=None, absent=0.12, probe=None, look=None, noise=(0.25, 0.15, 0.3)
+):
     """Images of a crossing by a hand that turns the probe about it, and a tracker's readings.
 
     Parameters
@@ -178,9 +187,7 @@ def crossing_world(seed, frames=54, recorded=None, absent=0.12, probe=None, look
     away = np.where(lost, rng.choice([-1, 1], frames) * rng.uniform(4, 9, frames) * look.elevation_mm, away)
     flat = np.column_stack([pixels * probe.pixel_mm, away])
     base = Rotation.random(rng=rng)
-    world_from_image = RigidTransform.from_components(
-        centre - (base * turns).apply(flat), base * turns
-    )
+    world_from_image = RigidTransform.from_components(centre - (base * turns).apply(flat), base * turns)
     # Who holds the probe sees to it that the crossing shows.
     drawn = [_directions(rng) for _ in range(40)]
     seen = [_both_seen(probe, look, pixels, turns, one) for one in drawn]
@@ -188,9 +195,10 @@ def crossing_world(seed, frames=54, recorded=None, absent=0.12, probe=None, look
     wires = _wires(rng, base, centre, drawn[best])
     points = _scatterers(rng, look, centre)
     letters = _lettering(rng, probe) if look.lettering else None
+    floor = centre + base.apply([0.0, look.floor_mm, 0.0]), base.apply([0.0, 1.0, 0.0])
     texture = _skin(rng, probe, look)
     images = np.stack(
-        [_frame(rng, probe, look, pose, wires, points, texture, letters) for pose in world_from_image]
+        [_frame(rng, probe, look, pose, wires, points, floor, texture, letters) for pose in world_from_image]
     )
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
     readings = world_from_image * mounting.inv() * _errors(rng, frames, *noise)
@@ -292,7 +300,7 @@ def _scatterers(rng, look, centre):
     return places, size * np.exp(2j * np.pi * rng.random(count))
 
 
-def _frame(rng, probe, look, world_from_image, wires, points, skin, letters):
+def _frame(rng, probe, look, world_from_image, wires, points, floor, skin, letters):
     echoes = np.zeros((probe.beams, probe.samples), complex)
     into = world_from_image.inv()
     faint = 10 ** (look.faint_db / 20.0)
@@ -310,13 +318,17 @@ def _frame(rng, probe, look, world_from_image, wires, points, skin, letters):
     near = np.abs(place[:, 2]) < 6 * look.elevation_mm
     x, y = probe.from_image(place[near, :2] / probe.pixel_mm).T
     _splat(echoes, probe, x, y, points[1][near] * _met(look, y, place[near, 2]))
+    if np.isfinite(look.floor_db):
+        _splat(echoes, probe, *_floor(rng, probe, look, into.apply(floor[0]), into.rotation.apply(floor[1])))
     speckle = rng.standard_normal((2, *echoes.shape))
     seen = _blurred(probe, look, echoes, lobes=True)
     grains = _blurred(probe, look, speckle[0] + 1j * speckle[1], lobes=False)
     grains *= 10 ** (look.speckle_db / 20.0) / np.sqrt(np.mean(np.abs(grains) ** 2))
     hiss = rng.standard_normal((2, *echoes.shape)) * 10 ** (look.noise_db / 20.0)
     depth = np.linspace(0, 1, probe.samples)
-    total = np.abs(seen + grains + skin * rng.uniform(0.7, 1.3) + (hiss[0] + 1j * hiss[1]) * (0.3 + 1.2 * depth))
+    total = np.abs(
+        seen + grains + skin * rng.uniform(0.7, 1.3) + (hiss[0] + 1j * hiss[1]) * (0.3 + 1.2 * depth)
+    )
     level = 20 * np.log10(total + 1e-4) + look.gain_step_db * (depth > 0.5)
     grey = np.clip(255.0 * (level + look.range_db) / (look.range_db + 2.0), 0, 255)
     column, row = np.meshgrid(*(np.arange(n) for n in probe.shape), indexing="ij")
@@ -327,6 +339,18 @@ def _frame(rng, probe, look, world_from_image, wires, points, skin, letters):
     if letters is not None:
         picture = np.maximum(picture, letters)
     return picture.astype(np.uint8)
+
+
+def _floor(rng, probe, look, place, normal):
+    """Points where the image meets a plane, and their amplitudes: a mirror, weak where met aslant."""
+    across = np.array([-normal[1], normal[0]]) / np.hypot(*normal[:2])
+    place = probe.from_image(place[:2] / probe.pixel_mm) - place[2] * np.array([0, normal[2]])
+    t = np.arange(-120, 120, STEP_MM)[:, None]
+    x, y = (place + t * across).T
+    beam = (0.0, 1.0) if np.isinf(probe.radius_mm) else _unit(x, y + probe.radius_mm)
+    aslant = np.arccos(np.clip(np.abs(beam[0] * normal[0] + beam[1] * normal[1]), 0, 1))
+    grain = 1.0 + 0.4 * gaussian_filter1d(rng.standard_normal(len(x)), 8) / 0.19
+    return x, y, grain * 10 ** ((look.floor_db - 18 * (aslant / 0.5) ** 2) / 20.0) * STEP_MM / 0.6
 
 
 def _unit(x, y):
@@ -369,7 +393,9 @@ def _blurred(probe, look, echoes, lobes):
     reach = int(look.lobes_mm / pitch)
     arcs = np.zeros_like(beam)
     for step in range(-reach, reach + 1, 2):
-        shape = np.cos(np.pi * step / (2 * reach + 1)) * (0.6 + 0.4 * np.cos(step * 1.3)) * (-1) ** (step // 2)
+        shape = (
+            np.cos(np.pi * step / (2 * reach + 1)) * (0.6 + 0.4 * np.cos(step * 1.3)) * (-1) ** (step // 2)
+        )
         moved = np.zeros_like(out)
         if step >= 0:
             moved[step:] = out[: len(out) - step]
@@ -403,7 +429,10 @@ def _lettering(rng, probe):
         letters = np.kron(rng.random((length, 5, 7)) < 0.45, np.ones((1, scale, scale)))
         block = np.concatenate([np.pad(one, ((0, scale), (0, 0))) for one in letters])
         if rng.random() < 0.65:
-            u, v = rng.choice([rng.integers(0, 40), max(0, columns - len(block) - 5)]), rng.integers(0, rows - 20)
+            u, v = (
+                rng.choice([rng.integers(0, 40), max(0, columns - len(block) - 5)]),
+                rng.integers(0, rows - 20),
+            )
         else:
             u, v = rng.integers(0, max(1, columns - len(block))), rng.choice([2, rows - 18])
         part = picture[u : u + len(block), v : v + block.shape[1]]
