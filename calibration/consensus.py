@@ -240,7 +240,7 @@ class _Candidates:
         """Squared distance of each frame's nearest candidate from the point, shape (models, frames)."""
         rows = self.rows.reshape(-1, 12).astype(np.float32)
         left = models.astype(np.float32) @ rows.T - self.wanted.ravel().astype(np.float32)
-        squares = np.sum(left.reshape(len(models), -1, 3) ** 2, axis=2)
+        squares = np.sum(left.reshape(len(models), len(self.of_frame), 3) ** 2, axis=2)
         return np.asarray(np.minimum.reduceat(squares, self.start, axis=1))
 
     def _refined(self, model: FloatArray) -> FloatArray:

@@ -138,7 +138,7 @@ def choose_crossings(recording: Recording, seen: Seen, offsets_s: Sequence[float
         raise InvalidInputError("offsets_s: expected at least one, got none")
     found, candidates = best[0].require(), best[1]
     near = found.away_mm <= GATES_MM[-1]
-    elsewhere = f"nothing within {GATES_MM[-1]:g} mm of where the other frames put the crossing"
+    elsewhere = f"nothing within {GATES_MM[-1]:g} mm of the other frames' crossing"
     reasons = dict.fromkeys((int(n) for n in candidates.frame[found.nearest[~near]]), elsewhere)
     unread = np.setdiff1d(seen.frame, candidates.frame)
     reasons |= dict.fromkeys((int(n) for n in unread), "no sensor reading at its time")

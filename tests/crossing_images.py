@@ -143,7 +143,8 @@ def random_look(rng, probe):
         focus_mm=rng.uniform(0.3, 0.7) * probe.depth_mm,
         spread_mm=rng.uniform(0.3, 0.6) * probe.depth_mm,
         pulse_mm=rng.uniform(0.2, 0.45) * deep**0.5,
-        beam_mm=rng.uniform(0.4, 0.9) * deep**0.5,
+        # Along the array: a convex one's beams spread by the angle of wavelength over aperture, 0.02 rad.
+        beam_mm=rng.uniform(0.4, 0.9) * (deep**0.5 if np.isinf(probe.radius_mm) else 0.7),
         lobes_db=rng.uniform(-38, -16),
         lobes_mm=rng.uniform(6, 20),
         slope_db=rng.uniform(3, 10),
@@ -385,7 +386,7 @@ def _blurred(probe, look, echoes, lobes):
         out = out + late
     depth = np.linspace(0, probe.depth_mm, probe.samples)
     narrow = look.beam_mm / pitch
-    thin, wide = (gaussian_filter1d(out, w, axis=0) * np.sqrt(2 * np.pi) * w for w in (narrow, 2.2 * narrow))
+    thin, wide = (gaussian_filter1d(out, w, axis=0) * np.sqrt(2 * np.pi) * w for w in (narrow, 1.8 * narrow))
     mix = np.clip(np.abs(depth - look.focus_mm) / (2.0 * look.spread_mm), 0, 1)
     beam = (1 - mix) * thin + mix * wide / 1.5
     if not lobes:

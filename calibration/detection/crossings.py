@@ -35,9 +35,12 @@ _ORIENTATIONS = 16
 _APART = 4
 """Least difference of the two lines' orientations, in steps of 11 degrees. Wires 20 degrees apart still
 respond, for the filters' own width is 10."""
-_LEAK = 0.0
+_LEAK = 0.1
+"""Part of a lone line's contrast that filters well apart from it may see; taken off the second line's."""
 _SIDE = 2.5
 """Where the two sides are, in `width_mm`: beyond the line itself."""
+_WIDTHS = (1.0, 2.0)
+"""Filters across a line, in `width_mm`."""
 _STEPS = 1.5
 """Samples to a `width_mm` of the images that are filtered."""
 _GLANCES = 40
@@ -47,6 +50,7 @@ _FEWEST_GLANCES = 8
 _STANDING = 0.3
 """Part of the frames that are darker than what stands still; wires are in one place less often."""
 _SHIFTS = 5
+"""Steps of the mean shift that centres a candidate; a bead is then placed to 0.02 mm."""
 _PEAKS = 40
 """Maxima looked at for each width."""
 
@@ -171,7 +175,7 @@ def _crossings(
     if inside is not None:
         grey = np.where(inside, grey, np.float32(0.0))
     peaks, scores = [], []
-    for width in (s.width_mm, 2.0 * s.width_mm):
+    for width in s.width_mm * np.array(_WIDTHS):
         coarse, step_px = _resampled(grey, pixel_mm, width)
         pixels, score = _maxima(_two_lines(coarse, step_px * pixel_mm, width, s), step_px, pixel_mm, s)
         peaks.append(pixels)

@@ -41,7 +41,7 @@ def test_crossing_wires_are_found_and_calibrated_with(run, refused, tmp_path):
     assert np.isin(np.flatnonzero(world.shown), picked.frame[away < 2.0]).mean() >= 0.8
     dropped = found.frames.dropped
     assert set(dropped) | set(found.frames.used) == set(range(36))
-    assert any("where the other frames put the crossing" in why for why in dropped.values())
+    assert any("nothing within 4 mm" in why for why in dropped.values())
     np.testing.assert_allclose(found.pixel_mm, world.pixel_mm, rtol=0.06)
     # The middle of what the crossing covered; tracker and beam leave half a millimetre, often.
     middle = np.median(world.crossing_px, axis=0)
