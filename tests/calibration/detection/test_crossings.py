@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from crossing_images import Look, Probe, crossing_world
+from scipy.ndimage import gaussian_filter
 from wire_scenes import PIXEL_MM, SHAPE, picture
 
 from calibration.detection.crossings import CrossingSettings, crossings_in_frames, crossings_in_image
@@ -76,9 +77,24 @@ def test_two_lines_are_stronger_where_they_cross_than_either_and_edges_are_none(
     np.testing.assert_allclose(pixels[0], true, atol=2.0)
     assert (score[1:] < 0.5 * score[0]).all()
     _, alone = crossings_in_image(step + one, (0.25, 0.25))
-    assert max(alone, default=0.0) < 0.3 * score[0]
+    # Filters 34 degrees off a line still see a little of it.
+    assert max(alone, default=0.0) < 0.5 * score[0]
     _, edge = crossings_in_image(step, (0.25, 0.25))
     assert max(edge, default=0.0) < 0.01 * score[0]
+
+
+@pytest.mark.parametrize("apart_deg", [30.0, 60.0])
+def test_long_wires_a_third_of_a_right_angle_apart_are_found_in_speckle(apart_deg):
+    rng = np.random.default_rng(3)
+    u, v = np.meshgrid(np.arange(240.0), np.arange(240.0), indexing="ij")
+    for turn in np.linspace(0.1, 2.9, 4):
+        true = rng.uniform(90, 150, 2)
+        image = 40.0 + 12.0 * gaussian_filter(rng.standard_normal(u.shape), 2.0) / 0.14
+        for angle, level in ((turn, 110.0), (turn + np.deg2rad(apart_deg), 70.0)):
+            off = (v - true[1]) * np.cos(angle) - (u - true[0]) * np.sin(angle)
+            image = np.maximum(image, 40.0 + level * np.exp(-0.5 * (off / 4.0) ** 2))
+        pixels, _ = crossings_in_image(np.clip(image, 0, 255).astype(np.uint8), (0.25, 0.25))
+        assert np.min(np.hypot(*((pixels - true) * 0.25).T)) < 2.0
 
 
 def test_a_region_bounds_what_counts_and_blank_frames_are_told():
