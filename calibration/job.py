@@ -12,8 +12,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import ChainSolution, ImagePoints, Seen, as_directions
-from calibration.clock.offset import ClockOffset, covered, estimate_offset
-from calibration.detection.dots import dots_in_frames, single_dots
+from calibration.clock.offset import ClockOffset, covered, delays_around, estimate_offset
+from calibration.consensus import GATES_MM, Consensus, find_consensus
+from calibration.detection.crossings import crossings_in_frames
+from calibration.detection.dots import dots_in_frames
 from calibration.detection.labelling import label_dots
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
@@ -33,6 +35,9 @@ Progress = Callable[[int, int], None]
 SEARCH_S = 0.4
 """Clock offsets tried to either side of the recording's own: usual latencies of trackers and frame grabbers
 are below 0.2 s."""
+
+_CHOICE_STEP_S = 0.1
+"""Clock offsets at which crossings are chosen; a hand moves by a few millimetres in that time."""
 
 _FEWEST_COVERED = 0.3
 """Least share of the frames with a detection that must have a reading; below it, the recordings do not belong
@@ -84,10 +89,17 @@ class JobSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Outcome:
-    """A calibration and what its report shows."""
+    """A calibration and what its report shows.
+
+    Attributes
+    ----------
+    seen : Seen
+        What it is made from; of several candidates, those chosen.
+    """
 
     solution: ChainSolution
     calibration: Calibration
+    seen: Seen
     shots: tuple[Shot, ...]
     beam: tuple[BeamBias, ...] = ()
     offset: ClockOffset | None = None
@@ -96,8 +108,43 @@ class Outcome:
 def find_crossings(
     recording: Recording, region_px: npt.ArrayLike | None = None, progress: Progress | None = None
 ) -> Seen:
-    """Find in every image the bright dot that a crossing of wires, or a bead, makes."""
-    return single_dots(dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress))
+    """Find in every image places where wires may cross, or a bead may be; `wires_job` chooses among them."""
+    return crossings_in_frames(recording.images, recording.pixel_mm, None, region_px, progress)
+
+
+def choose_crossings(recording: Recording, seen: Seen, offsets_s: Sequence[float]) -> Seen:
+    """Choose the candidate of each frame that is where the other frames put the crossing.
+
+    Parameters
+    ----------
+    seen : Seen
+        One or several candidates in each frame; what has one only is returned as it is.
+    offsets_s : sequence of float
+        Clock offsets tried; the one with which most frames agree counts.
+
+    Raises
+    ------
+    InsufficientDataError
+        If no more frames agree than chance candidates would, or few have a sensor reading.
+    """
+    if len(seen) == len(np.unique(seen.frame)):
+        return seen
+    best: tuple[Consensus, Seen] | None = None
+    for offset_s in offsets_s:
+        there = covered(recording.readings, recording.frame_time_s[seen.frame], offset_s)
+        found = find_consensus(paired(recording, seen, offset_s)[0], recording.pixel_mm)
+        if best is None or found.false_alarms < best[0].false_alarms:
+            best = found, seen[there]
+    if best is None:
+        raise InvalidInputError("offsets_s: expected at least one, got none")
+    found, candidates = best[0].require(), best[1]
+    near = found.away_mm <= GATES_MM[-1]
+    elsewhere = f"nothing within {GATES_MM[-1]:g} mm of the other frames' crossing"
+    reasons = dict.fromkeys((int(n) for n in candidates.frame[found.nearest[~near]]), elsewhere)
+    unread = np.setdiff1d(seen.frame, candidates.frame)
+    reasons |= dict.fromkeys((int(n) for n in unread), "no sensor reading at its time")
+    chosen = candidates[found.nearest[near]]
+    return replace(chosen, dropped={**seen.dropped, **reasons})
 
 
 def find_nwires(
@@ -180,8 +227,16 @@ def wires_job(
             return calibrate_cross_wire(points, *known, job.outlier_sigma)
         return calibrate_wires(points, phantom, *known, registration, job.outlier_sigma)
 
-    method = "cross-wire" if phantom is None else "n-wire" if phantom.n_shapes else "three-wire"
-    return _finished(recording, seen, job, calibrate, method)
+    if phantom is not None:
+        return _finished(recording, seen, job, calibrate, "n-wire" if phantom.n_shapes else "three-wire")
+    around = recording.time_offset_s
+    offsets = delays_around(around, SEARCH_S, _CHOICE_STEP_S).tolist() if job.estimate_offset else [around]
+    chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
+    outcome = _finished(recording, chosen, job, calibrate, "cross-wire")
+    shots = tuple(
+        replace(shot, candidates_px=seen.pixels[seen.frame == shot.frame]) for shot in outcome.shots
+    )
+    return replace(outcome, shots=shots)
 
 
 def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoints, dict[int, str]]:
@@ -239,7 +294,7 @@ def _finished(
     frames = FramesUsed(recording.images.shape[0], (), dropped)
     known = offset is not None or job.offset_given or recording.time_offset_s != 0.0
     calibration = as_calibration(solution, method, frames, used_offset if known else None)
-    return Outcome(solution, calibration, _shots(recording, seen, calibration), offset=offset)
+    return Outcome(solution, calibration, seen, _shots(recording, seen, calibration), offset=offset)
 
 
 def _covered_throughout(recording: Recording, seen: Seen) -> Seen:

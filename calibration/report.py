@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,8 @@ class Shot:
         Column and row of points on a line, or of dots; none if nothing was found.
     note : str
         Why the frame was dropped; empty if it was used.
+    candidates_px : ndarray, shape (c, 2)
+        Column and row of all places among which the mark was chosen.
     """
 
     frame: int
@@ -48,6 +50,7 @@ class Shot:
     marks_px: FloatArray
     as_line: bool
     note: str = ""
+    candidates_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def as_calibration(
@@ -218,6 +221,7 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
         return
     axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
     colour = DROPPED if shot.note else USED
+    axes.plot(*shot.candidates_px.T, "+", color=DROPPED, ms=5, mew=0.7)
     if len(shot.marks_px):
         columns, rows = shot.marks_px.T
         if shot.as_line:

@@ -16,11 +16,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.alternatives import best_solution
-from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, SeenAs
+from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, SeenAs, residuals_and_jacobian
+from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
 from calibration.identifiability import require_adequate
-from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters
+from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
 from calibration.starts import rotations_all_over, wire_start
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
 
@@ -77,7 +78,8 @@ def calibrate_cross_wire(
     Parameters
     ----------
     points : ImagePoints
-        The crossing in each frame.
+        The crossing in each frame, or several candidates for it, frames ascending and the likeliest first.
+        Frames none of whose candidates agrees with the others are not used; they may be most.
     pixel_mm : ndarray, shape (2,), optional
         Column pitch and row spacing; needed unless they are fitted.
     fit_pixels : bool
@@ -86,13 +88,39 @@ def calibrate_cross_wire(
     Raises
     ------
     InsufficientDataError
-        If there are too few points, they contradict each other, or the motion does not determine the answer.
+        If there are too few points, no more of them agree than chance candidates would, or the motion does
+        not determine the answer.
     """
     _require_frames(points)
     probe, held = probe_parameters(fit_pixels, pixel_mm)
-    start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
-    starts = [_sized(start, held)]
-    return require_adequate(best_solution(points, CrossWire(), starts, probe, outlier_sigma))
+    found = find_consensus(points, pixel_mm)
+    if not found.believed and len(points) == len(points.frames):
+        # Poor motion, too, can leave no consensus; then that is said.
+        start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
+        require_adequate(best_solution(points, CrossWire(), [_sized(start, held)], probe, outlier_sigma))
+    found.require()
+    agreeing = points[found.nearest[found.agreed]]
+    first = solve_chain(agreeing, CrossWire(), _sized(found.chain, held), probe, outlier_sigma)
+    # The rigid chain, from all that agree, tells candidates better than the sample did.
+    nearest, away = nearest_candidates(points, *_image_and_point(first.chain))
+    near, chosen = away <= GATES_MM[-1], points[nearest]
+    solution = best_solution(chosen[near], CrossWire(), [first.chain], probe, outlier_sigma)
+    return require_adequate(_with_contradicting(solution, chosen, near))
+
+
+def _image_and_point(chain: Chain) -> tuple[FloatArray, FloatArray]:
+    """Origin and axes of the image in the sensor's frame, and the phantom's origin in the world."""
+    pose = chain.sensor_from_image
+    axes = pose.rotation.as_matrix().T[:2] * chain.pixel_mm[:, None]
+    return np.vstack([pose.translation, axes]), np.asarray(chain.target_from_world.inv().translation)
+
+
+def _with_contradicting(solution: ChainSolution, points: ImagePoints, held: BoolArray) -> ChainSolution:
+    """The solution from `points[held]` with the residuals of the others, which are not used."""
+    used = held.copy()
+    used[held] = solution.used
+    residuals, _ = residuals_and_jacobian(solution.chain.parameters(), points, solution.phantom)
+    return replace(solution, points=points, used=used, residuals=residuals)
 
 
 def calibrate_wires(

@@ -17,7 +17,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy import ndimage
 from skimage.feature import peak_local_max
 
-from calibration.chain import Seen
 from calibration.detection.region import checked_pixel, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
@@ -155,23 +154,6 @@ def dots_in_frames(
         score=np.concatenate([np.zeros(0), *(score for _, score in found)]),
         dropped={i: "no dot" for i, n in enumerate(held) if n == 0},
     )
-
-
-def single_dots(dots: Dots, clear: float = 1.5) -> Seen:
-    """Keep the strongest dot of each frame, where images show one wire or one crossing of wires.
-
-    Parameters
-    ----------
-    clear : float
-        How much stronger it must be than the frame's next; other frames are dropped.
-    """
-    first = np.flatnonzero(np.diff(dots.frame, prepend=-1))
-    follows = np.append(dots.frame[1:] == dots.frame[:-1], False)[first]
-    after = np.where(follows, np.append(dots.score[1:], 0.0)[first], 0.0)
-    kept = dots.score[first] >= clear * after
-    unclear = {int(i): "no dot clearly the strongest" for i in dots.frame[first[~kept]]}
-    one = first[kept]
-    return Seen(dots.frame[one], dots.pixels[one], dropped={**dots.dropped, **unclear})
 
 
 def _dots(

@@ -221,7 +221,8 @@ def _calibrate(
         notes += _validated(outcome, other, other_seen, validation)
 
     def write_dots(path: Path) -> None:
-        write_points(path, PickedPoints(seen.frame, seen.pixels, seen.wire), wire_names)
+        found = outcome.seen
+        write_points(path, PickedPoints(found.frame, found.pixels, found.wire), wire_names)
 
     write_with_report(
         outcome.calibration,
@@ -319,13 +320,17 @@ def _seen_wires(
 
 
 def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
-    from calibration.job import paired
+    from calibration.job import choose_crossings, paired
     from calibration.repeatability import validate
+    from calibration.wires import CrossWire
     from speckle3d.core.calibration import readable
 
     found = outcome.calibration.time_offset_s
+    offset_s = other.time_offset_s if found is None else found
     with naming(str(path)):
-        points, _ = paired(other, seen, other.time_offset_s if found is None else found)
+        if isinstance(outcome.solution.phantom, CrossWire):
+            seen = choose_crossings(other, seen, [offset_s])
+        points, _ = paired(other, seen, offset_s)
         residuals = validate(outcome.solution, points)
     frames = len(set(points.frame.tolist()))
     rms, unit = readable(float((residuals**2).mean() ** 0.5), outcome.calibration.rms_unit)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_scenes import PIXEL_MM, SHAPE, picture, plus_results, scene
 
-from calibration.detection.dots import Dots, DotSettings, dots_in_frames, dots_in_image, single_dots
+from calibration.detection.dots import DotSettings, dots_in_frames, dots_in_image
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.metaimage import ImportSettings, read_metaimage
 from speckle3d.io.plus_config import read_wire_phantom
@@ -116,21 +116,6 @@ def test_frames_are_read_one_at_a_time_and_empty_ones_told():
     alone = dots_in_image(frames.frames[2], PIXEL_MM)
     np.testing.assert_array_equal(dots.pixels[dots.frame == 2], alone[0])
     np.testing.assert_array_equal(dots.score[dots.frame == 2], alone[1])
-
-
-def test_a_single_wire_is_its_frames_strongest_dot_if_that_is_clear():
-    dots = Dots(
-        frame=np.array([0, 0, 1, 1, 3]),
-        pixels=np.arange(10.0).reshape(5, 2),
-        score=np.array([9.0, 3.0, 9.0, 8.0, 1.0]),
-        dropped={2: "no dot"},
-    )
-    one = single_dots(dots, clear=2.0)
-    np.testing.assert_array_equal(one.frame, [0, 3])
-    np.testing.assert_array_equal(one.pixels, [[0, 1], [8, 9]])
-    assert one.dropped == {1: "no dot clearly the strongest", 2: "no dot"}
-    assert len(single_dots(dots, clear=1.0)) == 3
-    assert len(single_dots(Dots(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)))) == 0
 
 
 @pytest.mark.parametrize(

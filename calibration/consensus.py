@@ -1,0 +1,301 @@
+"""Which candidates show the one point that all frames should show: a consensus, judged against chance.
+
+A frame may offer several candidates, all of them wrong. Four candidates from four frames give a calibration
+by linear equations; the one with which most frames agree is kept if so much agreement is not to be expected
+by chance: of candidates exchanged between the frames, whose poses then tell nothing about them.
+
+References
+----------
+.. [1] M. A. Fischler and R. C. Bolles, "Random sample consensus", Commun. ACM, 1981.
+.. [2] P. Moulon, P. Monasse and R. Marlet, "Adaptive structure from motion with a contrario model
+   estimation", ACCV, 2012 (the number of false alarms; there chance is uniform over the image).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.special import gammaln
+
+from calibration.chain import Chain, ImagePoints
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import nearest_rotation
+
+GATES_MM = (1.0, 1.5, 2.5, 4.0)
+"""How near the crossing a candidate must come to agree. Points picked by hand leave 1 mm RMS, the worst of
+them 3; beyond 4 mm a calibration with one point would not be of use."""
+
+FALSE_ALARMS = 1e-3
+"""Agreements as good, expected among chance candidates, below which a consensus is believed: one recording in
+a thousand of nothing is calibrated with."""
+
+_SAMPLE = 4
+"""Frames that give twelve equations, for the image's origin, its two axes and the point."""
+_MOST_FRAMES = 120
+"""Frames that vote; more would vote alike."""
+_BATCHES = (300, *[3000] * 10)
+"""Samples drawn at a time. With the right candidate drawn in three frames of ten, one sample in 120 is right;
+in one of ten, one in 10,000. All take some two seconds."""
+_KEPT, _JUDGED = 25, 3
+"""Best samples of a batch that are refined, and best refined ones that are judged."""
+_SURE = -0.5
+"""Logarithm of the false alarms, over the number of frames, at which the search ends: a third of the frames
+agree to within a hundredth of the image, or more to less."""
+_LOOSE_MM = 6.0
+"""Samples of four are as uncertain as this where frames are turned by some ten degrees."""
+_TIGHTER_MM = (6.0, 5.0, 4.0, 3.0, 3.0)
+_PLAUSIBLE_PIXEL = 2.0
+"""Greatest ratio of a pixel size to the one given, either way; those of samples are uncertain."""
+_PIXEL_MM = 0.02, 1.5
+"""Plausible pixels if none are given."""
+_SQUARE = 0.6
+"""Greatest cosine between the axes of a sample; 90 degrees minus 37."""
+_FAR_MM = 300.0
+"""What origin and point may be from the sensor and the middle of its path; holds what motion leaves open."""
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """One candidate of each frame, and those that agree.
+
+    Attributes
+    ----------
+    chain : Chain
+        A start for the solver.
+    nearest : ndarray of int, shape (f,)
+        For each frame, ascending, the candidate nearest to where the point should be, as a row of the points.
+    away_mm : ndarray, shape (f,)
+        How far from it that candidate is.
+    gate_mm : float
+    false_alarms : float
+        Number of calibrations with as much agreement expected among chance candidates.
+    """
+
+    chain: Chain
+    nearest: IntArray
+    away_mm: FloatArray
+    gate_mm: float
+    false_alarms: float
+
+    @property
+    def agreed(self) -> BoolArray:
+        """Frames whose candidate is within `gate_mm`, shape (f,)."""
+        return np.asarray(self.away_mm <= self.gate_mm)
+
+    @property
+    def believed(self) -> bool:
+        """Whether chance would not agree as well."""
+        return self.false_alarms <= FALSE_ALARMS
+
+    def require(self) -> Consensus:
+        """Raise `InsufficientDataError` unless it is believed."""
+        if not self.believed:
+            raise InsufficientDataError(
+                f"expected one point that the frames agree on beyond chance, got {self.agreed.sum()} "
+                f"of {len(self.agreed)} frames within {self.gate_mm:g} mm, which chance gives "
+                f"{self.false_alarms:.2g} times a recording (limit {FALSE_ALARMS:g}): do the images and the "
+                "sensor readings belong together, and do they show a crossing? Points picked by hand, or a "
+                "region to look in, would help"
+            )
+        return self
+
+
+def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> Consensus:
+    """Find the calibration with which most frames have a candidate where the point should be.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        Candidates; those of a frame have its number and one pose, the likeliest first.
+    pixel_mm : ndarray, shape (2,), optional
+        Column pitch and row spacing, to a factor of two.
+
+    Returns
+    -------
+    Consensus
+        The one with the fewest false alarms; the caller judges them (`Consensus.require`).
+    """
+    voters = _Candidates(points.of_some_frames(_MOST_FRAMES), pixel_mm)
+    rng = np.random.default_rng(0)
+    best: tuple[float, float, FloatArray] = (np.inf, GATES_MM[-1], np.zeros(12))
+    # Where the motion leaves axes open, no sample is plausible, and any will do to say so.
+    for plausible in (True, False):
+        for count in _BATCHES if plausible else _BATCHES[:2]:
+            for model in voters.promising(voters.samples(rng, count), plausible):
+                best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
+            if best[0] < _SURE * len(voters.frames):
+                break
+        if best[0] < np.log10(FALSE_ALARMS):
+            break
+    log_alarms, gate, model = best
+    affine = voters.affine(model)
+    nearest, away = nearest_candidates(points, *affine)
+    alarms = float(10.0 ** min(log_alarms, 300.0))
+    return Consensus(_squared(*affine), nearest, away, gate, alarms)
+
+
+def nearest_candidates(
+    points: ImagePoints, image: FloatArray, point_mm: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Find the candidate of each frame nearest to a point.
+
+    Parameters
+    ----------
+    image : ndarray, shape (3, 3)
+        Origin, column axis and row axis of the image in the sensor's frame, as rows; mm, mm per pixel.
+    point_mm : ndarray, shape (3,)
+        In the world.
+
+    Returns
+    -------
+    nearest : ndarray of int, shape (f,)
+        Rows of `points`, for each frame in ascending order.
+    away_mm : ndarray, shape (f,)
+    """
+    place = image[0] + points.pixels @ image[1:]
+    away = np.linalg.norm(points.world_from_sensor.apply(place) - point_mm, axis=1)
+    frames, of_frame = np.unique(points.frame, return_inverse=True)
+    order = np.lexsort((away, of_frame))
+    first = order[np.searchsorted(of_frame[order], np.arange(len(frames)))]
+    return first, away[first]
+
+
+def _squared(image: FloatArray, point_mm: FloatArray) -> Chain:
+    """The nearest chain whose axes are square."""
+    size = np.maximum(np.linalg.norm(image[1:], axis=1), 1e-6)
+    turn = Rotation.from_matrix(nearest_rotation((image[1:] / size[:, None]).T))
+    probe = RigidTransform.from_components(image[0], turn)
+    return Chain(size, probe, RigidTransform.from_translation(-point_mm))
+
+
+class _Candidates:
+    """Candidates as equations linear in the image's origin, its axes and the point: twelve unknowns.
+
+    Pixels and positions are centred, and pixels scaled, so that all unknowns are millimetres.
+    """
+
+    def __init__(self, points: ImagePoints, pixel_mm: FloatArray | None) -> None:
+        self.points = points
+        self.frames, self.of_frame = np.unique(points.frame, return_inverse=True)
+        self.start = np.searchsorted(self.of_frame, np.arange(len(self.frames)))
+        self.count = np.bincount(self.of_frame)
+        self.centre = points.pixels.mean(axis=0)
+        self.spread = float(points.pixels.std()) or 1.0
+        self.middle = points.shifts_mm.mean(axis=0)
+        seen = (points.pixels - self.centre) / self.spread
+        turns = points.turns
+        lifted = np.concatenate([np.ones((len(seen), 1)), seen], axis=1)
+        image = np.einsum("nk,nri->nrki", lifted, turns).reshape(-1, 3, 9)
+        self.rows = np.concatenate([image, np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=2)
+        self.wanted = -(points.shifts_mm - self.middle)
+        low, high = (
+            (np.full(2, one) for one in _PIXEL_MM)
+            if pixel_mm is None
+            else (np.asarray(pixel_mm) / _PLAUSIBLE_PIXEL, np.asarray(pixel_mm) * _PLAUSIBLE_PIXEL)
+        )
+        self.shortest, self.longest = low * self.spread, high * self.spread
+        axes = np.repeat(self.longest, 3)
+        self.prior = np.diag(np.concatenate([np.full(3, _FAR_MM), axes, np.full(3, _FAR_MM)]) ** -2.0)
+
+    def samples(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Models of candidates drawn from four frames each, the likelier more often, shape (count, 12)."""
+        frames = np.argsort(rng.random((count, len(self.frames))), axis=1)[:, :_SAMPLE]
+        rank = np.arange(len(self.of_frame)) - self.start[self.of_frame]
+        weight = np.cumsum(1.0 / (1.0 + rank))
+        before = np.concatenate([[0.0], weight])[self.start]
+        last = weight[self.start + self.count - 1]
+        drawn = before[frames] + rng.random(frames.shape) * (last - before)[frames]
+        chosen = np.minimum(np.searchsorted(weight, drawn, side="right"), len(weight) - 1)
+        return self._solved(self.rows[chosen].reshape(count, -1, 12), self.wanted[chosen].reshape(count, -1))
+
+    def _solved(self, matrix: FloatArray, wanted: FloatArray) -> FloatArray:
+        turned = np.swapaxes(matrix, -1, -2)
+        return np.asarray(np.linalg.solve(turned @ matrix + self.prior, turned @ wanted[..., None])[..., 0])
+
+    def promising(self, models: FloatArray, plausible: bool) -> list[FloatArray]:
+        """Refine the models with which most frames agree."""
+        if plausible:
+            models = models[self._plausible(models)]
+        best = [self._refined(models[n]) for n in np.argsort(self._cost(models), kind="stable")[:_KEPT]]
+        refined = np.reshape(best, (-1, 12))
+        if plausible:
+            refined = refined[self._plausible(refined)]
+        return list(refined[np.argsort(self._cost(refined), kind="stable")[:_JUDGED]])
+
+    def _cost(self, models: FloatArray) -> FloatArray:
+        """Sum over the frames of their nearest candidate's squared distance, bounded; shape (models,)."""
+        return np.asarray(np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1))
+
+    def _plausible(self, models: FloatArray) -> BoolArray:
+        axes = models[:, 3:9].reshape(-1, 2, 3)
+        length = np.linalg.norm(axes, axis=2)
+        cosine = np.abs(np.sum(axes[:, 0] * axes[:, 1], axis=1)) / np.prod(np.maximum(length, 1e-9), axis=1)
+        sized = np.all((length > self.shortest) & (length < self.longest), axis=1)
+        return np.asarray(sized & (cosine < _SQUARE))
+
+    def _nearest(self, models: FloatArray) -> FloatArray:
+        """Squared distance of each frame's nearest candidate from the point, shape (models, frames)."""
+        rows = self.rows.reshape(-1, 12).astype(np.float32)
+        left = models.astype(np.float32) @ rows.T - self.wanted.ravel().astype(np.float32)
+        squares = np.sum(left.reshape(len(models), len(self.of_frame), 3) ** 2, axis=2)
+        return np.asarray(np.minimum.reduceat(squares, self.start, axis=1))
+
+    def _refined(self, model: FloatArray) -> FloatArray:
+        for gate in _TIGHTER_MM:
+            squares = np.sum((self.rows @ model - self.wanted) ** 2, axis=1)
+            order = np.lexsort((squares, self.of_frame))
+            first = order[self.start]
+            agreeing = first[squares[first] < gate**2]
+            if len(agreeing) <= _SAMPLE:
+                return model
+            model = self._solved(self.rows[agreeing].reshape(-1, 12), self.wanted[agreeing].ravel())
+        return model
+
+    def false_alarms(self, model: FloatArray) -> tuple[float, float]:
+        """Logarithm of the number of false alarms at the gate where it is least, and that gate, mm."""
+        n = len(self.frames)
+        if n <= _SAMPLE:
+            return np.inf, GATES_MM[-1]
+        away = np.sqrt(self._nearest(model[None])[0])
+        exchanged = self._exchanged(model)
+        area = float(np.prod(np.maximum(np.ptp(self.points.pixels, axis=0) / self.spread, 0.1)))
+        area *= float(np.prod(np.linalg.norm(model[3:9].reshape(2, 3), axis=1)))
+        tried = []
+        for gate in GATES_MM:
+            # Few frames have few pairs to count: at least what candidates all over the image would give.
+            least = np.pi * gate**2 * self.count.mean() / max(area, np.pi * gate**2)
+            chance = min(max(float(np.mean(exchanged < gate)), least), 1.0)
+            tried.append(_log_false_alarms(n, int(np.sum(away < gate)), chance, float(self.count.mean())))
+        best = int(np.argmin(tried))
+        return tried[best] + np.log10(len(GATES_MM)), GATES_MM[best]
+
+    def _exchanged(self, model: FloatArray) -> FloatArray:
+        """Distance from the point of the nearest candidate of each other frame, had it each frame's pose."""
+        seen = (self.points.pixels - self.centre) / self.spread
+        place = model[:3] + seen @ model[3:9].reshape(2, 3)
+        turns, shifts = self.points.turns[self.start], self.wanted[self.start]
+        away = np.einsum("fij,nj->fni", turns, place) - shifts[:, None] - model[9:]
+        nearest = np.minimum.reduceat(np.linalg.norm(away, axis=2), self.start, axis=1)
+        return np.asarray(nearest[~np.eye(len(nearest), dtype=bool)])
+
+    def affine(self, model: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The image and the point of a model as `nearest_candidates` has them."""
+        axes = model[3:9].reshape(2, 3) / self.spread
+        return np.vstack([model[:3] - self.centre @ axes, axes]), model[9:] + self.middle
+
+
+def _log_false_alarms(frames: int, agreeing: int, chance: float, candidates: float) -> float:
+    """Expected number, as a logarithm to base ten, of samples with which as many chance frames agree.
+
+    (n - 4) C(n, k) C(k, 4) m^4 p^(k - 4): sizes of the agreeing set, sets, samples in a set with m candidates
+    in each frame, and the chance that the rest of the set agrees (reference 2, equation 2).
+    """
+    if agreeing <= _SAMPLE:
+        return float("inf")
+    sets = gammaln(frames + 1) - gammaln(agreeing + 1) - gammaln(frames - agreeing + 1)
+    samples = gammaln(agreeing + 1) - gammaln(_SAMPLE + 1) - gammaln(agreeing - _SAMPLE + 1)
+    total = np.log(frames - _SAMPLE) + sets + samples + _SAMPLE * np.log(candidates)
+    return float((total + (agreeing - _SAMPLE) * np.log(chance)) / np.log(10.0))

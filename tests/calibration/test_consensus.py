@@ -1,0 +1,140 @@
+"""Consensus among candidates: half or more of them wrong, several to a frame, and nothing but chance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_examples import PIXEL_MM, TRIAL_1, scan_wires
+from crossing_images import crossing_world
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.chain import ImagePoints, Seen
+from calibration.consensus import find_consensus
+from calibration.detection.crossings import crossings_in_frames
+from calibration.job import JobSettings, Recording, wires_job
+from calibration.wires import calibrate_cross_wire
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.streams import TimedPoses
+
+CROSSING_MM = np.array([10.0, -20.0, 30.0])
+
+
+def scan(seed, count=52, noise_mm=0.4):
+    rng = np.random.default_rng(seed)
+    pixels, readings = scan_wires(rng, np.tile(CROSSING_MM, (count, 1)), noise_mm=noise_mm)
+    return ImagePoints(pixels, np.arange(count), readings)
+
+
+def anywhere(rng, points, count):
+    """Picks that show nothing, over the range of those that do."""
+    return rng.uniform(points.pixels.min(axis=0), points.pixels.max(axis=0), (count, 2))
+
+
+@pytest.mark.parametrize("wrong_share", [0.5, 0.65])
+def test_picks_of_which_most_are_wrong_give_the_calibration_of_the_right_ones(wrong_share):
+    points, rng = scan(0), np.random.default_rng(1)
+    wrong = rng.permutation(52) < wrong_share * 52
+    pixels = np.where(wrong[:, None], anywhere(rng, points, 52), points.pixels)
+    far = wrong & (np.hypot(*((pixels - points.pixels) * PIXEL_MM).T) > 5.0)
+    solution = calibrate_cross_wire(replace(points, pixels=pixels), PIXEL_MM)
+    assert not solution.used[far].any()
+    # One right one in fifty exceeds four standard deviations, for noise in the image only is not of one size.
+    assert (~solution.used[~wrong]).sum() <= 1
+    right = calibrate_cross_wire(points[~wrong], PIXEL_MM)
+    step = (right.chain.sensor_from_image.inv() * solution.chain.sensor_from_image).as_components()
+    # Both are solved from the same right picks, but for wrong ones that happen to be right.
+    assert np.linalg.norm(step[0]) < 0.5
+
+
+def test_the_right_one_of_six_candidates_is_chosen_and_frames_without_are_not_used():
+    points, rng = scan(2), np.random.default_rng(3)
+    pixels = np.stack([anywhere(rng, points, 52) for _ in range(6)], axis=1)
+    lacking = rng.permutation(52) < 16
+    place = np.minimum(rng.geometric(0.5, 52) - 1, 5)
+    true = place[~lacking] + 6 * np.flatnonzero(~lacking)
+    pixels.reshape(-1, 2)[true] = points.pixels[~lacking]
+    frame = np.repeat(np.arange(52), 6)
+    candidates = ImagePoints(pixels.reshape(-1, 2), frame, points.world_from_sensor[frame])
+    solution = calibrate_cross_wire(candidates, PIXEL_MM)
+    assert len(solution.points) == 52
+    np.testing.assert_array_equal(solution.points.frame, np.arange(52))
+    chosen = solution.points.pixels[solution.used & ~lacking]
+    np.testing.assert_array_equal(chosen, points.pixels[solution.used & ~lacking])
+    assert (solution.used & ~lacking).sum() >= 0.9 * (~lacking).sum()
+    # A wrong candidate may be near by chance: one in thirty is within 4 mm.
+    assert (solution.used & lacking).sum() <= 2
+    assert solution.rms < 0.6
+
+
+@pytest.mark.parametrize(("frames", "each"), [(8, 1), (30, 6)])
+def test_chance_candidates_are_refused_and_the_statistic_told(frames, each):
+    points, rng = scan(4, frames), np.random.default_rng(5)
+    frame = np.repeat(np.arange(frames), each)
+    pixels = anywhere(rng, points, frames * each)
+    chance = ImagePoints(pixels, frame, points.world_from_sensor[frame])
+    assert not find_consensus(chance, PIXEL_MM).believed
+    with pytest.raises(InsufficientDataError) as refused:
+        calibrate_cross_wire(chance, PIXEL_MM)
+    if each > 1:
+        assert f"of {frames} frames" in str(refused.value)
+        assert "chance gives" in str(refused.value)
+
+
+def test_a_wrong_pixel_size_does_not_hide_the_consensus():
+    points = scan(6)
+    solution = calibrate_cross_wire(points, np.array([1.0, 1.0]))
+    np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_images_of_crossing_wires_calibrate():
+    found = []
+    for seed in (603, 621):
+        world = crossing_world(seed, 40)
+        seen = crossings_in_frames(world.images, world.pixel_mm)
+        readings = world.world_from_sensor[seen.frame]
+        solution = calibrate_cross_wire(seen.points(readings), world.pixel_mm)
+        picked = solution.points_used
+        away = np.hypot(*((picked.pixels - world.crossing_px[picked.frame]) * world.pixel_mm).T)
+        shown = np.flatnonzero(world.shown)
+        found.append(np.isin(shown, picked.frame[away < 2.0]).mean())
+        # The tracker's 0.25 and 0.3 mm and 0.15 degrees, and half the beam's thickness.
+        assert solution.rms < 1.0
+        other = np.random.default_rng(seed).permutation(40)
+        with pytest.raises(InsufficientDataError, match="chance"):
+            calibrate_cross_wire(seen.points(world.world_from_sensor[other[seen.frame]]), world.pixel_mm)
+    assert min(found) >= 0.8
+
+
+@pytest.mark.slow
+def test_forty_recordings_of_nothing_give_no_consensus():
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 7])
+        frames, each = int(rng.integers(8, 40)), (1, 6)[seed % 2]
+        points = scan(seed, frames)
+        frame = np.repeat(np.arange(frames), each)
+        chance = ImagePoints(anywhere(rng, points, len(frame)), frame, points.world_from_sensor[frame])
+        assert not find_consensus(chance, PIXEL_MM).believed
+
+
+@pytest.mark.slow
+def test_candidates_are_chosen_although_the_clock_is_off():
+    times, rng = np.arange(0.0, 24.0, 0.2), np.random.default_rng(8)
+    wave = np.sin(2 * np.pi * np.outer(times, [0.11, 0.17, 0.07, 0.13, 0.09]) + [0, 1, 2, 3, 4])
+    turns = Rotation.from_euler("yxz", 0.5 * wave[:, :3])
+    pixels = np.array([220.0, 240.0]) + wave[:, 3:] * [150.0, 160.0]
+    flat = np.column_stack([pixels * PIXEL_MM, 0.3 * rng.standard_normal(len(times))])
+    world_from_image = RigidTransform.from_components(CROSSING_MM - turns.apply(flat), turns)
+    readings = TimedPoses(times - 0.21, world_from_image * TRIAL_1.inv(), max_gap_s=1.0)
+    candidates = np.stack([pixels, *rng.uniform(50, 430, (4, *pixels.shape))], axis=1)
+    for one in candidates:
+        rng.shuffle(one)
+    seen = Seen(np.repeat(np.arange(len(times)), 5), candidates.reshape(-1, 2))
+    recording = Recording(np.zeros((len(times), 8, 8), np.uint8), PIXEL_MM, 0.0, times, readings)
+    outcome = wires_job(recording, seen, JobSettings(estimate_offset=True), None)
+    # A reading is 0.3 mm off its place at 100 mm/s.
+    assert outcome.offset.seconds == pytest.approx(0.21, abs=0.01)
+    assert len(outcome.solution.points_used.frames) > 0.8 * len(outcome.seen)
+    right = np.abs(outcome.seen.pixels - pixels[outcome.seen.frame]).max(axis=1) < 1.0
+    assert right.mean() > 0.9
+    assert outcome.shots[0].candidates_px.shape == (5, 2)
