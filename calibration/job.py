@@ -12,7 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import ChainSolution, ImagePoints, Seen, as_directions
-from calibration.clock.offset import ClockOffset, covered, estimate_offset
+from calibration.clock.fitted import estimate_offset
+from calibration.clock.offset import ClockOffset, covered
+from calibration.clock.smoothing import smooth
 from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
 from calibration.nwires import label_and_start
@@ -224,8 +226,10 @@ def _finished(
     offset = None
     if job.estimate_offset:
         timed = _covered_throughout(recording, seen)
+        steady = replace(recording, readings=smooth(recording.readings))
         offset = estimate_offset(
-            lambda offset_s: calibrate(paired(recording, timed, offset_s)[0]),
+            calibrate,
+            lambda offset_s: paired(steady, timed, offset_s)[0],
             recording.time_offset_s,
             SEARCH_S,
         )

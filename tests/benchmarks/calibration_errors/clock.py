@@ -1,0 +1,218 @@
+"""The clock of a tracker, estimated with a plane's calibration: errors against what is claimed of them.
+
+The hand's motion is a sum of swings with the speeds of hands and a tremor, or one kind of motion after the
+other; the tracker samples it at 50 Hz with errors that are white, that wander, or both, on a clock that is
+regular, irregular, or loses samples. Nothing here interpolates: truth is evaluated at the times themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from calibration_errors.rows import Row, trials
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.chain import Seen
+from calibration.job import JobSettings, Recording, plane_job
+from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.streams import TimedPoses
+
+TRACKER_HZ = 50.0
+RATES_HZ = (25.0, 25.0 / 3.0, 8.85)
+"""Of frames: every second sample, every sixth, and nearly that."""
+
+ERRORS = ("white", "drifting", "both")
+OF_EACH = 60
+DRIFT_MM, DRIFT_RAD, DRIFT_S = 0.3, np.deg2rad(0.2), 5.0
+MOST_FRAMES, FEWEST_FRAMES = 300, 60
+SEARCHED_S = 0.4
+
+LARGEST_Z, WORST_S = 1.2, 0.004
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One recording of a plane."""
+
+    seed: int
+    frames_hz: float
+    errors: str
+
+
+@dataclass(frozen=True)
+class Found:
+    """Error and claimed error of the offset, s; `refused` says why there is none."""
+
+    error_s: float
+    claimed_s: float
+    refused: str = ""
+
+
+def measure(share: float, first_seed: int) -> list[Row]:
+    """Rows of each rate and kind of error."""
+    cases = [(rate, errors) for rate in RATES_HZ for errors in ERRORS]
+    count = max(3, round(share * OF_EACH))
+    todo = [Trial(first_seed + k, rate, errors) for rate, errors in cases for k in range(count)]
+    found = trials(run, todo)
+    return [
+        row_of(rate, errors, found[k * count : (k + 1) * count]) for k, (rate, errors) in enumerate(cases)
+    ]
+
+
+def row_of(rate: float, errors: str, found: list[Found]) -> Row:
+    """RMS of the errors over what is claimed, the worst error, and how many were refused."""
+    kept = [each for each in found if not each.refused]
+    z = np.array([each.error_s / each.claimed_s for each in kept])
+    worst = max((abs(each.error_s) for each in kept), default=np.inf)
+    rms = float(np.sqrt(np.mean(z**2))) if kept else np.inf
+    off = float(np.sqrt(np.mean([each.error_s**2 for each in kept]))) if kept else np.inf
+    text = (
+        f"RMS z {rms:.2f}, RMS {1e3 * off:.2f} ms, worst {1e3 * worst:.1f} ms, "
+        f"{len(found) - len(kept)} of {len(found)} refused"
+    )
+    reached = rms <= LARGEST_Z and worst <= WORST_S and len(kept) == len(found)
+    return Row(f"clock, {rate:.3g} frames/s, errors {errors}", text, "RMS z <= 1.2, worst <= 4 ms", reached)
+
+
+def run(trial: Trial) -> Found:
+    """Simulate a recording and estimate its clock."""
+    recording, seen, offset_s = simulate(trial)
+    try:
+        outcome = plane_job(recording, seen, JobSettings(estimate_offset=True), fit_pixels=bool(trial.seed % 2))
+    except Speckle3DError as error:
+        return Found(np.nan, np.nan, str(error))
+    assert outcome.offset is not None
+    return Found(outcome.offset.seconds - offset_s, outcome.offset.standard_error_s)
+
+
+def simulate(trial: Trial) -> tuple[Recording, Seen, float]:
+    """A recording of a plane in a bath, and its clock's true offset, s."""
+    rng = np.random.default_rng([trial.seed, round(100 * trial.frames_hz)])
+    frame_s, number = frame_times(rng, trial.frames_hz)
+    offset_s = rng.uniform(-0.2, 0.2)
+    hand = Hand(rng, frame_s[-1])
+    world_from_floor = RigidTransform.from_components(rng.uniform(-200, 200, 3), Rotation.random(rng=rng))
+    sensor_from_image = RigidTransform.from_components(
+        rng.uniform(40, 120) * Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]), Rotation.random(rng=rng)
+    )
+    width_mm, pixel_mm = rng.uniform(30.0, 60.0), rng.uniform(0.08, 0.25, 2)
+    pixels = lines_seen(rng, hand.at(frame_s), width_mm, pixel_mm)
+    sensor_s = sample_times(rng, frame_s[-1])
+    exact = world_from_floor * hand.at(sensor_s) * sensor_from_image.inv()
+    poses = with_errors(rng, exact, sensor_s, trial.errors)
+    stamped_s = sensor_s - offset_s
+    images = np.zeros((int(number[-1]) + 1, 2, 2), dtype=np.uint8)
+    times = np.arange(len(images)) / trial.frames_hz
+    recording = Recording(images, pixel_mm * rng.uniform(0.99, 1.01, 2), 0.0, times, TimedPoses(stamped_s, poses))
+    return recording, Seen(number, pixels), offset_s
+
+
+def frame_times(rng: np.random.Generator, frames_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times of 60 to 300 frames that show a line, in 10 to 40 s, and their numbers."""
+    seconds = rng.uniform(10.0, 40.0)
+    number = np.arange(int(seconds * frames_hz))
+    most = min(MOST_FRAMES, number.size)
+    kept = rng.choice(number, rng.integers(min(FEWEST_FRAMES, most), most + 1), replace=False)
+    number = np.sort(kept)
+    return number / frames_hz, number
+
+
+def sample_times(rng: np.random.Generator, last_s: float) -> np.ndarray:
+    """Times of the tracker's samples: regular, irregular by a tenth of a period, or with samples missing."""
+    phase = rng.uniform(0.0, 1.0 / TRACKER_HZ)
+    times = np.arange(phase - 1.0, last_s + 1.0, 1.0 / TRACKER_HZ)
+    kind = rng.integers(3)
+    if kind == 1:
+        times = times + rng.uniform(-0.1, 0.1, times.size) / TRACKER_HZ
+    if kind == 2:
+        there = rng.random(times.size) > 0.05
+        for start in rng.uniform(0.0, last_s, 3):
+            there &= (times < start) | (times > start + rng.uniform(0.1, 0.5))
+        times = times[there]
+    return times
+
+
+class Hand:
+    """Poses of an image over a floor at z = 0, as a function of time."""
+
+    def __init__(self, rng: np.random.Generator, last_s: float) -> None:
+        reach = np.array(
+            [
+                *np.deg2rad([rng.uniform(15, 35), rng.uniform(10, 25), rng.uniform(40, 120)]),
+                rng.uniform(6, 12),
+                *rng.uniform(10, 60, 2),
+            ]
+        )
+        frequency = rng.uniform(0.05, 0.7, (6, 8))
+        share = rng.standard_normal((6, 8)) / (0.2 + frequency)
+        share *= 0.7 * reach[:, None] / np.linalg.norm(share, axis=1, keepdims=True)
+        tremor = 0.15 * rng.standard_normal((6, 2)) * np.array([0.003, 0.003, 0.003, 1.0, 1.0, 1.0])[:, None]
+        self._frequency = np.hstack([frequency, rng.uniform(5.0, 10.0, (6, 2))])
+        self._share = np.hstack([share, tremor])
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, self._share.shape)
+        self._in_turn = bool(rng.integers(2))
+        self._last_s = last_s
+        self._order = rng.permutation(6)
+        self._height_mm = rng.uniform(25.0, 45.0)
+
+    def at(self, time_s: np.ndarray) -> RigidTransform:
+        """Pose of the image."""
+        cycle = 2.0 * np.pi * self._frequency[..., None] * time_s + self._phase[..., None]
+        x = np.einsum("ij,ijt->it", self._share, np.sin(cycle))
+        if self._in_turn:
+            # Each kind of motion has its part of the scan, a quarter of it wide, and is slight elsewhere.
+            middle = (self._order[:, None] + 0.5) / 6.0 * self._last_s
+            x *= 0.3 + 0.9 * np.exp(-(((time_s - middle) / (0.18 * self._last_s)) ** 2))
+        down = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+        limit = np.deg2rad([45.0, 35.0, 400.0])[:, None]
+        tilt, roll, yaw = limit * np.tanh(x[:3] / limit)
+        turn = (
+            about(2, yaw) * down * about(2, roll) * about(0, tilt)
+        )
+        height = self._height_mm + 15.0 * np.tanh(x[3] / 15.0)
+        return RigidTransform.from_components(np.column_stack([x[4], x[5], height]), turn)
+
+
+def about(axis: int, angles_rad: np.ndarray) -> Rotation:
+    """Turns about one axis."""
+    return Rotation.from_rotvec(np.outer(angles_rad, np.eye(3)[axis]))
+
+
+def lines_seen(
+    rng: np.random.Generator, world_from_image: RigidTransform, width_mm: float, pixel_mm: np.ndarray
+) -> np.ndarray:
+    """Two points of the floor's line in each image, whose depth errs by 0.1 to 0.3 mm, shape (m, 2, 2)."""
+    sigma_mm = rng.uniform(0.1, 0.3)
+    normal = world_from_image.rotation.inv().apply([0.0, 0.0, 1.0])
+    height = world_from_image.translation[:, 2]
+    across = np.array([0.0, width_mm])
+    depth = -(height[:, None] + normal[:, :1] * across) / normal[:, 1:2]
+    depth += sigma_mm * rng.standard_normal(depth.shape)
+    return np.stack([np.broadcast_to(across / pixel_mm[0], depth.shape), depth / pixel_mm[1]], axis=-1)
+
+
+def with_errors(
+    rng: np.random.Generator, exact: RigidTransform, time_s: np.ndarray, errors: str
+) -> RigidTransform:
+    """Readings whose errors are white, wander, or both: in the place, and of the sensor about itself."""
+    count = len(time_s)
+    shift, turn = np.zeros((count, 3)), np.zeros((count, 3))
+    if errors in ("white", "both"):
+        shift += rng.uniform(0.1, 0.3) * rng.standard_normal((count, 3))
+        turn += np.deg2rad(rng.uniform(0.05, 0.2)) * rng.standard_normal((count, 3))
+    if errors in ("drifting", "both"):
+        shift += DRIFT_MM * wander(rng, time_s)
+        turn += DRIFT_RAD * wander(rng, time_s)
+    place, rotation = exact.as_components()
+    return RigidTransform.from_components(place + shift, rotation * Rotation.from_rotvec(turn))
+
+
+def wander(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
+    """Three Ornstein-Uhlenbeck processes of unit size, shape (n, 3)."""
+    kept = np.exp(-np.diff(time_s) / DRIFT_S)
+    x = np.empty((len(time_s), 3))
+    x[0] = rng.standard_normal(3)
+    for k, share in enumerate(kept):
+        x[k + 1] = share * x[k] + np.sqrt(1.0 - share**2) * rng.standard_normal(3)
+    return x
