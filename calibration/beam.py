@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.chain import ChainSolution
-from calibration.plane import Plane, solve_chain
+from calibration.plane import Plane
+from calibration.solver import solve_chain
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 

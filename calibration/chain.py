@@ -24,6 +24,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import Fit
+from speckle3d.core.wander import SensorError, WanderingFit
 
 SeenAs = Literal["line", "direction", "dot"]
 
@@ -52,29 +53,37 @@ class ImagePoints:
         Translation in mm.
     wire : ndarray of int, shape (n,), optional
         The wire each point lies on.
+    time_s : ndarray, shape (n,), optional
+        When each point's frame was taken; without it, frames are taken to be evenly spaced. A sensor's error
+        wanders with it.
     """
 
     pixels: FloatArray
     frame: IntArray
     world_from_sensor: RigidTransform
     wire: IntArray | None = None
+    time_s: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or self.pixels.shape[1] != 2:
             raise InvalidInputError(f"pixels: expected shape (n, 2), got {self.pixels.shape}")
         require_finite(self.pixels, "pixels")
         counts = {len(self.pixels), len(self.frame), len(self.world_from_sensor)}
-        if self.wire is not None:
-            counts.add(len(self.wire))
+        counts |= {len(one) for one in (self.wire, self.time_s) if one is not None}
         if len(counts) > 1:
-            raise MismatchError(f"expected as many points as frames, poses and wires, got {sorted(counts)}")
+            raise MismatchError(
+                f"expected as many points as frames, poses, wires and times, got {sorted(counts)}"
+            )
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def __getitem__(self, chosen: BoolArray | IntArray | slice) -> ImagePoints:
         wire = None if self.wire is None else self.wire[chosen]
-        return ImagePoints(self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire)
+        time_s = None if self.time_s is None else self.time_s[chosen]
+        return ImagePoints(
+            self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire, time_s
+        )
 
     @cached_property
     def turns(self) -> FloatArray:
@@ -96,13 +105,24 @@ class ImagePoints:
         places = np.unique(np.linspace(0, len(self.frames) - 1, count).astype(int))
         return self[np.isin(self.frame, self.frames[places])]
 
+    @property
+    def times(self) -> FloatArray:
+        """`time_s`, or the frames' numbers where times are not known, shape (n,)."""
+        return np.asarray(self.frame, dtype=float) if self.time_s is None else self.time_s
+
     @classmethod
     def of_lines(
-        cls, frame: IntArray, points_px: FloatArray, world_from_sensor: RigidTransform
+        cls,
+        frame: IntArray,
+        points_px: FloatArray,
+        world_from_sensor: RigidTransform,
+        time_s: FloatArray | None = None,
     ) -> ImagePoints:
-        """Two points of a line in each frame: m frames and poses, `points_px` of shape (m, 2, 2)."""
+        """Two points of a line in each frame: m frames, poses and times, `points_px` of shape (m, 2, 2)."""
         twice = np.repeat(np.arange(len(frame)), 2)
-        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], world_from_sensor[twice])
+        times = None if time_s is None else np.asarray(time_s)[twice]
+        poses = world_from_sensor[twice]
+        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], poses, time_s=times)
 
 
 @dataclass(frozen=True)
@@ -138,11 +158,11 @@ class Seen:
         """Whether lines were found, not dots."""
         return self.pixels.ndim == 3
 
-    def points(self, world_from_sensor: RigidTransform) -> ImagePoints:
-        """Join with the sensor's pose at each line or dot."""
+    def points(self, world_from_sensor: RigidTransform, time_s: FloatArray | None = None) -> ImagePoints:
+        """Join with the sensor's pose and the time of each line or dot."""
         if self.are_lines:
-            return ImagePoints.of_lines(self.frame, self.pixels, world_from_sensor)
-        return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire)
+            return ImagePoints.of_lines(self.frame, self.pixels, world_from_sensor, time_s)
+        return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire, time_s)
 
 
 def as_directions(lines: ImagePoints) -> ImagePoints:
@@ -213,9 +233,8 @@ class ChainSolution:
     fit : Fit
         Of the points used, in frames that lie on the image and on the phantom: there the angles are
         small rotations about the image's z, y and x, wherever the sensor is mounted.
-    covariance : ndarray, shape (p, p)
-        In the same frames, in the order of `free`; residuals may be correlated within a frame (a sensor's
-        error moves all its points) and from frame to frame (it drifts).
+    noise : WanderingFit
+        What the sensor's errors are like, and the covariance that follows.
     points : ImagePoints
         All that were given.
     used : ndarray of bool, shape (n,)
@@ -231,7 +250,7 @@ class ChainSolution:
     phantom: Phantom
     free: tuple[str, ...]
     fit: Fit
-    covariance: FloatArray
+    noise: WanderingFit
     points: ImagePoints
     used: BoolArray
     residuals: FloatArray
@@ -242,6 +261,15 @@ class ChainSolution:
     def angular(self) -> bool:
         """Whether only directions are known: residuals are sines of angles, and nothing has a length."""
         return self.phantom.seen_as == "direction"
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the free parameters, shape (p, p), in frames that lie on the image and on the phantom.
+
+        Residuals are correlated within a frame, for a sensor's error moves all its points, and from frame to
+        frame, for it wanders.
+        """
+        return self.noise.covariance
 
     @property
     def free_columns(self) -> list[int]:
@@ -306,6 +334,29 @@ def free_jacobian(points: ImagePoints, phantom: Phantom, chain: Chain, free: Seq
     """Derivatives by the free parameters in the sensor's and the world's own frames, shape (n r, p)."""
     _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
     return jacobian.reshape(-1, len(CHAIN))[:, [CHAIN.index(name) for name in free]]
+
+
+_PROPORTIONS_MM = (0.5, 2.0, 8.0)
+"""Errors of position over errors of rotation that are tried, mm per degree: trackers are specified at 0.25 mm
+with 0.5 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
+
+
+def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorError:
+    """How residuals move with small turns of the sensor about the world's axes, rad, and with shifts, mm.
+
+    An orientation sensor's inclination wanders alone: its heading hardly moves lines of a plane that is
+    nearly level.
+    """
+    rows, _ = phantom.vanishing(points)
+    in_world = rows @ chain.target_from_world.rotation.as_matrix()
+    flat = np.column_stack([points.pixels * chain.pixel_mm, np.zeros(len(points))])
+    if phantom.seen_as == "direction":
+        along = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.rotation.apply(flat))
+        turned = in_world @ -skew(along)
+        return SensorError(turned.reshape(-1, 3)[:, :2], (np.ones(2),))
+    arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
+    both = np.concatenate([in_world @ -skew(arm), in_world], axis=2)
+    return SensorError(both.reshape(-1, 6), [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in _PROPORTIONS_MM])
 
 
 def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -19,8 +19,9 @@ from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
-from calibration.plane import OUTLIER_SIGMA, Stages, calibrate_plane
+from calibration.plane import Stages, calibrate_plane
 from calibration.report import Shot, as_calibration
+from calibration.solver import OUTLIER_SIGMA
 from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
@@ -210,7 +211,7 @@ def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoin
     read: RigidTransform | Rotation = recording.readings.at(times[there] - offset_s)
     poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
     below_origin = replace(seen, pixels=seen.pixels + np.array([0.0, recording.first_row]))
-    return below_origin[there].points(poses), {**seen.dropped, **missing}
+    return below_origin[there].points(poses, times[there]), {**seen.dropped, **missing}
 
 
 def _finished(

@@ -16,7 +16,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import ANGLES, ChainSolution, ImagePoints
 from calibration.identifiability import require_adequate
-from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, LineDirections, settled_angles, solve_chain
+from calibration.plane import LineDirections, settled_angles
+from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, solve_chain
 from calibration.starts import hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError

@@ -1,4 +1,4 @@
-"""Calibration with a plane, and the solver that all calibrations with a phantom share.
+"""Calibration with a plane.
 
 References
 ----------
@@ -8,66 +8,35 @@ References
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import (
-    ANGLES,
-    CHAIN,
-    POSE,
-    PROBE,
-    Chain,
-    ChainSolution,
-    ImagePoints,
-    Phantom,
-    SeenAs,
-    as_directions,
-    free_jacobian,
-    residuals_and_jacobian,
-)
+from calibration.chain import ANGLES, POSE, PROBE, Chain, ChainSolution, ImagePoints, SeenAs, as_directions
 from calibration.identifiability import judge, require_adequate
-from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.leastsquares import (
-    Fit,
-    clustered_covariance,
-    condition_number,
-    huber_weights,
-    levenberg_marquardt,
-    robust_sigma,
+from calibration.solver import (
+    OUTLIER_SIGMA,
+    SOME_FRAMES,
+    first_guess,
+    probe_parameters,
+    residuals_of,
+    sigma_of,
+    solve_chain,
 )
+from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
 
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
 
-SOME_FRAMES = 100
-"""Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
-
 _PIXEL_MM = 0.15
 """Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
-OUTLIER_SIGMA = 4.0
-"""Frames whose residual exceeds this many robust standard deviations are dropped: of Gaussian residuals of
-one size one in 16,000; of dots, which are known less well out of the image than in it, one in a hundred."""
-
-_NEARLY_ABSOLUTE = 0.06745
-"""Limit of Huber's weights, a tenth of the median: nearly all residuals count by their absolute values."""
-_REWEIGHTINGS = 8
 _SAME = 0.02
 """Two starts that settle at residuals as close as this share have found the same; no more are tried."""
-_SETTLED = 0.99
-"""Reweighting ends when it lowers the mean absolute residual by less."""
-_FREE_ROUNDS = 5
-"""After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
-_SMALLEST_SIGMA = 1e-7
-"""Residuals of exact data are rounding; nothing in them is an outlier."""
-
 Stages = Literal["three", "one"]
 
 
@@ -113,157 +82,6 @@ class LineDirections:
         rows = np.zeros((len(points), 1, 3))
         rows[:, 0, 2] = 1.0 / lengths
         return rows, np.zeros((len(points), 1))
-
-
-def solve_chain(
-    points: ImagePoints,
-    phantom: Phantom,
-    start: Chain,
-    probe: tuple[str, ...] = PROBE,
-    outlier_sigma: float = OUTLIER_SIGMA,
-) -> ChainSolution:
-    """Refine a chain until the phantom's residuals are least, leaving out frames that contradict the others.
-
-    Parameters
-    ----------
-    points : ImagePoints
-    phantom : Phantom
-    start : Chain
-        From which the solution is reached; its held parameters stay.
-    probe : tuple of str
-        Which of `PROBE` to estimate; all that the phantom determines of `TARGET` are estimated besides.
-    outlier_sigma : float
-        Frames whose largest residual exceeds so many robust standard deviations are dropped.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there are too few points, or fewer than half of them agree.
-    """
-    free = (*probe, *phantom.determined)
-    chain = _first_guess(points, phantom, start, free)
-    residuals = _residuals(points, phantom, chain)
-    used = _frames_within(residuals, points.frame, outlier_sigma * _sigma(residuals))
-    for round_ in itertools.count():
-        _require_majority(used, points)
-        chain, fit, jacobian = _refined(points[used], phantom, chain, free)
-        residuals = _residuals(points, phantom, chain)
-        sigma = _sigma(residuals[used])
-        agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
-        if round_ >= _FREE_ROUNDS:
-            agreeing &= used
-        if (agreeing == used).all():
-            break
-        used = agreeing
-    # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit, jacobian = _refined(points[used], phantom, chain, free)
-    return ChainSolution(
-        chain,
-        phantom,
-        free,
-        fit,
-        clustered_covariance(jacobian, fit.residuals, points.frame[used]),
-        points,
-        used,
-        residuals,
-        sigma,
-        condition_number(free_jacobian(points[used], phantom, chain, free)),
-    )
-
-
-def _sigma(residuals: FloatArray) -> float:
-    return robust_sigma(residuals, _SMALLEST_SIGMA)
-
-
-def probe_parameters(
-    fit_pixels: bool, pixel_mm: FloatArray | None
-) -> tuple[tuple[str, ...], FloatArray | None]:
-    """Which of `PROBE` to estimate, and the pixel size to hold, if any.
-
-    Raises
-    ------
-    InvalidInputError
-        If the pixel size is neither fitted nor given.
-    """
-    if fit_pixels:
-        return PROBE, None
-    if pixel_mm is None:
-        raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
-    return POSE, np.asarray(pixel_mm, dtype=float)
-
-
-def _first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
-    """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
-    chain, before = start, np.inf
-    for _ in range(_REWEIGHTINGS):
-        size = np.abs(_residuals(points, phantom, chain))
-        if size.mean() > _SETTLED * before:
-            break
-        before = size.mean()
-        weights = np.sqrt(huber_weights(size / _sigma(size), _NEARLY_ABSOLUTE))
-        chain, _, _ = _refined(points, phantom, chain, free, weights, tolerance=1e-3)
-    return chain
-
-
-def _residuals(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatArray:
-    return residuals_and_jacobian(chain.parameters(), points, phantom)[0]
-
-
-def _refined(
-    points: ImagePoints,
-    phantom: Phantom,
-    chain: Chain,
-    free: tuple[str, ...],
-    weights: FloatArray | None = None,
-    tolerance: float = 1e-9,
-) -> tuple[Chain, Fit, FloatArray]:
-    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
-
-    There all angles start at zero: far from where fixed angles become singular, and well scaled.
-    """
-    near = replace(points, world_from_sensor=chain.target_from_image(points))
-    columns = np.array([CHAIN.index(name) for name in free])
-    origin = np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-    scale = 1.0 if weights is None else weights
-
-    @lru_cache(maxsize=2)
-    def at(x: bytes) -> tuple[FloatArray, FloatArray]:
-        full = origin.copy()
-        full[columns] = np.frombuffer(x)
-        values, jacobian = residuals_and_jacobian(full, near, phantom)
-        kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
-        return (values * scale).ravel(), kept.reshape(-1, len(columns))
-
-    def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return at(x.tobytes())
-
-    fit = levenberg_marquardt(
-        lambda x: both(x)[0].copy(), origin[columns], lambda x: both(x)[1].copy(), free, tolerance=tolerance
-    )
-    found = origin.copy()
-    found[columns] = fit.parameters
-    step = Chain.from_parameters(found)
-    moved = Chain(
-        step.pixel_mm,
-        chain.sensor_from_image * step.sensor_from_image,
-        step.target_from_world * chain.target_from_world,
-    )
-    return moved, fit, both(fit.parameters)[1]
-
-
-def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
-    """Points of the frames none of whose residuals exceeds `limit`."""
-    wrong = np.unique(frame[(np.abs(residuals) > limit).any(axis=1)])
-    return ~np.isin(frame, wrong)
-
-
-def _require_majority(used: BoolArray, points: ImagePoints) -> None:
-    frames, agreeing = len(points.frames), len(points[used].frames)
-    if 2 * agreeing <= frames:
-        raise InsufficientDataError(
-            f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the images "
-            "and the sensor readings belong together, and is the phantom the one named?"
-        )
 
 
 def calibrate_plane(
@@ -366,8 +184,8 @@ def settled_angles(
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
     best, least = None, np.inf
     for start in angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals):
-        chain = _first_guess(lines, phantom, start, free)
-        sigma = _sigma(_residuals(lines, phantom, chain))
+        chain = first_guess(lines, phantom, start, free)
+        sigma = sigma_of(residuals_of(lines, phantom, chain))
         agreed = abs(sigma - least) < _SAME * least
         if sigma < least:
             best, least = chain, sigma

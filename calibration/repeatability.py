@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibration.chain import ChainSolution, ImagePoints, as_directions, residuals_and_jacobian
-from calibration.plane import solve_chain
+from calibration.solver import solve_chain
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError

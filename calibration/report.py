@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from calibration.beam import BeamBias
 from calibration.chain import SCALES, ChainSolution, free_jacobian
 from calibration.identifiability import judge
+from calibration.solver import near_jacobian
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
 from speckle3d.core.geometry import roll_yaw_tilt
-from speckle3d.core.leastsquares import clustered_covariance
 from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
@@ -84,9 +84,10 @@ def as_calibration(
 def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
     """The parameters estimated, in the sensor's and the world's own frames."""
     values, used = solution.chain.parameters(), solution.points_used
-    matrix = free_jacobian(used, solution.phantom, solution.chain, solution.free)
-    covariance = clustered_covariance(matrix, solution.residuals[solution.used].ravel(), used.frame)
-    errors = np.sqrt(np.diag(covariance))
+    own = free_jacobian(used, solution.phantom, solution.chain, solution.free)
+    _, near = near_jacobian(used, solution.phantom, solution.chain, solution.free)
+    own_from_near = np.linalg.lstsq(own, near, rcond=None)[0]
+    errors = np.sqrt(np.diag(own_from_near @ solution.covariance @ own_from_near.T))
     return tuple(
         Parameter(name, float(values[column]), float(error), _unit(name))
         for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)

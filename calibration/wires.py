@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, SeenAs
 from calibration.identifiability import require_adequate
-from calibration.plane import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
+from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
 from calibration.starts import rotations_all_over, wire_start
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError

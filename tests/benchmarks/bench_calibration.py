@@ -20,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from calibration_examples import PIXEL_MM, TRIAL_1, centre_of, scan_plane
 
 from calibration.chain import CHAIN, PROBE, Chain, ChainSolution, ImagePoints, residuals_and_jacobian
-from calibration.plane import Plane, _refined, _three_stages, calibrate_plane, solve_chain
+from calibration.plane import Plane, _three_stages, calibrate_plane
+from calibration.solver import refined, solve_chain
 
 LINES, TARGET_S = 700, 0.1
 FREE = (*PROBE, *Plane().determined)
@@ -48,7 +49,7 @@ def by_us(lines: ImagePoints, start: Chain) -> ChainSolution:
 
 def by_us_once(lines: ImagePoints, start: Chain) -> Chain:
     """The same least squares as SciPy's, nothing else: analytic derivatives, frames on image and plane."""
-    return _refined(lines, Plane(), start, FREE)[0]
+    return refined(lines, Plane(), start, FREE)[0]
 
 
 def median_seconds(function, *arguments, runs: int) -> float:

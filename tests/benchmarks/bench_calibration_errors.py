@@ -17,7 +17,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 HERE = Path(__file__).resolve().parent
-KINDS = sorted(path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem != "rows")
+KINDS = sorted(
+    path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem not in ("rows", "hand")
+)
 FIRST_SEED = 900_001
 
 

@@ -10,7 +10,8 @@ from scipy.spatial.transform import RigidTransform
 from calibration.chain import ImagePoints
 from calibration.identifiability import MOTIONS, REFUSED_MM, WEAK_MM, judge, require_adequate
 from calibration.orientation import calibrate_orientation
-from calibration.plane import Plane, calibrate_plane, solve_chain
+from calibration.plane import Plane, calibrate_plane
+from calibration.solver import solve_chain
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 

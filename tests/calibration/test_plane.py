@@ -11,7 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import CHAIN, PROBE, TARGET, Chain, ImagePoints, free_jacobian, residuals_and_jacobian
 from calibration.identifiability import MOTIONS
-from calibration.plane import Plane, calibrate_plane, solve_chain
+from calibration.plane import Plane, calibrate_plane
+from calibration.solver import solve_chain
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import condition_number
 

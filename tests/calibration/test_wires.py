@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import ImagePoints
 from calibration.identifiability import MOTIONS
-from calibration.plane import OUTLIER_SIGMA
+from calibration.solver import OUTLIER_SIGMA
 from calibration.wires import calibrate_cross_wire, calibrate_wires
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom, three_wires

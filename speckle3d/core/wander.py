@@ -1,0 +1,219 @@
+"""Least squares whose residuals carry a sensor's wandering error: Ornstein-Uhlenbeck and white noise.
+
+A sensor's error drifts over seconds, so that neighbouring residuals err alike and many of them say no more
+than a few. The errors are the states of a Kalman filter that passes through the recording once for a whole
+grid of sizes and time constants and turns residuals and Jacobian into innovations, which are independent;
+the answers of the grid are averaged by their restricted likelihood.
+
+References
+----------
+.. [1] G. E. Uhlenbeck and L. S. Ornstein, "On the theory of the Brownian motion", Phys. Rev. 36, 1930.
+.. [2] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
+   Biometrika 58, 1971 (restricted likelihood).
+.. [3] A. C. Harvey and G. D. A. Phillips, "Maximum likelihood estimation of regression models with
+   autoregressive-moving average disturbances", Biometrika 66, 1979 (generalised least squares by the filter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import MismatchError
+
+WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
+"""Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
+
+JITTER = (0.0, 0.5, 1.5)
+"""Sizes tried of the error that is new in every frame and moves all its residuals together."""
+
+_TIMES = 4
+"""Time constants tried, evenly spaced in logarithm."""
+
+_SHORTEST, _LONGEST = 4.0, 2.0
+"""Shortest and longest time constant tried: four frames, of which fewer look like white noise; twice the
+recording, which looks like a straight line."""
+
+_SMALLEST = 1e-12
+"""Residuals below are rounding: nothing wanders in them."""
+
+
+@dataclass(frozen=True)
+class SensorError:
+    """How the errors of a sensor move residuals.
+
+    Attributes
+    ----------
+    effects : ndarray, shape (m, k)
+        Derivatives of the residuals by the k components of the error.
+    proportions : sequence of ndarray, shape (k,)
+        Standard deviations of the components, in proportion to each other; several are tried. A component
+        of zero does not wander.
+    """
+
+    effects: FloatArray
+    proportions: Sequence[FloatArray]
+
+
+@dataclass(frozen=True)
+class WanderingFit:
+    """An answer of linear least squares with wandering errors, averaged over the grid.
+
+    Attributes
+    ----------
+    step : ndarray, shape (p,)
+        Added to the parameters, it makes ``residuals + jacobian @ step`` least.
+    covariance : ndarray, shape (p, p)
+    white : float
+        Standard deviation of the white noise of a residual.
+    wander : float
+        Root mean square effect of the wandering error on a residual, in the residuals' unit.
+    time_s : float
+        Its time constant, in the unit of the times given; NaN where nothing wanders.
+    """
+
+    step: FloatArray
+    covariance: FloatArray
+    white: float
+    wander: float
+    time_s: float
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Size of wandering and of jitter relative to white noise, time constant, and proportion, each (g,)."""
+
+    wander: FloatArray
+    jitter: FloatArray
+    time_s: FloatArray
+    unit: FloatArray
+    """Variance of each component of the error whose root mean square effect is one, shape (g, k)."""
+
+
+def wandering_fit(
+    jacobian: FloatArray,
+    residuals: FloatArray,
+    group: IntArray,
+    time_s: FloatArray,
+    error: SensorError,
+    jitter: Sequence[float] = JITTER,
+    prior: FloatArray | None = None,
+) -> WanderingFit:
+    """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (m, p)
+    residuals : ndarray, shape (m,)
+    group : ndarray of int, shape (m,)
+        Frame of each residual, ascending; residuals of a frame have one sensor reading.
+    time_s : ndarray, shape (m,)
+        Of each residual's frame.
+    error : SensorError
+    jitter : sequence of float
+        Sizes of the error that is new in each frame to try (`JITTER`); zero alone where a frame has one
+        residual.
+    prior : ndarray, shape (p, p), optional
+        Inverse covariance of what is known of the parameters besides, in the units of the parameters, about
+        the present ones.
+
+    Raises
+    ------
+    MismatchError
+        If the arrays are not of one length.
+    """
+    lengths = {len(jacobian), len(residuals), len(group), len(time_s), len(error.effects)}
+    if len(lengths) > 1:
+        raise MismatchError(f"expected as many rows of each, got {sorted(lengths)}")
+    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+    grid = _grid(error, time_s[starts], jitter)
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    known = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
+    columns = np.column_stack([jacobian / scale, residuals])
+    normal, log_determinant = _innovations(columns, error.effects, starts, time_s, grid)
+    matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
+    free = max(len(residuals) - len(scale), 1)
+    inverse = np.linalg.pinv(matrix, rcond=1e-15, hermitian=True)
+    left = np.maximum(energy - np.einsum("gi,gij,gj->g", pull, inverse, pull), 0.0)
+    variance = np.maximum(left / free, _SMALLEST**2)
+    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=1e-15, hermitian=True)
+    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None])
+    _, volume = np.linalg.slogdet(matrix)
+    likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
+    weight = np.exp(likelihood - likelihood.max())
+    weight /= weight.sum()
+    step = weight @ steps
+    apart = steps - step
+    covariance = np.einsum("g,gij->ij", weight, spread) + np.einsum("g,gi,gj->ij", weight, apart, apart)
+    wandering = weight * (grid.wander > 0)
+    time = float(np.exp(wandering @ np.log(grid.time_s) / wandering.sum())) if wandering.sum() > 0 else np.nan
+    return WanderingFit(
+        step / scale,
+        covariance / np.outer(scale, scale),
+        float(np.sqrt(weight @ variance)),
+        float(np.sqrt(weight @ (variance * grid.wander**2))),
+        time,
+    )
+
+
+def _grid(error: SensorError, frame_time_s: FloatArray, jitter: Sequence[float]) -> _Grid:
+    span = max(float(np.ptp(frame_time_s)), _SMALLEST)
+    spacing = float(np.median(np.diff(frame_time_s))) if len(frame_time_s) > 1 else span
+    shortest = min(max(_SHORTEST * spacing, _SMALLEST), span)
+    times = np.geomspace(shortest, _LONGEST * span, _TIMES)
+    units = []
+    for proportion in error.proportions:
+        effect = np.mean((error.effects * proportion) ** 2) * len(proportion)
+        units.append(np.asarray(proportion) ** 2 / max(float(effect), _SMALLEST**2))
+    rows = [
+        (wander, shake, time, unit)
+        for wander in WANDER
+        for shake in jitter
+        for time in (times if wander > 0 else times[:1])
+        for unit in (units if wander > 0 or shake > 0 else units[:1])
+    ]
+    # A size of zero stands for one time and one proportion; its prior is that of all of them.
+    return _Grid(
+        np.array([row[0] for row in rows]),
+        np.array([row[1] for row in rows]),
+        np.array([row[2] for row in rows]),
+        np.array([row[3] for row in rows]),
+    )
+
+
+def _innovations(
+    columns: FloatArray, effects: FloatArray, starts: IntArray, time_s: FloatArray, grid: _Grid
+) -> tuple[FloatArray, FloatArray]:
+    """Products of the columns' innovations, (g, p + 1, p + 1), and logarithms of their variance, (g,)."""
+    count, k = grid.unit.shape
+    stationary = grid.unit * (grid.wander**2)[:, None]
+    shaken = grid.unit * (grid.jitter**2)[:, None]
+    diagonal = np.arange(k)
+    variance = np.zeros((count, k, k))
+    variance[:, diagonal, diagonal] = stationary
+    expected = np.zeros((count, k, columns.shape[1]))
+    normal = np.zeros((count, columns.shape[1], columns.shape[1]))
+    log_determinant = np.zeros(count)
+    before = time_s[starts[0]]
+    for first, last in zip(starts, [*starts[1:], len(columns)], strict=True):
+        kept = np.exp(-max(time_s[first] - before, 0.0) / grid.time_s)
+        before = time_s[first]
+        variance *= (kept**2)[:, None, None]
+        variance[:, diagonal, diagonal] += (1.0 - kept**2)[:, None] * stationary
+        expected *= kept[:, None, None]
+        effect = effects[first:last]
+        seen = effect @ variance
+        total = seen @ effect.T + (effect * shaken[:, None]) @ effect.T + np.eye(last - first)
+        root = np.linalg.cholesky(total)
+        both = np.linalg.solve(root, np.concatenate([columns[first:last] - effect @ expected, seen], axis=2))
+        whitened, gain = both[:, :, : columns.shape[1]], both[:, :, columns.shape[1] :]
+        across = np.swapaxes(gain, 1, 2)
+        expected += across @ whitened
+        variance -= across @ gain
+        normal += np.swapaxes(whitened, 1, 2) @ whitened
+        log_determinant += 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    return normal, log_determinant
