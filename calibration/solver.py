@@ -118,18 +118,35 @@ def _with_wandering_errors(
 ) -> tuple[Chain, WanderingFit]:
     """Steps from a least-squares solution to the one that knows that the sensor's errors wander."""
     for _ in range(_WANDERING_STEPS):
-        residuals, jacobian = near_jacobian(points, phantom, chain, free)
-        several = residuals.size // len(points)
-        noise = wandering_fit(
-            jacobian,
-            residuals,
-            np.repeat(points.frame, several),
-            np.repeat(points.times, several),
-            sensor_error(points, phantom, chain),
-            (0.0,) if residuals.size == len(points.frames) else JITTER,
-        )
+        noise = wandering_noise(points, phantom, chain, free)
         chain = moved_by(chain, free, noise.step)
     return chain, noise
+
+
+def wandering_noise(
+    points: ImagePoints,
+    phantom: Phantom,
+    chain: Chain,
+    free: tuple[str, ...],
+    more: FloatArray | None = None,
+) -> WanderingFit:
+    """One step of least squares that knows that the sensor's errors wander, and its covariance.
+
+    Parameters
+    ----------
+    more : ndarray, shape (n r, k), optional
+        Derivatives of the residuals by further parameters, which come after the free ones.
+    """
+    residuals, jacobian = near_jacobian(points, phantom, chain, free)
+    several = residuals.size // len(points)
+    return wandering_fit(
+        jacobian if more is None else np.column_stack([jacobian, more]),
+        residuals,
+        np.repeat(points.frame, several),
+        np.repeat(points.times, several),
+        sensor_error(points, phantom, chain),
+        (0.0,) if residuals.size == len(points.frames) else JITTER,
+    )
 
 
 def sigma_of(residuals: FloatArray) -> float:

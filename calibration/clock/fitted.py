@@ -10,25 +10,37 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import CHAIN, ChainSolution, ImagePoints, residuals_and_jacobian
-from calibration.clock.offset import ClockOffset, delays_around
+from calibration.chain import ChainSolution, ImagePoints, as_directions
+from calibration.clock.offset import ClockOffset, covered, delays_around, require_peak
+from calibration.clock.smoothing import smooth
+from calibration.solver import SOME_FRAMES, first_guess, moved_by, residuals_of, sigma_of, wandering_noise
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.leastsquares import clustered_covariance
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.wander import WanderingFit
 
-STEP_S = 0.04
-"""Offsets tried first: a quarter of a period of 6 Hz, faster than hands swing a probe."""
+STEP_S = 0.02
+"""Steps of the offsets tried first: half a frame at 25 frames/s, in which no hand reverses."""
 
-_MOST_STEPS = 12
+_ANEW = 10
+"""Of so many offsets tried, one gets a calibration from nothing; others begin from the one beside them."""
+
+_ROUNDS = 2
+"""The second leaves out the frames that contradict the others at the offset that the first one found."""
+_MOST_STEPS = 10
 _SETTLED = 0.02
 """Steps end when one is below this share of the standard error."""
 _DERIVATIVE_S = 1e-3
 
+Calibrate = Callable[[ImagePoints], ChainSolution]
+
 
 def estimate_offset(
-    calibrate: Callable[[ImagePoints], ChainSolution],
-    points_at: Callable[[float], ImagePoints],
+    calibrate: Calibrate,
+    points: ImagePoints,
+    readings: TimedPoses | TimedRotations,
     around_s: float = 0.0,
     search_s: float = 0.4,
 ) -> ClockOffset:
@@ -38,69 +50,138 @@ def estimate_offset(
     ----------
     calibrate : callable
         May raise `InsufficientDataError`.
-    points_at : callable
-        The same points with the sensor read at a given offset, smoothly (`calibration.clock.smoothing`).
+    points : ImagePoints
+        With times; those that have a reading at every offset tried are used, so that all offsets are judged
+        by the same points.
+    readings : TimedPoses or TimedRotations
     around_s, search_s : float
         Offsets from `around_s` - `search_s` to `around_s` + `search_s` are tried.
 
     Raises
     ------
     InsufficientDataError
-        If no offset gives a calibration, the best is at the end of the range, or another is as good.
+        If readings cover no frame at all offsets, no offset gives a calibration, the best is at the end of
+        the range, or another is as good.
     """
-    tried = delays_around(around_s, search_s, STEP_S)
-    sigmas = np.array([_sigma(calibrate, points_at(float(offset))) for offset in tried])
-    best = int(np.argmin(sigmas))
-    if not np.isfinite(sigmas[best]):
+    there = covered(readings, points.times, around_s, search_s)
+    if not there.any():
         raise InsufficientDataError(
-            f"expected a clock offset within {search_s:g} s that gives a calibration, got none"
+            f"expected readings from {search_s:g} s before to {search_s:g} s after some frames, to tell the "
+            "clock, got none"
         )
-    seconds = float(tried[best])
-    for _ in range(_MOST_STEPS):
+    points_at = _Reader(points[there], smooth(readings)).at
+    tried = delays_around(around_s, search_s, STEP_S)
+    misfit = _sigmas(calibrate, points_at, tried) ** 2
+    best = int(np.argmin(misfit))
+    seconds, error = float(tried[best]), np.inf
+    if 0 < best < len(tried) - 1:
+        require_peak(tried, misfit, best)
+    for _ in range(_ROUNDS):
         solution = calibrate(points_at(seconds))
-        step, error = offset_step(solution, points_at, seconds)
-        seconds += float(np.clip(step, -STEP_S, STEP_S))
-        if not abs(seconds - around_s) <= search_s - _DERIVATIVE_S:
-            raise InsufficientDataError(
-                f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its end"
-            )
-        if abs(step) < _SETTLED * error:
-            break
+        chain = solution.chain
+        for _ in range(_MOST_STEPS):
+            joint = _joint_fit(replace(solution, chain=chain), points_at, seconds)
+            step, error = float(joint.step[-1]), float(np.sqrt(joint.covariance[-1, -1]))
+            chain = moved_by(chain, solution.free, joint.step[:-1])
+            seconds += float(np.clip(step, -STEP_S, STEP_S))
+            if not abs(seconds - around_s) < search_s - STEP_S:
+                raise InsufficientDataError(
+                    f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its "
+                    "end"
+                )
+            if abs(step) < _SETTLED * error:
+                break
     return ClockOffset(seconds, error)
 
 
-def offset_step(
+def with_uncertain_offset(
+    solution: ChainSolution, readings: TimedPoses | TimedRotations, seconds: float
+) -> ChainSolution:
+    """Return a solution whose covariance includes that of the clock offset it was made with."""
+    there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
+    shown = replace(solution, points=solution.points[there], used=solution.used[there])
+    joint = _joint_fit(shown, _Reader(shown.points, smooth(readings)).at, seconds)
+    kept = slice(len(solution.free))
+    noise = replace(joint, step=joint.step[kept], covariance=joint.covariance[kept, kept])
+    return replace(solution, noise=noise)
+
+
+class _Reader:
+    """Points with the sensor read at another offset, each time of a frame once."""
+
+    def __init__(self, points: ImagePoints, readings: TimedPoses | TimedRotations) -> None:
+        self._points, self._readings = points, readings
+        self._times, self._of_point = np.unique(points.times, return_inverse=True)
+
+    def at(self, seconds: float) -> ImagePoints:
+        read: RigidTransform | Rotation = self._readings.at(self._times - seconds)
+        poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+        return replace(self._points, world_from_sensor=poses[self._of_point])
+
+
+def _joint_fit(
     solution: ChainSolution, points_at: Callable[[float], ImagePoints], seconds: float
-) -> tuple[float, float]:
-    """Step of the offset that lowers the residuals most, all parameters free, and its standard error, s."""
-    jacobian = with_offset(solution, points_at, seconds)
-    residuals = solution.residuals[solution.used].ravel()
-    step = -np.linalg.lstsq(jacobian, residuals, rcond=1e-12)[0]
-    covariance = clustered_covariance(jacobian, residuals, solution.points_used.frame)
-    return float(step[-1]), float(np.sqrt(covariance[-1, -1]))
-
-
-def with_offset(
-    solution: ChainSolution, points_at: Callable[[float], ImagePoints], seconds: float
-) -> FloatArray:
-    """Derivatives of the residuals used by the free parameters and by the offset, shape (n r, p + 1).
-
-    The parameters are those of frames that lie on the image and on the phantom (`ChainSolution.fit`).
-    """
-    used, phantom = solution.points_used, solution.phantom
-    near = replace(used, world_from_sensor=solution.chain.target_from_image(used))
-    origin = np.concatenate([solution.chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-    _, jacobian = residuals_and_jacobian(origin, near, phantom)
-    columns = jacobian.reshape(-1, len(CHAIN))[:, solution.free_columns]
-    later, sooner = (
-        residuals_and_jacobian(solution.chain.parameters(), points_at(at)[solution.used], phantom)[0]
-        for at in (seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
+) -> WanderingFit:
+    """Step and covariance of the free parameters and, last, of the offset, s, all solved for together."""
+    used = solution.used
+    here, later, sooner = (
+        _as_seen(solution, points_at(at))[used]
+        for at in (seconds, seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
     )
-    return np.column_stack([columns, (later - sooner).ravel() / (2.0 * _DERIVATIVE_S)])
+    change = residuals_of(later, solution.phantom, solution.chain)
+    change = change - residuals_of(sooner, solution.phantom, solution.chain)
+    column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
+    return wandering_noise(here, solution.phantom, solution.chain, solution.free, column)
 
 
-def _sigma(calibrate: Callable[[ImagePoints], ChainSolution], points: ImagePoints) -> float:
-    try:
-        return calibrate(points).sigma
-    except InsufficientDataError:
-        return float("inf")
+def _as_seen(solution: ChainSolution, points: ImagePoints) -> ImagePoints:
+    """The points, or their directions without places for a solution that knows no more."""
+    if not solution.angular:
+        return points
+    if points.pixels.shape == solution.points.pixels.shape:
+        turns = RigidTransform.from_rotation(points.world_from_sensor.rotation)
+        return replace(points, world_from_sensor=turns)
+    return as_directions(points)
+
+
+def _sigmas(
+    calibrate: Calibrate, points_at: Callable[[float], ImagePoints], tried_s: FloatArray
+) -> FloatArray:
+    """Robust standard deviation of the residuals of some frames at every offset."""
+    some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried_s]
+    found = _anew(calibrate, some)
+    sigmas = np.empty(len(tried_s))
+    begins = np.array(sorted(found))
+    begin_of = begins[np.abs(np.arange(len(some))[:, None] - begins).argmin(axis=1)]
+    for begin, solution in found.items():
+        mine = np.flatnonzero(begin_of == begin)
+        # To both sides, each from the solution of the one beside it.
+        for side in (mine[mine >= begin], mine[mine < begin][::-1]):
+            chain = solution.chain
+            for number in side:
+                points = _as_seen(solution, some[number])
+                chain = first_guess(points, solution.phantom, chain, solution.free)
+                sigmas[number] = sigma_of(residuals_of(points, solution.phantom, chain))
+    return sigmas
+
+
+def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolution]:
+    """Calibrations from nothing at some of the offsets; at all, until there is one, if those fail.
+
+    At a wrong offset a motion may seem to determine nothing, for its residuals are large.
+    """
+    first = list(range(len(some) // 2 % _ANEW, len(some), _ANEW))
+    found: dict[int, ChainSolution] = {}
+    refusal: InsufficientDataError | None = None
+    for number in first + [k for k in range(len(some)) if k not in first]:
+        if found and number not in first:
+            break
+        try:
+            found[number] = calibrate(some[number])
+        except InsufficientDataError as error:
+            refusal = error
+    if not found:
+        raise InsufficientDataError(
+            f"expected a clock offset that gives a calibration, got none among {len(some)} tried: {refusal}"
+        )
+    return found

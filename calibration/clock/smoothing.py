@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import cast, overload
+from typing import overload
 
 import numpy as np
 import numpy.typing as npt
@@ -108,7 +108,7 @@ class _Smooth:
     def turned(self, times_s: FloatArray) -> Rotation:
         """Rotation at each time."""
         nearest, vectors = self._rotation_vectors(times_s, self._turning_s)
-        return cast(Rotation, self.rotation[nearest] * Rotation.from_rotvec(vectors))
+        return self.rotation[nearest] * Rotation.from_rotvec(vectors)
 
     def moved(self, times_s: FloatArray) -> FloatArray:
         """Translation at each time, shape (q, 3)."""
