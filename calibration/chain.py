@@ -24,7 +24,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
 from speckle3d.core.leastsquares import Fit
-from speckle3d.core.wander import SensorError, WanderingFit
+from speckle3d.core.wander import WanderingFit
 
 SeenAs = Literal["line", "direction", "dot"]
 
@@ -222,6 +222,42 @@ class Chain:
 
 
 @dataclass(frozen=True)
+class PixelPrior:
+    """What is known of the pixel size before anything is measured.
+
+    Parameters
+    ----------
+    pixel_mm : ndarray, shape (2,)
+        Column pitch and row spacing, as the scanner's calipers have them.
+    error : float
+        Their standard error, as a share of them.
+    """
+
+    pixel_mm: FloatArray
+    error: float
+
+    def deviation(self, pixel_mm: FloatArray) -> FloatArray:
+        """Deviation of other sizes, in standard errors, shape (2,)."""
+        return np.asarray((pixel_mm / self.pixel_mm - 1.0) / self.error)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another answer, far away, to which a discrete ambiguity of the phantom leads.
+
+    Attributes
+    ----------
+    chain : Chain
+    evidence : float
+        By how much the sum of its squared residuals exceeds that of the solution, in variances of a residual
+        that is independent of the others.
+    """
+
+    chain: Chain
+    evidence: float
+
+
+@dataclass(frozen=True)
 class ChainSolution:
     """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.
 
@@ -244,6 +280,10 @@ class ChainSolution:
         Robust standard deviation of the residuals of the points used.
     condition_number : float
         Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2).
+    prior : PixelPrior, optional
+        That the solution takes into account.
+    rival : Rival, optional
+        The other answer that explains the points best.
     """
 
     chain: Chain
@@ -256,6 +296,8 @@ class ChainSolution:
     residuals: FloatArray
     sigma: float
     condition_number: float
+    prior: PixelPrior | None = None
+    rival: Rival | None = None
 
     @property
     def angular(self) -> bool:
@@ -336,27 +378,51 @@ def free_jacobian(points: ImagePoints, phantom: Phantom, chain: Chain, free: Seq
     return jacobian.reshape(-1, len(CHAIN))[:, [CHAIN.index(name) for name in free]]
 
 
-_PROPORTIONS_MM = (0.5, 2.0, 8.0)
-"""Errors of position over errors of rotation that are tried, mm per degree: trackers are specified at 0.25 mm
-with 0.5 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
+def near_jacobian(
+    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals, shape (n r,), and Jacobian, (n r, p), in frames that lie on the image and on the phantom."""
+    near = replace(points, world_from_sensor=chain.target_from_image(points))
+    residuals, jacobian = residuals_and_jacobian(on_image(chain), near, phantom)
+    columns = [CHAIN.index(name) for name in free]
+    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
 
 
-def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorError:
-    """How residuals move with small turns of the sensor about the world's axes, rad, and with shifts, mm.
+def moved_by(chain: Chain, free: tuple[str, ...], step: FloatArray) -> Chain:
+    """Add a step in the free parameters, in frames that lie on the image and on the phantom."""
+    parameters = on_image(chain)
+    parameters[[CHAIN.index(name) for name in free]] += step
+    return moved_to(chain, parameters)
 
-    An orientation sensor's inclination wanders alone: its heading hardly moves lines of a plane that is
-    nearly level.
+
+def on_image(chain: Chain) -> FloatArray:
+    """Parameters of a chain in frames that lie on the image and on the phantom: zero but for pixel sizes."""
+    return np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
+
+
+def moved_to(chain: Chain, parameters: FloatArray) -> Chain:
+    """Replace the parameters of `on_image` by others."""
+    step = Chain.from_parameters(parameters)
+    return Chain(
+        step.pixel_mm,
+        chain.sensor_from_image * step.sensor_from_image,
+        step.target_from_world * chain.target_from_world,
+    )
+
+
+def corners_moved(chain: Chain, points: ImagePoints) -> FloatArray:
+    """Derivatives of the image's corners, mm, by all parameters, in frames that lie on the image and phantom.
+
+    The image is taken to reach as far as points are in it. Shape (4, 3, 14).
     """
-    rows, _ = phantom.vanishing(points)
-    in_world = rows @ chain.target_from_world.rotation.as_matrix()
-    flat = np.column_stack([points.pixels * chain.pixel_mm, np.zeros(len(points))])
-    if phantom.seen_as == "direction":
-        along = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.rotation.apply(flat))
-        turned = in_world @ -skew(along)
-        return SensorError(turned.reshape(-1, 3)[:, :2], (np.ones(2),))
-    arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
-    both = np.concatenate([in_world @ -skew(arm), in_world], axis=2)
-    return SensorError(both.reshape(-1, 6), [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in _PROPORTIONS_MM])
+    right, bottom = points.pixels.max(axis=0)
+    corners_px = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+    flat = np.column_stack([corners_px * chain.pixel_mm, np.zeros(len(corners_px))])
+    moved = np.zeros((len(corners_px), 3, len(CHAIN)))
+    moved[:, 0, 0], moved[:, 1, 1] = corners_px.T
+    moved[:, :, 2:5] = np.eye(3)
+    moved[:, :, 7:4:-1] = -skew(flat)
+    return moved
 
 
 def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:

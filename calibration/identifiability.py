@@ -1,28 +1,29 @@
-"""Whether the motion of a scan determines the calibration, and which motion is missing.
+"""Whether the motion of a scan determines the calibration, and which motions are missing.
 
-To find the missing motion, more frames are imagined in which the probe is turned or shifted in one more way;
-missing is the motion whose frames would make the answer most certain.
+To find the missing motions, more frames are imagined in which the probe is turned or shifted in the ways that
+the scan has not. Missing are those without which the answer would stay uncertain, all others added.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import CHAIN, ChainSolution, ImagePoints, residuals_and_jacobian
+from calibration.chain import CHAIN, ChainSolution, ImagePoints, corners_moved, residuals_and_jacobian
+from calibration.motions import Motion, absent, extents, on_phantom, with_motion
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import skew
 
 MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
 
-REFUSED_MM, REFUSED_RAD = 5.0, np.deg2rad(2.0)
-"""Standard error of the image's corners, or of an orientation sensor's rotation, above which a solution is
-refused: what a ruler and a protractor on the probe achieve."""
+_TWO_SIDED = 1.96
+REFUSED_MM, REFUSED_RAD = 5.0 / _TWO_SIDED, np.deg2rad(5.0) / _TWO_SIDED
+"""Standard error of the image's worst corner, and of its rotation about the worst axis, above which a
+solution is refused: 95 % intervals of 5 mm and 5 degrees, which a ruler and a protractor on the probe
+achieve."""
 
 WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
 """Standard error of a weakly determined solution; 1 degree is the published precision (Housden 2008)."""
@@ -31,39 +32,18 @@ MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
 """Root mean square residual above which the phantom does not explain the images: the worst published is
 3.5 mm as a distance, with early magnetic trackers (TR 303, section 5), 2 mm in each component."""
 
-SMALLEST_IMAGE_MM = 1.0
-"""Smallest plausible image. Where the probe was only turned about a point of the image, pixels shrink to
-nothing: an image that is one point is at the same height in all frames."""
+TIE = 25.0
+"""Evidence (`Rival`) below which two answers are not told apart: five standard deviations."""
 
-_TURN_RAD, _SHIFT_MM = np.deg2rad(15.0), 10.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
+_HELPS = 1.5
+"""A motion matters if without it the error stays as many times larger."""
 
-_UNKNOWN = {"s_x": 0.3, "s_y": 0.3}
-"""Standard deviation of a parameter before anything is measured; of pixel sizes, as a share of them."""
+_UNKNOWN = 0.3
+"""Standard deviation of a pixel size before anything is measured or given, as a share of it."""
 _UNKNOWN_RAD, _UNKNOWN_MM = 1.0, 300.0
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A way to move the probe: turn about, or shift along, one of the image's axes."""
-
-    advice: str
-    axis: int
-    turns: bool
-
-
-_UP_AND_DOWN = Motion("move the probe up and down (the phantom then appears at other depths)", 1, False)
-_SHRUNK = "the motion does not determine the pixel size"
-
-MOTIONS = (
-    Motion("tilt the probe to and fro (rotate about the image's lateral axis)", 0, True),
-    Motion("rotate about the beam axis", 1, True),
-    Motion("roll the probe from side to side (rotate about the elevational axis)", 2, True),
-    Motion("shift the probe sideways (the phantom then appears elsewhere across the image)", 0, False),
-    _UP_AND_DOWN,
-)
 
 
 @dataclass(frozen=True)
@@ -73,8 +53,8 @@ class Adequacy:
     Attributes
     ----------
     standard_error : float
-        Of the image's corners, root mean square, mm; of the rotation about its worst axis, rad, where only
-        directions are known.
+        Of the image's worst corner, mm; of the rotation about its worst axis, rad, where only directions are
+        known.
     condition_number : float
         Of the scaled Jacobian, in frames on the image and the phantom.
     missing : tuple of str
@@ -88,14 +68,26 @@ class Adequacy:
     verdict: str
 
 
+@dataclass(frozen=True)
+class _Errors:
+    """Standard errors of the image's worst corner, mm, and of its rotation about the worst axis, rad."""
+
+    corner_mm: float
+    angle_rad: float
+
+    def of_limit(self, mm: float, rad: float) -> float:
+        """The larger of both, as a share of what is allowed."""
+        return max(self.corner_mm / mm, self.angle_rad / rad)
+
+
 def require_adequate(solution: ChainSolution) -> ChainSolution:
     """Return `solution` if its motion was sufficient.
 
     Raises
     ------
     InsufficientDataError
-        Naming the missing motion, if the answer is too uncertain to be used; or if the phantom does not
-        explain the images.
+        Naming the missing motions, if the answer is too uncertain to be used, or another explains the images
+        as well; or if the phantom does not explain the images.
     """
     found = judge(solution)
     if found.refused:
@@ -109,143 +101,170 @@ def judge(solution: ChainSolution) -> Adequacy:
     The image is taken to reach as far as the phantom was seen in it.
     """
     angular = solution.angular
-    weak, limit = (WEAK_RAD, REFUSED_RAD) if angular else (WEAK_MM, REFUSED_MM)
-    information = _information(solution, _on_phantom(solution, solution.points_used))
-    error = _standard_error(solution, information)
+    information = _information(solution, on_phantom(solution, solution.points_used))
+    white = _errors(solution, _covariance(solution, information))
+    claimed = _errors(solution, _full(solution, solution.covariance))
+    errors = _Errors(
+        0.0 if angular else max(white.corner_mm, claimed.corner_mm), max(white.angle_rad, claimed.angle_rad)
+    )
+    error = errors.angle_rad if angular else errors.corner_mm
+    excess = errors.of_limit(REFUSED_MM, REFUSED_RAD)
     condition = solution.fit.condition_number
     share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * error <= limit:
+    if share < 1 and share * excess <= 1:
         misfit = (
             f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
             "numbers the ones named?"
         )
         return Adequacy(error, condition, (), True, misfit)
-    right_down_mm = solution.points_used.pixels.max(axis=0) * solution.chain.pixel_mm
-    if not angular and right_down_mm.min() < SMALLEST_IMAGE_MM:
-        return Adequacy(error, condition, (_UP_AND_DOWN.advice,), True, f"{_SHRUNK}: {_UP_AND_DOWN.advice}")
-    refused = bool(error > limit or not condition <= MAX_CONDITION)
-    missing = tuple(_missing(solution, information, weak)) if error > weak else ()
+    tied = solution.rival is not None and solution.rival.evidence < TIE
+    refused = bool(excess > 1 or not condition <= MAX_CONDITION or tied)
+    weak = errors.of_limit(WEAK_MM, WEAK_RAD) > 1
+    missing: list[Motion] = []
+    if weak or refused:
+        scale = max(1.0, errors.of_limit(WEAK_MM, WEAK_RAD) / white.of_limit(WEAK_MM, WEAK_RAD)) ** 2
+        missing = _uncertain(solution, information, scale)
+    if tied:
+        missing += [motion for motion in _telling(solution) if motion not in missing]
     where = "" if angular else " at the image's corners"
-    state = f"standard error {_size(error, angular)}{where}, condition number {condition:.3g}"
+    state = f"standard error {_size(error, angular)}{where}"
+    if not angular and errors.angle_rad / REFUSED_RAD > errors.corner_mm / REFUSED_MM:
+        state += f" and {_size(errors.angle_rad, True)}"
+    state += f", condition number {condition:.3g}"
     if missing:
-        advice = "; and ".join(missing)
-    elif solution.phantom.seen_as == "dot" and error <= weak:
+        advice = "; and ".join(motion.advice for motion in missing)
+    elif solution.phantom.seen_as == "dot" and not weak:
         # No motion would help.
         advice = "what stays unknown is where the phantom is: show more of it, all its wires"
     else:
         advice = "record more frames over a wider range"
-    if refused:
+    if tied and excess <= 1:
+        verdict = f"two answers explain the images equally well, one of them mirrored ({state}): {advice}"
+    elif refused:
         verdict = f"the motion does not determine the calibration ({state}): {advice}"
-    elif error > weak:
+    elif weak:
         verdict = f"the motion determines the calibration weakly ({state}): {advice}"
     else:
         verdict = f"the motion was sufficient ({state})"
-    return Adequacy(error, condition, missing, refused, verdict)
+    return Adequacy(error, condition, tuple(motion.advice for motion in missing), refused, verdict)
 
 
 def _size(error: float, angular: bool) -> str:
     return f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm"
 
 
-def _on_phantom(solution: ChainSolution, points: ImagePoints) -> ImagePoints:
-    """Points whose sensor is at the image and whose world is the phantom: all angles to be found are zero."""
-    return replace(points, world_from_sensor=solution.chain.target_from_image(points))
-
-
 def _information(solution: ChainSolution, near: ImagePoints) -> FloatArray:
-    """Inverse covariance that points (`_on_phantom`) bring to the free parameters."""
-    origin = np.concatenate([solution.chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-    _, jacobian = residuals_and_jacobian(origin, near, solution.phantom)
-    matrix = jacobian.reshape(-1, len(CHAIN))[:, solution.free_columns]
+    """Inverse covariance that points (`on_phantom`) bring to the free parameters, were errors independent."""
+    _, jacobian = _near_jacobian(solution, near, solution.chain.pixel_mm)
     least = _LEAST_SIGMA_RAD if solution.angular else _LEAST_SIGMA_MM
-    return np.asarray(matrix.T @ matrix / max(solution.sigma, least) ** 2)
+    return np.asarray(jacobian.T @ jacobian / max(solution.sigma, least) ** 2)
 
 
-def _standard_error(solution: ChainSolution, information: FloatArray) -> float:
-    """Standard error of the corners, mm, or of the worst angle, rad, from this information alone."""
-    covariance = np.zeros((len(CHAIN), len(CHAIN)))
-    columns = solution.free_columns
-    covariance[np.ix_(columns, columns)] = np.linalg.inv(information + np.diag(_plausible(solution)))
+def _near_jacobian(
+    solution: ChainSolution, near: ImagePoints, pixel_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    origin = np.concatenate([pixel_mm, np.zeros(len(CHAIN) - 2)])
+    residuals, jacobian = residuals_and_jacobian(origin, near, solution.phantom)
+    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, solution.free_columns]
+
+
+def _covariance(solution: ChainSolution, information: FloatArray) -> FloatArray:
+    """Covariance of `CHAIN` from this information, and what is known before."""
+    return _full(solution, np.asarray(np.linalg.inv(information + np.diag(_plausible(solution)))))
+
+
+def _full(solution: ChainSolution, covariance: FloatArray) -> FloatArray:
+    """Covariance of the free parameters among those of `CHAIN`."""
+    full = np.zeros((len(CHAIN), len(CHAIN)))
+    full[np.ix_(solution.free_columns, solution.free_columns)] = covariance
+    return full
+
+
+def _errors(solution: ChainSolution, covariance: FloatArray) -> _Errors:
+    angle = float(np.sqrt(np.linalg.eigvalsh(covariance[5:8, 5:8])[-1]))
     if solution.angular:
-        return float(np.sqrt(np.linalg.eigvalsh(covariance[5:8, 5:8])[-1]))
-    right, bottom = solution.points_used.pixels.max(axis=0)
-    corners_px = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
-    flat = np.column_stack([corners_px * solution.chain.pixel_mm, np.zeros(len(corners_px))])
-    moved = np.zeros((len(corners_px), 3, len(CHAIN)))
-    moved[:, 0, 0], moved[:, 1, 1] = corners_px.T
-    moved[:, :, 2:5] = np.eye(3)
-    moved[:, :, 7:4:-1] = -skew(flat)
-    return float(np.sqrt(np.mean(np.einsum("kip,pq,kiq->k", moved, covariance, moved))))
+        return _Errors(0.0, angle)
+    moved = corners_moved(solution.chain, solution.points_used)
+    corners = np.einsum("kip,pq,kiq->k", moved, covariance, moved)
+    return _Errors(float(np.sqrt(corners.max())), angle)
 
 
 def _plausible(solution: ChainSolution) -> FloatArray:
     """Inverse variance of each free parameter before anything is measured."""
-    sizes = dict(zip(CHAIN[:2], solution.chain.pixel_mm, strict=True))
+    size = solution.chain.pixel_mm * _UNKNOWN
+    if solution.prior is not None:
+        size = solution.prior.pixel_mm * solution.prior.error
+    known = dict(zip(CHAIN[:2], size, strict=True))
     widths = [
-        _UNKNOWN[name] * float(sizes[name])
-        if name in _UNKNOWN
-        else _UNKNOWN_MM
-        if name[0] in "xyz"
-        else _UNKNOWN_RAD
+        float(known[name]) if name in known else _UNKNOWN_MM if name[0] in "xyz" else _UNKNOWN_RAD
         for name in solution.free
     ]
     return np.array(widths) ** -2.0
 
 
-def _missing(solution: ChainSolution, information: FloatArray, enough: float) -> Iterator[str]:
-    """Motions, the most helpful first, until the answer would be certain enough."""
-    known, error = information, _standard_error(solution, information)
-    candidates = list(MOTIONS)
-    while candidates and error > enough:
-        added = [known + _imagined(solution, motion) for motion in candidates]
-        errors = [_standard_error(solution, sum_) for sum_ in added]
-        best = int(np.argmin(errors))
-        if errors[best] > 0.8 * error:
-            return
-        known, error = added[best], errors[best]
-        yield candidates.pop(best).advice
+def _uncertain(solution: ChainSolution, information: FloatArray, inflation: float) -> list[Motion]:
+    """Motions without which the answer would stay uncertain, the most helpful first.
 
-
-def _imagined(solution: ChainSolution, motion: Motion) -> FloatArray:
-    """Information of as many frames again, with the probe moved in one more way."""
-    if not motion.turns and solution.angular:
-        return np.zeros((len(solution.free), len(solution.free)))
-    near = _on_phantom(solution, solution.points_used.of_some_frames(_TRIED_FRAMES))
-    moved = _turned if motion.turns else _shifted
+    Parameters
+    ----------
+    inflation : float
+        Variance of the answer over that from independent errors of the same size.
+    """
+    near = on_phantom(solution, solution.points_used.of_some_frames(_TRIED_FRAMES))
     share = len(solution.points_used.frames) / len(near.frames) / 2.0
-    steps = [moved(solution, near, np.eye(3)[motion.axis] * sign) for sign in (-1.0, 1.0)]
-    return np.asarray(share * sum(_information(solution, step) for step in steps))
+
+    def error(motions: Sequence[Motion]) -> float:
+        more = [share * _information(solution, with_motion(solution, near, one)) for one in motions]
+        found = _errors(solution, _covariance(solution, (information + sum(more)) / inflation))
+        return found.of_limit(WEAK_MM, WEAK_RAD)
+
+    return _needed(solution, error)
 
 
-def _shifted(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
-    """The image shifted along itself, so that the same points of the phantom appear elsewhere in it."""
-    shift = RigidTransform.from_translation(_SHIFT_MM * axis)
-    pixels = near.pixels - _SHIFT_MM * axis[:2] / solution.chain.pixel_mm
-    return replace(near, pixels=pixels, world_from_sensor=near.world_from_sensor * shift)
+def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float]) -> list[Motion]:
+    """Of the motions that a scan has not, those without which its error would stay larger.
+
+    If none is absent, the one that helps most: it was there, and not far enough.
+    """
+    lacking = absent(solution)
+    least, now = error(lacking), error([])
+    without = {one: error([other for other in lacking if other is not one]) for one in lacking}
+    needed = [one for one in lacking if without[one] > max(_HELPS * least, 1.0)]
+    if needed:
+        return sorted(needed, key=lambda one: -without[one])
+    if lacking and now > _HELPS * least:
+        # Each would do.
+        return [min(lacking, key=lambda one: error([one]))]
+    some = list(extents(solution))
+    best = min(some, key=lambda one: error([one]))
+    return [best] if now > _HELPS * error([best]) else []
 
 
-def _turned(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
-    """The image turned about its dot, or about the middle of its line, which then runs elsewhere."""
-    turn = Rotation.from_rotvec(_TURN_RAD * axis)
-    seen, size = solution.phantom.seen_as, solution.chain.pixel_mm
-    if seen == "dot":
-        return _about(near, near.pixels * size, turn, near.pixels)
-    up = near.turns[:, 2] @ turn.as_matrix()
-    along = np.column_stack([-up[:, 1], up[:, 0]])
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    if seen == "direction":
-        return _about(near, np.zeros_like(near.pixels), turn, along / size)
-    ends = (near.pixels * size).reshape(-1, 2, 2)
-    middle = np.repeat(ends.mean(axis=1), 2, axis=0)
-    half = np.repeat(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / 2.0, 2)
-    sign = np.tile([-1.0, 1.0], len(ends))
-    return _about(near, middle, turn, (middle + (sign * half)[:, None] * along) / size)
+def _telling(solution: ChainSolution) -> list[Motion]:
+    """Motions that would tell a solution from its rival."""
+    if solution.rival is None:
+        return []
+    rival, points = solution.rival.chain, solution.points_used
+    near = on_phantom(solution, points.of_some_frames(_TRIED_FRAMES))
+    back = solution.chain.target_from_world.inv()
+    image = solution.chain.sensor_from_image.inv()
 
+    def agreement(motions: Sequence[Motion]) -> float:
+        sets = [near, *(with_motion(solution, near, one) for one in motions)]
+        rows, wanted = [], []
+        for one in sets:
+            poses = rival.target_from_world * back * one.world_from_sensor * image * rival.sensor_from_image
+            seen = ImagePoints(one.pixels, one.frame, poses, one.wire)
+            residuals, jacobian = _near_jacobian(solution, seen, rival.pixel_mm)
+            rows.append(jacobian)
+            wanted.append(residuals)
+        matrix, values = np.vstack(rows), np.concatenate(wanted)
+        known = np.diag(np.sqrt(_plausible(solution))) * solution.sigma
+        step = np.linalg.lstsq(np.vstack([matrix, known]), -np.append(values, np.zeros(len(known))))[0]
+        left = float(np.sqrt(np.mean((values + matrix @ step) ** 2)))
+        return solution.sigma / max(left, 1e-3 * solution.sigma)
 
-def _about(near: ImagePoints, centre_mm: FloatArray, turn: Rotation, pixels: FloatArray) -> ImagePoints:
-    centre = np.column_stack([centre_mm, np.zeros(len(centre_mm))])
-    step = RigidTransform.from_components(centre - turn.apply(centre), turn)
-    return replace(near, pixels=pixels, world_from_sensor=near.world_from_sensor * step)
+    return _needed(solution, agreement)

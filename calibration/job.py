@@ -159,6 +159,7 @@ def orientation_job(
             level,
             viewed_from,
             job.outlier_sigma,
+            lines.time_s,
         )
 
     return _finished(recording, seen, job, calibrate, "orientation")

@@ -14,10 +14,11 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.alternatives import best_solution
 from calibration.chain import ANGLES, ChainSolution, ImagePoints
 from calibration.identifiability import require_adequate
 from calibration.plane import LineDirections, settled_angles
-from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, solve_chain
+from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES
 from calibration.starts import hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -44,6 +45,7 @@ def calibrate_orientation(
     level: bool = False,
     viewed_from: Viewed = "above",
     outlier_sigma: float = OUTLIER_SIGMA,
+    time_s: FloatArray | None = None,
 ) -> ChainSolution:
     """Calibrate an orientation sensor: find the rotation ``sensor_from_image`` from lines of a plane.
 
@@ -61,6 +63,8 @@ def calibrate_orientation(
     viewed_from : str
         ``"above"``: on average the beam points down, as over the floor of a water bath; ``"below"``: up. It
         tells the image from its in-plane mirror, which the lines alone cannot.
+    time_s : ndarray, shape (m,), optional
+        Of each line; without it, frames are taken to be evenly spaced.
 
     Raises
     ------
@@ -75,9 +79,10 @@ def calibrate_orientation(
     size = np.array([float(pixel_mm[0] / pixel_mm[1]), 1.0])
     normals = hemisphere()
     normals = normals[:1] if level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
-    lines = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor))
-    start = settled_angles(lines.of_some_frames(SOME_FRAMES), size[0], normals, level=level)
-    best = require_adequate(solve_chain(lines, LineDirections(size, level), start, ANGLES, outlier_sigma))
+    lines = ImagePoints(directions_px, frame, RigidTransform.from_rotation(world_from_sensor), time_s=time_s)
+    starts = settled_angles(lines.of_some_frames(SOME_FRAMES), size[0], normals, level=level)
+    found = best_solution(lines, LineDirections(size, level), starts, ANGLES, outlier_sigma)
+    best = require_adequate(found)
     _require_floor(best)
     return upright(best, viewed_from)
 

@@ -14,7 +14,17 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ANGLES, POSE, PROBE, Chain, ChainSolution, ImagePoints, SeenAs, as_directions
+from calibration.alternatives import apart, best_solution
+from calibration.chain import (
+    ANGLES,
+    PROBE,
+    Chain,
+    ChainSolution,
+    ImagePoints,
+    PixelPrior,
+    SeenAs,
+    as_directions,
+)
 from calibration.identifiability import judge, require_adequate
 from calibration.solver import (
     OUTLIER_SIGMA,
@@ -22,12 +32,10 @@ from calibration.solver import (
     first_guess,
     probe_parameters,
     residuals_of,
-    sigma_of,
-    solve_chain,
 )
 from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
@@ -35,8 +43,13 @@ _FEWEST_LINES = 6
 _PIXEL_MM = 0.15
 """Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
-_SAME = 0.02
-"""Two starts that settle at residuals as close as this share have found the same; no more are tried."""
+_HOPELESS = 3.0
+"""Ends of iterations whose mean absolute residual is as many times the least are not looked at again."""
+PIXEL_ERROR = 0.02
+"""Standard error of a pixel size from a scanner's calipers, as a share of it: of distances they show."""
+_CONTRADICTS = 3.0
+"""Standard errors by which lines must move the pixel size given for it to be doubted."""
+
 Stages = Literal["three", "one"]
 
 
@@ -90,6 +103,7 @@ def calibrate_plane(
     fit_pixels: bool = True,
     stages: Stages = "three",
     outlier_sigma: float = OUTLIER_SIGMA,
+    pixel_error: float = PIXEL_ERROR,
 ) -> ChainSolution:
     """Calibrate a 6-DOF sensor from lines of a plane: the floor of a water bath, or the Cambridge phantom.
 
@@ -104,58 +118,87 @@ def calibrate_plane(
     stages : str
         ``"three"``: angles from line directions, then distances, then all. ``"one"``: all at once, from
         several mountings.
+    pixel_error : float
+        Standard error of the pixel size given, as a share of it; infinite if it is a guess.
 
     Raises
     ------
     InsufficientDataError
-        If there are too few lines, they contradict each other, or the motion does not determine the answer;
-        then the missing motion is named.
+        If there are too few lines, they contradict each other or the pixel size, or the motion does not
+        determine the answer; then the missing motions are named.
     """
     if len(lines) < 2 * _FEWEST_LINES:
         raise InsufficientDataError(
             f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
         )
+    if not pixel_error > 0:
+        raise InvalidInputError(f"pixel_error: expected a positive share, got {pixel_error:g}")
     probe, held = probe_parameters(fit_pixels, pixel_mm)
-    start = _three_stages(lines, held) if stages == "three" else _one_stage(lines, held, probe)
-    solution = solve_chain(lines, Plane(), start, probe, outlier_sigma)
-    if fit_pixels and judge(solution).refused:
-        size = np.full(2, _PIXEL_MM) if pixel_mm is None else np.asarray(pixel_mm, dtype=float)
-        solution = _from_plausible_pixels(lines, size, outlier_sigma)
+    prior = None
+    if fit_pixels and pixel_mm is not None and np.isfinite(pixel_error):
+        prior = PixelPrior(np.asarray(pixel_mm, dtype=float), pixel_error)
+    solution = _solved(lines, held, prior, stages, probe, outlier_sigma)
+    if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
+        solution = _without_prior(lines, solution, stages, outlier_sigma)
     return facing_up(require_adequate(solution))
 
 
-def _from_plausible_pixels(lines: ImagePoints, pixel_mm: FloatArray, outlier_sigma: float) -> ChainSolution:
-    """Solve again with the pixels held at first: free ones may shrink to nothing where the motion is poor.
+def _solved(
+    lines: ImagePoints,
+    held: FloatArray | None,
+    prior: PixelPrior | None,
+    stages: Stages,
+    probe: tuple[str, ...],
+    outlier_sigma: float,
+) -> ChainSolution:
+    if stages == "one":
+        given = held if prior is None else prior.pixel_mm
+        starts = _one_stage(lines, given)
+    elif held is not None or prior is not None:
+        starts = [_three_stages(lines, held if prior is None else prior.pixel_mm)]
+    else:
+        starts = [_three_stages(lines, size) for size in (None, np.full(2, _PIXEL_MM))]
+    return best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
 
-    If they shrink again, the solution with held pixels is returned as if they were free, for `judge`.
+
+def _without_prior(
+    lines: ImagePoints, solution: ChainSolution, stages: Stages, outlier_sigma: float
+) -> ChainSolution:
+    """Believe lines that contradict the pixel size given if they determine it by themselves.
+
+    Raises
+    ------
+    InsufficientDataError
+        If they do not.
     """
-    start = _three_stages(lines, pixel_mm)
-    held = solve_chain(lines, Plane(), start, POSE, outlier_sigma)
-    again = solve_chain(lines, Plane(), held.chain, PROBE, outlier_sigma)
-    if not judge(again).refused:
-        return again
-    shown = replace(held, free=again.free, fit=again.fit)
-    return shown if judge(shown).refused else again
+    alone = _solved(lines, None, None, stages, PROBE, outlier_sigma)
+    verdict = judge(alone)
+    if not verdict.refused:
+        return alone
+    if judge(solution).refused or solution.prior is None:
+        return solution
+    given, found = solution.prior.pixel_mm, solution.chain.pixel_mm
+    raise InsufficientDataError(
+        f"expected lines that agree with pixels of {given[0]:.4g} x {given[1]:.4g} mm to "
+        f"{100 * solution.prior.error:g} %, got {found[0]:.4g} x {found[1]:.4g} mm with them, and without "
+        f"them {verdict.verdict}"
+    )
 
 
 def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
     """The first two stages: angles from some directions, then distances. The caller refines all together."""
     directions = as_directions(lines.of_some_frames(SOME_FRAMES))
-    chain = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
-    return _with_distances(lines, chain, pixel_mm)
+    found = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
+    return _with_distances(lines, found[0], pixel_mm)
 
 
-def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None, probe: tuple[str, ...]) -> Chain:
-    """The best solution for all parameters at once of some lines, from several mountings."""
+def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:
+    """Starts of all parameters at once, from several mountings."""
     few = lines.of_some_frames(SOME_FRAMES)
     directions = as_directions(few)
     turns = directions.world_from_sensor.rotation
     starts = angle_starts(directions.pixels, turns, _ratio(pixel_mm), hemisphere())
-    settled = [
-        solve_chain(few, Plane(), _with_distances(few, start, pixel_mm), probe, outlier_sigma=np.inf)
-        for start in starts
-    ]
-    return min(settled, key=lambda solution: solution.sigma).chain
+    return [_with_distances(few, start, pixel_mm) for start in starts]
 
 
 def _ratio(pixel_mm: FloatArray | None) -> float:
@@ -172,28 +215,34 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
 
 def settled_angles(
     lines: ImagePoints, ratio: float, normals: FloatArray, fit_ratio: bool = False, level: bool = False
-) -> Chain:
+) -> list[Chain]:
     """First stage: find the angles that make line directions lie in the plane, robustly.
 
     Parameters
     ----------
     lines : ImagePoints
         With directions for pixels (`as_directions`).
+
+    Returns
+    -------
+    list of Chain
+        Where iterations end, the one that leaves least first; those that leave more than the best by a
+        factor of `_HOPELESS` are left out.
     """
     phantom = LineDirections(np.array([ratio, 1.0]), level)
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
-    best, least = None, np.inf
-    for start in angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals):
-        chain = first_guess(lines, phantom, start, free)
-        sigma = sigma_of(residuals_of(lines, phantom, chain))
-        agreed = abs(sigma - least) < _SAME * least
-        if sigma < least:
-            best, least = chain, sigma
-        if agreed:
-            break
-    if best is None:
+    starts = angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals)
+    settled = [first_guess(lines, phantom, start, free) for start in starts]
+    if not settled:
         raise InsufficientDataError("expected line directions that are finite, got others")
-    return best
+    left = [float(np.abs(residuals_of(lines, phantom, chain)).mean()) for chain in settled]
+    order = sorted(range(len(left)), key=lambda k: left[k])
+    found: list[Chain] = []
+    for k in order:
+        near = any(not apart(other, settled[k], lines, phantom) for other in found)
+        if not near and left[k] <= _HOPELESS * left[order[0]]:
+            found.append(settled[k])
+    return found
 
 
 def facing_up(solution: ChainSolution) -> ChainSolution:

@@ -6,7 +6,6 @@ frames that contradict the others are left out.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from functools import lru_cache
 
@@ -20,10 +19,14 @@ from calibration.chain import (
     ChainSolution,
     ImagePoints,
     Phantom,
+    PixelPrior,
     free_jacobian,
+    moved_to,
+    on_image,
     residuals_and_jacobian,
-    sensor_error,
 )
+from calibration.profile import widened
+from calibration.wandering import settle
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import (
@@ -33,7 +36,6 @@ from speckle3d.core.leastsquares import (
     levenberg_marquardt,
     robust_sigma,
 )
-from speckle3d.core.wander import JITTER, WanderingFit, wandering_fit
 
 SOME_FRAMES = 100
 """Number of frames that choose among starting points; the answer is refined from all frames afterwards."""
@@ -47,8 +49,6 @@ _NEARLY_ABSOLUTE = 0.06745
 _REWEIGHTINGS = 8
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
-_WANDERING_STEPS = 2
-"""The first finds the answer, the second its covariance there."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -61,6 +61,7 @@ def solve_chain(
     start: Chain,
     probe: tuple[str, ...] = PROBE,
     outlier_sigma: float = OUTLIER_SIGMA,
+    prior: PixelPrior | None = None,
 ) -> ChainSolution:
     """Refine a chain until the phantom's residuals are least, leaving out frames that contradict the others.
 
@@ -74,6 +75,8 @@ def solve_chain(
         Which of `PROBE` to estimate; all that the phantom determines of `TARGET` are estimated besides.
     outlier_sigma : float
         Frames whose largest residual exceeds so many robust standard deviations are dropped.
+    prior : PixelPrior, optional
+        Counts as further residuals where the pixel size is estimated.
 
     Raises
     ------
@@ -81,24 +84,14 @@ def solve_chain(
         If there are too few points, or fewer than half of them agree.
     """
     free = (*probe, *phantom.determined)
-    chain = first_guess(points, phantom, start, free)
+    prior = prior if "s_x" in free else None
+    chain, used = agreed(points, phantom, start, free, outlier_sigma, prior)
+    chain, noise = settle(points[used], phantom, chain, free, prior)
+    noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
-    used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
-    for round_ in itertools.count():
-        _require_majority(used, points)
-        chain, _, _ = refined(points[used], phantom, chain, free)
-        residuals = residuals_of(points, phantom, chain)
-        sigma = sigma_of(residuals[used])
-        agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma)
-        if round_ >= _FREE_ROUNDS:
-            agreeing &= used
-        if (agreeing == used).all():
-            break
-        used = agreeing
-    chain, noise = _with_wandering_errors(points[used], phantom, chain, free)
-    residuals = residuals_of(points, phantom, chain)
+    sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit, _ = refined(points[used], phantom, chain, free)
+    _, fit, _ = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
     return ChainSolution(
         chain,
         phantom,
@@ -108,45 +101,36 @@ def solve_chain(
         points,
         used,
         residuals,
-        sigma_of(residuals[used]),
+        sigma,
         condition_number(free_jacobian(points[used], phantom, chain, free)),
+        prior,
     )
 
 
-def _with_wandering_errors(
-    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
-) -> tuple[Chain, WanderingFit]:
-    """Steps from a least-squares solution to the one that knows that the sensor's errors wander."""
-    for _ in range(_WANDERING_STEPS):
-        noise = wandering_noise(points, phantom, chain, free)
-        chain = moved_by(chain, free, noise.step)
-    return chain, noise
-
-
-def wandering_noise(
+def agreed(
     points: ImagePoints,
     phantom: Phantom,
-    chain: Chain,
+    start: Chain,
     free: tuple[str, ...],
-    more: FloatArray | None = None,
-) -> WanderingFit:
-    """One step of least squares that knows that the sensor's errors wander, and its covariance.
-
-    Parameters
-    ----------
-    more : ndarray, shape (n r, k), optional
-        Derivatives of the residuals by further parameters, which come after the free ones.
-    """
-    residuals, jacobian = near_jacobian(points, phantom, chain, free)
-    several = residuals.size // len(points)
-    return wandering_fit(
-        jacobian if more is None else np.column_stack([jacobian, more]),
-        residuals,
-        np.repeat(points.frame, several),
-        np.repeat(points.times, several),
-        sensor_error(points, phantom, chain),
-        (0.0,) if residuals.size == len(points.frames) else JITTER,
-    )
+    outlier_sigma: float,
+    prior: PixelPrior | None = None,
+) -> tuple[Chain, BoolArray]:
+    """Least squares of the frames that do not contradict the others, and which points those are."""
+    chain = first_guess(points, phantom, start, free, prior)
+    residuals = residuals_of(points, phantom, chain)
+    used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
+    round_ = 0
+    while True:
+        _require_majority(used, points)
+        sigma = sigma_of(residuals[used])
+        chain, _, _ = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
+        residuals = residuals_of(points, phantom, chain)
+        agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals[used]))
+        if round_ >= _FREE_ROUNDS:
+            agreeing &= used
+        if (agreeing == used).all():
+            return chain, used
+        used, round_ = agreeing, round_ + 1
 
 
 def sigma_of(residuals: FloatArray) -> float:
@@ -171,7 +155,13 @@ def probe_parameters(
     return POSE, np.asarray(pixel_mm, dtype=float)
 
 
-def first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
+def first_guess(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    free: tuple[str, ...],
+    prior: PixelPrior | None = None,
+) -> Chain:
     """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
     chain, before = start, np.inf
     for _ in range(_REWEIGHTINGS):
@@ -179,8 +169,11 @@ def first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple
         if size.mean() > _SETTLED * before:
             break
         before = size.mean()
-        weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
-        chain, _, _ = refined(points, phantom, chain, free, weights, tolerance=1e-3)
+        sigma = sigma_of(size)
+        weights = np.sqrt(huber_weights(size / sigma, _NEARLY_ABSOLUTE))
+        # A prior weighs as much against the residuals as they weigh on average.
+        fair = sigma * float(np.sqrt(np.mean(weights**2)))
+        chain, _, _ = refined(points, phantom, chain, free, weights, 1e-3, prior, fair)
     return chain
 
 
@@ -196,14 +189,17 @@ def refined(
     free: tuple[str, ...],
     weights: FloatArray | None = None,
     tolerance: float = 1e-9,
+    prior: PixelPrior | None = None,
+    sigma: float = 1.0,
 ) -> tuple[Chain, Fit, FloatArray]:
     """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
 
-    There all angles start at zero: far from where fixed angles become singular, and well scaled.
+    There all angles start at zero: far from where fixed angles become singular, and well scaled. The prior's
+    deviations are weighed against residuals of standard deviation `sigma`, and follow them in the fit.
     """
     near = replace(points, world_from_sensor=chain.target_from_image(points))
     columns = np.array([CHAIN.index(name) for name in free])
-    origin = _origin(chain)
+    origin = on_image(chain)
     scale = 1.0 if weights is None else weights
 
     @lru_cache(maxsize=2)
@@ -212,7 +208,11 @@ def refined(
         full[columns] = np.frombuffer(x)
         values, jacobian = residuals_and_jacobian(full, near, phantom)
         kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
-        return (values * scale).ravel(), kept.reshape(-1, len(columns))
+        kept, values = kept.reshape(-1, len(columns)), (values * scale).ravel()
+        if prior is None:
+            return values, kept
+        extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
+        return np.append(values, sigma * prior.deviation(full[:2])), np.vstack([kept, extra])
 
     def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         return at(x.tobytes())
@@ -222,37 +222,7 @@ def refined(
     )
     found = origin.copy()
     found[columns] = fit.parameters
-    return _moved_to(chain, found), fit, both(fit.parameters)[1]
-
-
-def near_jacobian(
-    points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals, shape (n r,), and Jacobian, (n r, p), in frames that lie on the image and on the phantom."""
-    near = replace(points, world_from_sensor=chain.target_from_image(points))
-    residuals, jacobian = residuals_and_jacobian(_origin(chain), near, phantom)
-    columns = [CHAIN.index(name) for name in free]
-    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
-
-
-def moved_by(chain: Chain, free: tuple[str, ...], step: FloatArray) -> Chain:
-    """Add a step in the free parameters, in frames that lie on the image and on the phantom."""
-    parameters = _origin(chain)
-    parameters[[CHAIN.index(name) for name in free]] += step
-    return _moved_to(chain, parameters)
-
-
-def _origin(chain: Chain) -> FloatArray:
-    return np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-
-
-def _moved_to(chain: Chain, parameters: FloatArray) -> Chain:
-    step = Chain.from_parameters(parameters)
-    return Chain(
-        step.pixel_mm,
-        chain.sensor_from_image * step.sensor_from_image,
-        step.target_from_world * chain.target_from_world,
-    )
+    return moved_to(chain, found), fit, both(fit.parameters)[1]
 
 
 def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:

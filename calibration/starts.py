@@ -66,7 +66,7 @@ def rotations_all_over() -> Rotation:
 
 
 def angle_starts(
-    directions_px: FloatArray, world_from_sensor: Rotation, ratio: float, normals: FloatArray, keep: int = 4
+    directions_px: FloatArray, world_from_sensor: Rotation, ratio: float, normals: FloatArray, keep: int = 12
 ) -> list[Chain]:
     """Try mountings of the sensor and normals of the plane all over, and keep the best; no distances.
 

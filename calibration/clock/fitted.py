@@ -12,14 +12,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ChainSolution, ImagePoints, as_directions
+from calibration.chain import Chain, ChainSolution, ImagePoints, as_directions
 from calibration.clock.offset import ClockOffset, covered, delays_around, require_peak
 from calibration.clock.smoothing import smooth
-from calibration.solver import SOME_FRAMES, first_guess, moved_by, residuals_of, sigma_of, wandering_noise
+from calibration.solver import SOME_FRAMES, first_guess, residuals_of, sigma_of
+from calibration.wandering import settle
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.wander import WanderingFit
 
 STEP_S = 0.02
 """Steps of the offsets tried first: half a frame at 25 frames/s, in which no hand reverses."""
@@ -30,7 +30,7 @@ _ANEW = 10
 _ROUNDS = 2
 """The second leaves out the frames that contradict the others at the offset that the first one found."""
 _MOST_STEPS = 10
-_SETTLED = 0.02
+_SETTLED = 0.1
 """Steps end when one is below this share of the standard error."""
 _DERIVATIVE_S = 1e-3
 
@@ -78,11 +78,9 @@ def estimate_offset(
         require_peak(tried, misfit, best)
     for _ in range(_ROUNDS):
         solution = calibrate(points_at(seconds))
-        chain = solution.chain
         for _ in range(_MOST_STEPS):
-            joint = _joint_fit(replace(solution, chain=chain), points_at, seconds)
-            step, error = float(joint.step[-1]), float(np.sqrt(joint.covariance[-1, -1]))
-            chain = moved_by(chain, solution.free, joint.step[:-1])
+            chain, step, covariance = _joint_fit(solution, points_at, seconds)
+            solution, error = replace(solution, chain=chain), float(np.sqrt(covariance[-1, -1]))
             seconds += float(np.clip(step, -STEP_S, STEP_S))
             if not abs(seconds - around_s) < search_s - STEP_S:
                 raise InsufficientDataError(
@@ -100,10 +98,10 @@ def with_uncertain_offset(
     """Return a solution whose covariance includes that of the clock offset it was made with."""
     there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
     shown = replace(solution, points=solution.points[there], used=solution.used[there])
-    joint = _joint_fit(shown, _Reader(shown.points, smooth(readings)).at, seconds)
-    kept = slice(len(solution.free))
-    noise = replace(joint, step=joint.step[kept], covariance=joint.covariance[kept, kept])
-    return replace(solution, noise=noise)
+    _, _, joint = _joint_fit(shown, _Reader(shown.points, smooth(readings)).at, seconds)
+    along, variance = joint[:-1, -1], joint[-1, -1]
+    covariance = solution.covariance + np.outer(along, along) / variance
+    return replace(solution, noise=replace(solution.noise, covariance=covariance))
 
 
 class _Reader:
@@ -121,17 +119,21 @@ class _Reader:
 
 def _joint_fit(
     solution: ChainSolution, points_at: Callable[[float], ImagePoints], seconds: float
-) -> WanderingFit:
-    """Step and covariance of the free parameters and, last, of the offset, s, all solved for together."""
-    used = solution.used
+) -> tuple[Chain, float, FloatArray]:
+    """Solve for chain and offset together: the chain, the offset's step, s, and their covariance.
+
+    The covariance is that of the free parameters, in frames that lie on the image and on the phantom, and of
+    the offset after them.
+    """
+    used, phantom, chain = solution.used, solution.phantom, solution.chain
     here, later, sooner = (
         _as_seen(solution, points_at(at))[used]
         for at in (seconds, seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
     )
-    change = residuals_of(later, solution.phantom, solution.chain)
-    change = change - residuals_of(sooner, solution.phantom, solution.chain)
+    change = residuals_of(later, phantom, chain) - residuals_of(sooner, phantom, chain)
     column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
-    return wandering_noise(here, solution.phantom, solution.chain, solution.free, column)
+    found, noise = settle(here, phantom, chain, solution.free, solution.prior, column)
+    return found, float(noise.step[-1]), noise.covariance
 
 
 def _as_seen(solution: ChainSolution, points: ImagePoints) -> ImagePoints:
@@ -160,7 +162,7 @@ def _sigmas(
             chain = solution.chain
             for number in side:
                 points = _as_seen(solution, some[number])
-                chain = first_guess(points, solution.phantom, chain, solution.free)
+                chain = first_guess(points, solution.phantom, chain, solution.free, solution.prior)
                 sigmas[number] = sigma_of(residuals_of(points, solution.phantom, chain))
     return sigmas
 

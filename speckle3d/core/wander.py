@@ -30,12 +30,18 @@ WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 JITTER = (0.0, 0.5, 1.5)
 """Sizes tried of the error that is new in every frame and moves all its residuals together."""
 
+STEADY = 0.25
+"""Probability, before anything is measured, that nothing wanders."""
+
 _TIMES = 4
 """Time constants tried, evenly spaced in logarithm."""
 
 _SHORTEST, _LONGEST = 4.0, 2.0
 """Shortest and longest time constant tried: four frames, of which fewer look like white noise; twice the
 recording, which looks like a straight line."""
+
+_SINGULAR = 1e-15
+"""Ratio of eigenvalues below which a direction counts as not determined."""
 
 _SMALLEST = 1e-12
 """Residuals below are rounding: nothing wanders in them."""
@@ -73,6 +79,8 @@ class WanderingFit:
         Root mean square effect of the wandering error on a residual, in the residuals' unit.
     time_s : float
         Its time constant, in the unit of the times given; NaN where nothing wanders.
+    spread : ndarray, shape (k,)
+        Variances of the components of the sensor's error in a frame, wandering and jitter together.
     """
 
     step: FloatArray
@@ -80,6 +88,7 @@ class WanderingFit:
     white: float
     wander: float
     time_s: float
+    spread: FloatArray
 
 
 @dataclass(frozen=True)
@@ -91,6 +100,7 @@ class _Grid:
     time_s: FloatArray
     unit: FloatArray
     """Variance of each component of the error whose root mean square effect is one, shape (g, k)."""
+    prior: FloatArray
 
 
 def wandering_fit(
@@ -101,6 +111,7 @@ def wandering_fit(
     error: SensorError,
     jitter: Sequence[float] = JITTER,
     prior: FloatArray | None = None,
+    excess: FloatArray | None = None,
 ) -> WanderingFit:
     """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
 
@@ -117,8 +128,9 @@ def wandering_fit(
         Sizes of the error that is new in each frame to try (`JITTER`); zero alone where a frame has one
         residual.
     prior : ndarray, shape (p, p), optional
-        Inverse covariance of what is known of the parameters besides, in the units of the parameters, about
-        the present ones.
+        Inverse covariance of what is known of the parameters besides, in the units of the parameters.
+    excess : ndarray, shape (p,), optional
+        By how much the present parameters exceed what is known; by default not at all.
 
     Raises
     ------
@@ -137,14 +149,16 @@ def wandering_fit(
     normal, log_determinant = _innovations(columns, error.effects, starts, time_s, grid)
     matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
     free = max(len(residuals) - len(scale), 1)
-    inverse = np.linalg.pinv(matrix, rcond=1e-15, hermitian=True)
+    inverse = np.linalg.pinv(matrix, rcond=_SINGULAR, hermitian=True)
     left = np.maximum(energy - np.einsum("gi,gij,gj->g", pull, inverse, pull), 0.0)
     variance = np.maximum(left / free, _SMALLEST**2)
-    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=1e-15, hermitian=True)
-    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None])
-    _, volume = np.linalg.slogdet(matrix)
+    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=_SINGULAR, hermitian=True)
+    back = np.zeros(len(scale)) if excess is None else known @ (excess * scale)
+    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
+    sizes = np.linalg.eigvalsh(matrix)
+    volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
-    weight = np.exp(likelihood - likelihood.max())
+    weight = grid.prior * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
     step = weight @ steps
     apart = steps - step
@@ -157,7 +171,38 @@ def wandering_fit(
         float(np.sqrt(weight @ variance)),
         float(np.sqrt(weight @ (variance * grid.wander**2))),
         time,
+        (weight * variance * (grid.wander**2 + grid.jitter**2)) @ grid.unit,
     )
+
+
+def attributed(
+    residuals: FloatArray, group: IntArray, error: SensorError, fit: WanderingFit
+) -> tuple[FloatArray, FloatArray]:
+    """Divide residuals between the sensor and the image, each frame by itself: their expected errors.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (m,)
+    group : ndarray of int, shape (m,)
+        Frame of each residual, ascending.
+
+    Returns
+    -------
+    sensor : ndarray, shape (m, k)
+        Error of the sensor in the frame of each residual.
+    image : ndarray, shape (m,)
+        What is left for the image.
+    """
+    sensor, image = np.zeros_like(error.effects), np.zeros_like(residuals)
+    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+    least = max(fit.white, _SMALLEST) ** 2
+    for first, last in zip(starts, [*starts[1:], len(group)], strict=True):
+        effect = error.effects[first:last]
+        total = (effect * fit.spread) @ effect.T + least * np.eye(last - first)
+        pull = np.linalg.solve(total, residuals[first:last])
+        sensor[first:last] = fit.spread * (pull @ effect)
+        image[first:last] = least * pull
+    return sensor, image
 
 
 def _grid(error: SensorError, frame_time_s: FloatArray, jitter: Sequence[float]) -> _Grid:
@@ -176,13 +221,10 @@ def _grid(error: SensorError, frame_time_s: FloatArray, jitter: Sequence[float])
         for time in (times if wander > 0 else times[:1])
         for unit in (units if wander > 0 or shake > 0 else units[:1])
     ]
-    # A size of zero stands for one time and one proportion; its prior is that of all of them.
-    return _Grid(
-        np.array([row[0] for row in rows]),
-        np.array([row[1] for row in rows]),
-        np.array([row[2] for row in rows]),
-        np.array([row[3] for row in rows]),
-    )
+    wander, shake, time, unit = (np.array(column) for column in zip(*rows, strict=True))
+    still = wander == 0
+    prior = np.where(still, STEADY / still.sum(), (1.0 - STEADY) / np.maximum((~still).sum(), 1))
+    return _Grid(wander, shake, time, unit, prior)
 
 
 def _innovations(

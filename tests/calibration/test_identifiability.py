@@ -8,7 +8,8 @@ from calibration_examples import BEAM_DOWN, COLUMNS, PIXEL_MM, TRIAL_1, about, s
 from scipy.spatial.transform import RigidTransform
 
 from calibration.chain import ImagePoints
-from calibration.identifiability import MOTIONS, REFUSED_MM, WEAK_MM, judge, require_adequate
+from calibration.identifiability import REFUSED_MM, WEAK_MM, judge, require_adequate
+from calibration.motions import MOTIONS
 from calibration.orientation import calibrate_orientation
 from calibration.plane import Plane, calibrate_plane
 from calibration.solver import solve_chain

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import CHAIN, PROBE, TARGET, Chain, ImagePoints, free_jacobian, residuals_and_jacobian
-from calibration.identifiability import MOTIONS
+from calibration.motions import MOTIONS
 from calibration.plane import Plane, calibrate_plane
 from calibration.solver import solve_chain
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError

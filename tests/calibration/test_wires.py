@@ -9,7 +9,7 @@ from calibration_examples import PIXEL_MM, TRIAL_1, centre_of, scan_wires
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import ImagePoints
-from calibration.identifiability import MOTIONS
+from calibration.motions import MOTIONS
 from calibration.solver import OUTLIER_SIGMA
 from calibration.wires import calibrate_cross_wire, calibrate_wires
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
