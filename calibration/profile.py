@@ -75,7 +75,10 @@ def widened(
 
 
 class _Rise:
-    """Rise of the sum of squares with one displacement held and all else solved for."""
+    """Rise of the sum of squares with one displacement held and all else solved for.
+
+    That of images that agree with the answer: its derivative there is zero, whatever the errors are.
+    """
 
     def __init__(
         self,
@@ -96,12 +99,11 @@ class _Rise:
             return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
 
         self._at, self._step = at, step
-        residuals, jacobian = at(np.zeros(len(free)))
+        self._here, jacobian = at(np.zeros(len(free)))
         scale = np.linalg.norm(jacobian, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         # All directions but the one held, in the unit of each parameter.
         self._others = np.linalg.svd((step * scale)[None])[2][1:].T / scale[:, None]
-        self._least = float(residuals @ residuals)
         pushed = jacobian @ step
         left = pushed - jacobian @ self._others @ np.linalg.lstsq(jacobian @ self._others, pushed)[0]
         self.promised = float(left @ left)
@@ -111,13 +113,13 @@ class _Rise:
         """Rise at so many standard errors."""
 
         def residuals(y: FloatArray) -> FloatArray:
-            return self._at(errors * self._step + self._others @ y)[0]
+            return self._at(errors * self._step + self._others @ y)[0] - self._here
 
         def jacobian(y: FloatArray) -> FloatArray:
             return self._at(errors * self._step + self._others @ y)[1] @ self._others
 
         fit = levenberg_marquardt(residuals, np.zeros(self._others.shape[1]), jacobian, tolerance=_TOLERANCE)
-        return float(fit.residuals @ fit.residuals) - self._least
+        return float(fit.residuals @ fit.residuals)
 
 
 def _reach(rise: _Rise, sign: float) -> float:

@@ -38,7 +38,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a trial ended with: angle wrong and claimed, degrees; errors over claims; or why it was refused."""
+    """What a trial ended with: angle wrong and claimed; errors over claims; or why it was refused."""
 
     below_level_deg: float
     wrong_deg: float = 0.0
