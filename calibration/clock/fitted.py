@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.chain import Chain, ChainSolution, ImagePoints, as_directions
 from calibration.clock.offset import ClockOffset, covered, delays_around, require_peak
 from calibration.clock.smoothing import smooth
+from calibration.identifiability import InadequateError
 from calibration.solver import SOME_FRAMES, first_guess, residuals_of, sigma_of
 from calibration.wandering import settle
 from speckle3d.core.arrays import FloatArray
@@ -24,11 +25,12 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 STEP_S = 0.02
 """Steps of the offsets tried first: half a frame at 25 frames/s, in which no hand reverses."""
 
-_ANEW = 10
+_ANEW = 15
 """Of so many offsets tried, one gets a calibration from nothing; others begin from the one beside them."""
 
-_ROUNDS = 2
-"""The second leaves out the frames that contradict the others at the offset that the first one found."""
+_ROUNDS = 3
+"""The next one leaves out the frames that contradict the others at the offset that was found, if it is not
+the one that the round began with."""
 _MOST_STEPS = 10
 _SETTLED = 0.1
 """Steps end when one is below this share of the standard error."""
@@ -77,7 +79,7 @@ def estimate_offset(
     if 0 < best < len(tried) - 1:
         require_peak(tried, misfit, best)
     for _ in range(_ROUNDS):
-        solution = calibrate(points_at(seconds))
+        begun, solution = seconds, _adequate_or_not(calibrate, points_at(seconds))
         for _ in range(_MOST_STEPS):
             chain, step, covariance = _joint_fit(solution, points_at, seconds)
             solution, error = replace(solution, chain=chain), float(np.sqrt(covariance[-1, -1]))
@@ -89,6 +91,8 @@ def estimate_offset(
                 )
             if abs(step) < _SETTLED * error:
                 break
+        if abs(seconds - begun) < STEP_S:
+            break
     return ClockOffset(seconds, error)
 
 
@@ -168,10 +172,7 @@ def _sigmas(
 
 
 def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolution]:
-    """Calibrations from nothing at some of the offsets; at all, until there is one, if those fail.
-
-    At a wrong offset a motion may seem to determine nothing, for its residuals are large.
-    """
+    """Calibrations from nothing at some of the offsets; at all, until there is one, if those fail."""
     first = list(range(len(some) // 2 % _ANEW, len(some), _ANEW))
     found: dict[int, ChainSolution] = {}
     refusal: InsufficientDataError | None = None
@@ -179,7 +180,7 @@ def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolut
         if found and number not in first:
             break
         try:
-            found[number] = calibrate(some[number])
+            found[number] = _adequate_or_not(calibrate, some[number])
         except InsufficientDataError as error:
             refusal = error
     if not found:
@@ -187,3 +188,11 @@ def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolut
             f"expected a clock offset that gives a calibration, got none among {len(some)} tried: {refusal}"
         )
     return found
+
+
+def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> ChainSolution:
+    """Calibrate, whatever the motion: at a wrong offset it may seem to determine too little."""
+    try:
+        return calibrate(points)
+    except InadequateError as refused:
+        return refused.solution

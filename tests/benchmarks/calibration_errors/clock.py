@@ -155,38 +155,34 @@ class Hand:
     """Poses of an image over a floor at z = 0, as a function of time."""
 
     def __init__(self, rng: np.random.Generator, last_s: float) -> None:
-        reach = np.array(
-            [
-                *np.deg2rad([rng.uniform(15, 35), rng.uniform(10, 25), rng.uniform(30, 80)]),
-                rng.uniform(6, 12),
-                *rng.uniform(10, 60, 2),
-            ]
-        )
-        frequency = 1.0 / rng.uniform(1.5, 8.0, (6, 5))
-        share = rng.standard_normal((6, 5))
-        share *= 0.9 * reach[:, None] / np.linalg.norm(share, axis=1, keepdims=True)
-        tremor = 0.15 * rng.standard_normal((6, 2)) * np.array([0.003, 0.003, 0.003, 1.0, 1.0, 1.0])[:, None]
-        self._frequency = np.hstack([frequency, rng.uniform(5.0, 10.0, (6, 2))])
-        self._share = np.hstack([share, tremor])
-        self._phase = rng.uniform(0.0, 2.0 * np.pi, self._share.shape)
-        self._in_turn = bool(rng.integers(2))
-        self._last_s = last_s
-        self._order = rng.permutation(6)
+        turns = np.deg2rad([rng.uniform(20, 35), rng.uniform(12, 25), rng.uniform(30, 80)])
+        reach = np.array([*turns, rng.uniform(6, 12), *rng.uniform(10, 60, 2)])
+        self._frequency = 1.0 / rng.uniform(1.5, 8.0, (6, 5))
+        self._share = rng.uniform(0.3, 1.0, (6, 5))
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, (6, 5))
+        self._tremor_hz, self._tremor_phase = rng.uniform(5.0, 10.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
+        self._tremor = np.array([*np.deg2rad([0.03] * 3), *[0.15] * 3]) * rng.standard_normal(6)
+        self._in_turn, self._order, self._last_s = bool(rng.integers(2)), rng.permutation(6), last_s
         self._height_mm = rng.uniform(25.0, 45.0)
+        widest = np.abs(self._swing(np.linspace(0.0, last_s, 1000))).max(axis=1)
+        self._share *= (reach / widest)[:, None]
 
-    def at(self, time_s: np.ndarray) -> RigidTransform:
-        """Pose of the image."""
+    def _swing(self, time_s: np.ndarray) -> np.ndarray:
         cycle = 2.0 * np.pi * self._frequency[..., None] * time_s + self._phase[..., None]
         x = np.einsum("ij,ijt->it", self._share, np.sin(cycle))
         if self._in_turn:
-            # Each kind of motion has its part of the scan, a quarter of it wide, and is a third of that elsewhere.
+            # Each kind of motion has its part of the scan, a quarter of it wide, and less of it elsewhere.
             middle = (self._order[:, None] + 0.5) / 6.0 * self._last_s
-            x *= 0.4 + 0.8 * np.exp(-(((time_s - middle) / (0.18 * self._last_s)) ** 2))
+            x *= 0.4 + 0.6 * np.exp(-(((time_s - middle) / (0.18 * self._last_s)) ** 2))
+        return x
+
+    def at(self, time_s: np.ndarray) -> RigidTransform:
+        """Pose of the image."""
+        tremor = np.sin(2.0 * np.pi * self._tremor_hz[:, None] * time_s + self._tremor_phase[:, None])
+        x = self._swing(time_s) + self._tremor[:, None] * tremor
         down = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-        limit = np.deg2rad([45.0, 35.0, 400.0])[:, None]
-        tilt, roll, yaw = limit * np.tanh(x[:3] / limit)
-        turn = about(2, yaw) * down * about(2, roll) * about(0, tilt)
-        height = self._height_mm + 15.0 * np.tanh(x[3] / 15.0)
+        turn = about(2, x[2]) * down * about(2, x[1]) * about(0, x[0])
+        height = self._height_mm + x[3]
         return RigidTransform.from_components(np.column_stack([x[4], x[5], height]), turn)
 
 
