@@ -85,12 +85,18 @@ def calibrate_registered(
     if not whole:
         raise refusals[0]
     blocks = _blocks(points)
-    choice = _chosen({name: _missed_mm(solution, blocks) for name, solution in whole.items()})
+    choice = choose({name: _missed_mm(solution, blocks) for name, solution in whole.items()})
     return whole[choice.registration], choice
 
 
-def _chosen(missed_mm: Mapping[Registration, FloatArray]) -> Choice:
-    """Choose the simplest that is worse than the best by at most a standard error of the difference."""
+def choose(missed_mm: Mapping[Registration, FloatArray]) -> Choice:
+    """Choose the simplest that is worse than the best by at most a standard error of the difference.
+
+    Parameters
+    ----------
+    missed_mm : mapping of str to ndarray, shape (blocks,)
+        Simplest first.
+    """
     means = {name: float(each.mean()) for name, each in missed_mm.items()}
     best = missed_mm[min(missed_mm, key=lambda name: means[name])]
     worse = {

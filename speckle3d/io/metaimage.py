@@ -7,6 +7,7 @@ orientations such as ``MF`` (x towards the marked side, y far from the probe).
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -225,7 +226,7 @@ def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None
     if sensor is None:
         return None
     # Poses may be asked for by any name; a reference counts if both are tracked in the same world.
-    moving, _, world = sensor.name.partition("To")
+    moving, world = _ends(sensor.name)
     usual = "none" if moving == "Reference" else f"ReferenceTo{world}"
     reference = _transform(header, settings.reference_transform, usual)
     both = (sensor,) if reference is None else (sensor, reference)
@@ -256,14 +257,20 @@ def _transform(header: SequenceHeader, given: str | None, default: str) -> _Tran
     name = default if given is None else given.removesuffix("Transform")
     if name == "none":
         return None
-    moving, to, world = name.partition("To")
-    for held in (name, f"{world}To{moving}" if to else name):
+    moving, world = _ends(name)
+    for held in (name, f"{world}To{moving}"):
         if any(f"{held}Transform" in frame for frame in header.frames):
             return _Transform(name, held)
     if given is not None:
         there = ", ".join(header.transforms) or "none"
         raise InvalidInputError(f"{header.path}: expected a transform {name}, got {there}")
     return None
+
+
+def _ends(name: str) -> tuple[str, str]:
+    """Split ``XToY`` as PLUS does, before a capital: ``ToolToTracker`` is of ``Tool`` in ``Tracker``."""
+    found = re.fullmatch(r"(.+?)To([A-Z].*)", name)
+    return (found[1], found[2]) if found else (name, "")
 
 
 def _poses(header: SequenceHeader, asked: _Transform, valid: npt.NDArray[np.bool_]) -> RigidTransform:
