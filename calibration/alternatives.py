@@ -47,6 +47,9 @@ class _Problem:
     def costs(self, points: ImagePoints, chains: Sequence[Chain]) -> FloatArray:
         """Sums of squared residuals, each cut off, in the unit of the least one's mean."""
         residuals = [residuals_of(points, self.phantom, chain) for chain in chains]
+        if self.phantom.seen_as == "line":
+            # Lines err by rows: an image that shrinks to nothing leaves no residual in millimetres.
+            residuals = [one / chain.pixel_mm[1] for one, chain in zip(residuals, chains, strict=True)]
         cut = _CUT * min(sigma_of(one) for one in residuals)
         sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
         least = max(float(sums.min()), np.finfo(float).tiny)

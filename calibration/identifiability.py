@@ -38,8 +38,17 @@ TIE = 25.0
 _TRIED_FRAMES = 12
 _LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
 """Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
-_HELPS = 1.5
-"""A motion matters if without it the error stays as many times larger."""
+_ALLOWED_LACKING, _ALLOWED_FULL = 0.65, 2.0
+"""Shares of what is allowed. Where a motion is absent, the standard error is itself uncertain, and three of
+it are to stay below 5 mm and 5 degrees. Where none is, and errors are large only because they wander, the
+motion is not to blame: then 5 mm and 5 degrees are the limits of the standard error."""
+_HELPS, _MATTERS = 1.5, 0.5
+"""A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
+_HOPELESS = 10.0
+"""Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are:
+all motions that a scan of a plane has not are named."""
+_INFLATION = 4.0
+"""Most that errors that wander are taken to enlarge those of a scan in which nothing is missing."""
 
 _UNKNOWN = 0.3
 """Standard deviation of a pixel size before anything is measured or given, as a share of it."""
@@ -127,7 +136,7 @@ def judge(solution: ChainSolution) -> Adequacy:
     share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
-    if share < 1 and share * excess <= 1:
+    if share < 1 and share * white.of_limit(REFUSED_MM, REFUSED_RAD) <= 1:
         misfit = (
             f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
@@ -135,12 +144,15 @@ def judge(solution: ChainSolution) -> Adequacy:
         )
         return Adequacy(error, condition, (), True, misfit)
     tied = solution.rival is not None and solution.rival.evidence < TIE
-    refused = bool(excess > 1 or not condition <= MAX_CONDITION or tied)
+    allowed = _ALLOWED_LACKING if absent(solution) else 1.0
+    if not absent(solution) and white.of_limit(WEAK_MM, WEAK_RAD) <= 1:
+        allowed = _ALLOWED_FULL
+    refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied)
     weak = errors.of_limit(WEAK_MM, WEAK_RAD) > 1
     missing: list[Motion] = []
     if weak or refused:
-        scale = max(1.0, errors.of_limit(WEAK_MM, WEAK_RAD) / white.of_limit(WEAK_MM, WEAK_RAD)) ** 2
-        missing = _uncertain(solution, information, scale)
+        scale = errors.of_limit(WEAK_MM, WEAK_RAD) / white.of_limit(WEAK_MM, WEAK_RAD)
+        missing = _uncertain(solution, information, min(max(scale, 1.0), _INFLATION) ** 2)
     if tied:
         missing += [motion for motion in _telling(solution) if motion not in missing]
     where = "" if angular else " at the image's corners"
@@ -150,12 +162,12 @@ def judge(solution: ChainSolution) -> Adequacy:
     state += f", condition number {condition:.3g}"
     if missing:
         advice = "; and ".join(motion.advice for motion in missing)
-    elif solution.phantom.seen_as == "dot" and not weak:
+    elif solution.phantom.seen_as == "dot" and (not weak or not condition <= MAX_CONDITION):
         # No motion would help.
         advice = "what stays unknown is where the phantom is: show more of it, all its wires"
     else:
         advice = "record more frames over a wider range"
-    if tied and excess <= 1:
+    if tied and excess <= allowed:
         verdict = f"two answers explain the images equally well, one of them mirrored ({state}): {advice}"
     elif refused:
         verdict = f"the motion does not determine the calibration ({state}): {advice}"
@@ -245,13 +257,17 @@ def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float])
     """
     lacking = absent(solution)
     least, now = error(lacking), error([])
+    if now > _HOPELESS and solution.phantom.seen_as != "dot":
+        return lacking
     without = {one: error([other for other in lacking if other is not one]) for one in lacking}
-    needed = [one for one in lacking if without[one] > max(_HELPS * least, 1.0)]
+    needed = [one for one in lacking if without[one] > max(_HELPS * least, _MATTERS)]
+    needed.sort(key=lambda one: -without[one])
+    # Of several that would do, those that help most.
+    while len(needed) < len(lacking) and error(needed) > max(_HELPS * least, _MATTERS):
+        others = [one for one in lacking if one not in needed]
+        needed.append(min(others, key=lambda one: error([*needed, one])))
     if needed:
-        return sorted(needed, key=lambda one: -without[one])
-    if lacking and now > _HELPS * least:
-        # Each would do.
-        return [min(lacking, key=lambda one: error([one]))]
+        return needed
     some = list(extents(solution))
     best = min(some, key=lambda one: error([one]))
     return [best] if now > _HELPS * error([best]) else []

@@ -19,7 +19,7 @@ from calibration.detection.dots import dots_in_frames, single_dots
 from calibration.detection.labelling import label_dots
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
-from calibration.plane import Stages, calibrate_plane
+from calibration.plane import PIXEL_ERROR, Stages, calibrate_plane
 from calibration.registration import Choice, calibrate_registered
 from calibration.report import Shot, as_calibration
 from calibration.solver import OUTLIER_SIGMA
@@ -131,14 +131,16 @@ def plane_job(
     fit_pixels: bool = True,
     stages: Stages = "three",
     beam_mm: Sequence[float] = (),
+    pixel_error: float = PIXEL_ERROR,
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with a plane; `beam_mm` are thicknesses whose bias the report shows."""
     _require_poses(recording)
+    size = recording.pixel_mm
     outcome = _finished(
         recording,
         seen,
         job,
-        lambda points: calibrate_plane(points, recording.pixel_mm, fit_pixels, stages, job.outlier_sigma),
+        lambda points: calibrate_plane(points, size, fit_pixels, stages, job.outlier_sigma, pixel_error),
         "plane",
     )
     return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in beam_mm))

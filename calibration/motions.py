@@ -13,7 +13,11 @@ from speckle3d.core.arrays import FloatArray
 _TURN_RAD = np.deg2rad(15.0)
 _SHIFT = 0.2
 """Imagined frames are turned by as much, and shifted by as much of the image, to either side."""
-_ABSENT = 0.2
+_LEAST_SHIFT_MM = 8.0
+"""And by as much at least, even of a small image: a hand wobbles by millimetres whatever the image's size."""
+_OBLONG = 3.0
+"""Pixels found to be so oblong, or more, are taken for square: their shape was not determined."""
+_ABSENT = 0.25
 """A motion whose standard deviation is below this share of that step is absent: a hand that means to hold
 still wobbles by a degree or two, 0.7 to 1.4 as a standard deviation; one that moves on purpose moves by five.
 """
@@ -51,19 +55,19 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
 
     Lines tell roll and depth by themselves, and the sensor alone tells how far the plane's normal moved in
     its frame: the mounting, which is not known well where a motion is missing, hardly enters. Motions that
-    cannot help are left out.
+    cannot help are left out: a plane looks the same from every side.
     """
     points, size = solution.points_used, solution.chain.pixel_mm
     if solution.phantom.seen_as == "dot":
         turns = solution.chain.target_from_image(points).rotation
         spread = (turns.mean().inv() * turns).as_rotvec().std(axis=0) / _TURN_RAD
-        places = points.pixels.std(axis=0) / (_SHIFT * points.pixels.max(axis=0))
+        places = (points.pixels * size).std(axis=0) / _steps_mm(solution)
         return dict(zip(MOTIONS, [*spread, *places], strict=True))
     up = points.turns.transpose(0, 2, 1) @ solution.chain.target_from_world.rotation.as_matrix()[2]
     middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
-    turns = points.world_from_sensor.rotation
-    yaw = float(((turns.mean().inv() * turns).as_rotvec() @ middle).std())
+    if not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
+        size = np.full(2, size[1])
     if solution.angular:
         along, depth = points.pixels * size, None
     else:
@@ -73,15 +77,19 @@ def extents(solution: ChainSolution) -> dict[Motion, float]:
     slope = np.arctan(along[:, 1] / along[:, 0])
     found = {
         TILT: np.sqrt(max(swing - slope.var(), 0.0)) / _TURN_RAD,
-        YAW: yaw / _TURN_RAD,
-        ROLL: slope.std() / _TURN_RAD,
+        # The slope depends on the pixels' shape, which may be wrong; the normal swings as far at least.
+        ROLL: min(slope.std(), np.sqrt(swing)) / _TURN_RAD,
     }
     if depth is not None:
         # About the column at which the lines cross: turning the probe there does not change the depth.
         steps = np.column_stack([np.ones(len(slope)), np.tan(slope)])
         left = depth - steps @ np.linalg.lstsq(steps, depth, rcond=None)[0]
-        found[UP_AND_DOWN] = left.std() / (_SHIFT * image_mm(solution)[1])
+        found[UP_AND_DOWN] = left.std() / _steps_mm(solution)[1]
     return {motion: float(extent) for motion, extent in found.items()}
+
+
+def _steps_mm(solution: ChainSolution) -> FloatArray:
+    return np.maximum(_SHIFT * image_mm(solution), _LEAST_SHIFT_MM)
 
 
 def _middle_column(centre_mm: FloatArray) -> float:
@@ -105,7 +113,7 @@ def with_motion(solution: ChainSolution, near: ImagePoints, motion: Motion) -> I
 
 def _shifted(solution: ChainSolution, near: ImagePoints, axis: FloatArray) -> ImagePoints:
     """The image shifted along itself, so that the same points of the phantom appear elsewhere in it."""
-    step = _SHIFT * axis * np.append(image_mm(solution), 0.0)
+    step = axis * np.append(_steps_mm(solution), 0.0)
     shift = RigidTransform.from_translation(step)
     pixels = near.pixels - step[:2] / solution.chain.pixel_mm
     return replace(near, pixels=pixels, world_from_sensor=near.world_from_sensor * shift)

@@ -45,6 +45,8 @@ _PIXEL_MM = 0.15
 
 _HOPELESS = 3.0
 """Ends of iterations whose mean absolute residual is as many times the least are not looked at again."""
+_TRIED = 3
+"""Angles that are followed to the end."""
 PIXEL_ERROR = 0.02
 """Standard error of a pixel size from a scanner's calipers, as a share of it: of distances they show."""
 _CONTRADICTS = 3.0
@@ -155,9 +157,9 @@ def _solved(
         given = held if prior is None else prior.pixel_mm
         starts = _one_stage(lines, given)
     elif held is not None or prior is not None:
-        starts = [_three_stages(lines, held if prior is None else prior.pixel_mm)]
+        starts = _three_stages(lines, held if prior is None else prior.pixel_mm)
     else:
-        starts = [_three_stages(lines, size) for size in (None, np.full(2, _PIXEL_MM))]
+        starts = [*_three_stages(lines, None), *_three_stages(lines, np.full(2, _PIXEL_MM))]
     return best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
 
 
@@ -185,11 +187,11 @@ def _without_prior(
     )
 
 
-def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> Chain:
+def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:
     """The first two stages: angles from some directions, then distances. The caller refines all together."""
     directions = as_directions(lines.of_some_frames(SOME_FRAMES))
     found = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
-    return _with_distances(lines, found[0], pixel_mm)
+    return [_with_distances(lines, angles, pixel_mm) for angles in found[:_TRIED]]
 
 
 def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:

@@ -49,6 +49,10 @@ _NEARLY_ABSOLUTE = 0.06745
 _REWEIGHTINGS = 8
 _SETTLED = 0.99
 """Reweighting ends when it lowers the mean absolute residual by less."""
+_RUNAWAY = 2.0
+"""Steps that take errors for wandering leave residuals larger by a tenth, rarely by a half."""
+_RESIZED = 0.1
+"""And they change pixel sizes by a few percent."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
 _SMALLEST_SIGMA = 1e-7
@@ -86,7 +90,15 @@ def solve_chain(
     free = (*probe, *phantom.determined)
     prior = prior if "s_x" in free else None
     chain, used = agreed(points, phantom, start, free, outlier_sigma, prior)
-    chain, noise = settle(points[used], phantom, chain, free, prior)
+    least = sigma_of(residuals_of(points[used], phantom, chain))
+    settled, noise = settle(points[used], phantom, chain, free, prior)
+    # Where the motion leaves the answer open, linear steps run away; the covariance says how open it is.
+    bigger = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
+    if sigma_of(residuals_of(points[used], phantom, settled)) < _RUNAWAY * least and bigger < _RESIZED:
+        chain = settled
+    if phantom.determined:
+        # Where the phantom is, as the readings say on average: what wanders is not in its place.
+        chain, _, _ = refined(points[used], phantom, chain, phantom.determined)
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])
@@ -201,6 +213,7 @@ def refined(
     columns = np.array([CHAIN.index(name) for name in free])
     origin = on_image(chain)
     scale = 1.0 if weights is None else weights
+    in_rows = phantom.seen_as == "line" and prior is not None
 
     @lru_cache(maxsize=2)
     def at(x: bytes) -> tuple[FloatArray, FloatArray]:
@@ -209,6 +222,11 @@ def refined(
         values, jacobian = residuals_and_jacobian(full, near, phantom)
         kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
         kept, values = kept.reshape(-1, len(columns)), (values * scale).ravel()
+        if in_rows:
+            # Lines err by rows: in millimetres, an image that shrinks to nothing would leave no residual.
+            larger = full[1] / origin[1]
+            kept, values = kept / larger, values / larger
+            kept[:, free.index("s_y")] -= values / full[1]
         if prior is None:
             return values, kept
         extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])

@@ -15,9 +15,10 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.alternatives import best_solution
 from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, SeenAs
 from calibration.identifiability import require_adequate
-from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
+from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters
 from calibration.starts import rotations_all_over, wire_start
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -90,7 +91,8 @@ def calibrate_cross_wire(
     _require_frames(points)
     probe, held = probe_parameters(fit_pixels, pixel_mm)
     start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
-    return require_adequate(solve_chain(points, CrossWire(), _sized(start, held), probe, outlier_sigma))
+    starts = [_sized(start, held)]
+    return require_adequate(best_solution(points, CrossWire(), starts, probe, outlier_sigma))
 
 
 def calibrate_wires(
@@ -130,11 +132,12 @@ def calibrate_wires(
     place = centred.world_from_phantom
     if place is not None:
         phantom = Wires(centred, _ESTIMATED[registration])
-        start, _ = wire_start(points, phantom.vanishing(points), place.inv())
+        starts = [wire_start(points, phantom.vanishing(points), place.inv())[0]]
     else:
         phantom = Wires(centred)
-        start = _anywhere(points.of_some_frames(SOME_FRAMES), phantom, held, probe)
-    return require_adequate(solve_chain(points, phantom, _sized(start, held), probe, outlier_sigma))
+        starts = _anywhere(points.of_some_frames(SOME_FRAMES), phantom)
+    sized = [_sized(start, held) for start in starts]
+    return require_adequate(best_solution(points, phantom, sized, probe, outlier_sigma))
 
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
@@ -147,13 +150,12 @@ def _about_middle(geometry: WirePhantom) -> WirePhantom:
     return replace(geometry, points_mm=geometry.points_mm - middle, ends_mm=shifted, world_from_phantom=moved)
 
 
-def _anywhere(few: ImagePoints, phantom: Wires, held: FloatArray | None, probe: tuple[str, ...]) -> Chain:
-    """Best start among orientations of the phantom spread over all rotations."""
+def _anywhere(few: ImagePoints, phantom: Wires) -> list[Chain]:
+    """Best starts among orientations of the phantom spread over all rotations."""
     equations = phantom.vanishing(few)
     tried = [wire_start(few, equations, turn) for turn in rotations_all_over()]
     best = sorted(tried, key=lambda one: float(np.median(np.abs(one[1].residuals))))[:_STARTS]
-    settled = [solve_chain(few, phantom, _sized(chain, held), probe, np.inf) for chain, _ in best]
-    return min(settled, key=lambda solution: solution.sigma).chain
+    return [chain for chain, _ in best]
 
 
 def _sized(start: Chain, pixel_mm: FloatArray | None) -> Chain:

@@ -38,6 +38,9 @@ TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sens
 FixedPixels = Annotated[
     bool, typer.Option("--fixed-pixels", help="Keep the pixel size instead of estimating it.")
 ]
+PixelError = Annotated[
+    float, typer.Option(min=0.0, help="Standard error of the pixel size, as a share of it; inf if a guess.")
+]
 OutlierSigma = Annotated[
     float, typer.Option(min=1.0, help="Drop frames whose residual exceeds so many standard deviations.")
 ]
@@ -62,6 +65,7 @@ def calibrate_plane(
     transform: Transform = None,
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
+    pixel_error: PixelError = 0.02,
     stages: Annotated[
         Literal["three", "one"], typer.Option(help="Angles, distances, all; or all at once.")
     ] = "three",
@@ -96,7 +100,9 @@ def calibrate_plane(
         recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma, transform)
         return recording, find_lines(recording, region, path, lines), job
 
-    solve = partial(plane_job, fit_pixels=not fixed_pixels, stages=stages, beam_mm=widths)
+    solve = partial(
+        plane_job, fit_pixels=not fixed_pixels, stages=stages, beam_mm=widths, pixel_error=pixel_error
+    )
     _calibrate(scan, solve, images, poses, validation, out, as_json)
 
 

@@ -24,13 +24,13 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
 
-WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
+WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
 
 JITTER = (0.0, 0.5, 1.5)
 """Sizes tried of the error that is new in every frame and moves all its residuals together."""
 
-STEADY = 0.25
+STEADY = 0.1
 """Probability, before anything is measured, that nothing wanders."""
 
 _TIMES = 4

@@ -115,7 +115,7 @@ def moves_of(rng, time_s, reaches: dict[str, float], wobbles: dict[str, float]) 
 def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     """A scan of a floor without some motions."""
     rng = np.random.default_rng(seed)
-    count = int(rng.choice([80, 100, 150, 250, 400]))
+    count = int(rng.choice([80, 100, 150, 250, 400] if missing else [150, 250, 400]))
     time_s = np.arange(count) * rng.uniform(0.12, 0.5)
     time_s += rng.uniform(-0.01, 0.01, count)
     time_s = np.maximum(time_s, 0.0)
@@ -164,8 +164,10 @@ def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     shifts = rng.choice([0.02, 0.1, 0.2]) * rng.standard_normal((count, 3))
     turns = np.deg2rad(rng.choice([0.02, 0.05, 0.1]) * rng.standard_normal((count, 3)))
     if rng.random() < 0.5:
-        shifts += drift(rng, time_s, 0.3, 3)
-        turns += np.deg2rad(drift(rng, time_s, 0.2, 3))
+        # A scan is good if its tracker is, too.
+        size = 1.0 if missing else 0.5
+        shifts += drift(rng, time_s, 0.3 * size, 3)
+        turns += np.deg2rad(drift(rng, time_s, 0.2 * size, 3))
     wrong = RigidTransform.from_components(shifts, Rotation.from_rotvec(turns))
     place, orientation = readings.as_components()
     moved, turned = wrong.as_components()
