@@ -93,18 +93,32 @@ class _Errors:
         return max(self.corner_mm / mm, self.angle_rad / rad)
 
 
+class InadequateError(InsufficientDataError):
+    """A solution that is refused, with the reason.
+
+    Attributes
+    ----------
+    solution : ChainSolution
+        Still a start for others.
+    """
+
+    def __init__(self, message: str, solution: ChainSolution) -> None:
+        super().__init__(message)
+        self.solution = solution
+
+
 def require_adequate(solution: ChainSolution) -> ChainSolution:
     """Return `solution` if its motion was sufficient.
 
     Raises
     ------
-    InsufficientDataError
+    InadequateError
         Naming the missing motions, if the answer is too uncertain to be used, or another explains the images
         as well; or if the phantom does not explain the images.
     """
     found = judge(solution)
     if found.refused:
-        raise InsufficientDataError(found.verdict)
+        raise InadequateError(found.verdict, solution)
     return solution
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.beam import BeamBias, predict_bias
 from calibration.chain import ChainSolution, ImagePoints, Seen, as_directions
-from calibration.clock.offset import ClockOffset, covered, delays_around, estimate_offset
+from calibration.clock.fitted import estimate_offset, with_uncertain_offset
+from calibration.clock.offset import ClockOffset, covered, delays_around
 from calibration.consensus import GATES_MM, Consensus, find_consensus
 from calibration.detection.crossings import crossings_in_frames
 from calibration.detection.dots import dots_in_frames
@@ -20,6 +22,7 @@ from calibration.detection.labelling import label_dots
 from calibration.nwires import label_and_start
 from calibration.orientation import Viewed, calibrate_orientation
 from calibration.plane import PIXEL_ERROR, Stages, calibrate_plane
+from calibration.registration import Choice, calibrate_registered
 from calibration.report import Shot, as_calibration
 from calibration.solver import OUTLIER_SIGMA
 from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
@@ -103,6 +106,7 @@ class Outcome:
     shots: tuple[Shot, ...]
     beam: tuple[BeamBias, ...] = ()
     offset: ClockOffset | None = None
+    choice: Choice | None = None
 
 
 def find_crossings(
@@ -216,23 +220,38 @@ def wires_job(
     job: JobSettings,
     phantom: WirePhantom | None,
     fit_pixels: bool = True,
-    registration: Registration = "turned",
+    registration: Registration | Literal["auto"] = "auto",
 ) -> Outcome:
-    """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes; without a phantom, two that cross."""
+    """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes; without a phantom, two that cross.
+
+    With `registration` "auto", frames left out choose how much to believe of the phantom's stated place.
+    """
     _require_poses(recording)
     known = recording.pixel_mm, fit_pixels
+    chosen = registration == "auto" and phantom is not None and phantom.world_from_phantom is not None
+    # The clock is sought, before the choice, with what depends least on the place and yet is determined.
+    fixed: Registration = "turned" if registration == "auto" else registration
+    choices: list[Choice] = []
 
     def calibrate(points: ImagePoints) -> ChainSolution:
         if phantom is None:
             return calibrate_cross_wire(points, *known, job.outlier_sigma)
-        return calibrate_wires(points, phantom, *known, registration, job.outlier_sigma)
+        return calibrate_wires(points, phantom, *known, fixed, job.outlier_sigma)
+
+    def choose(points: ImagePoints) -> ChainSolution:
+        assert phantom is not None
+        solution, choice = calibrate_registered(points, phantom, *known, job.outlier_sigma)
+        choices.append(choice)
+        return solution
 
     if phantom is not None:
-        return _finished(recording, seen, job, calibrate, "n-wire" if phantom.n_shapes else "three-wire")
+        method = "n-wire" if phantom.n_shapes else "three-wire"
+        outcome = _finished(recording, seen, job, calibrate, method, choose if chosen else calibrate)
+        return replace(outcome, choice=choices[-1] if choices else None)
     around = recording.time_offset_s
     offsets = delays_around(around, SEARCH_S, _CHOICE_STEP_S).tolist() if job.estimate_offset else [around]
-    chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
-    outcome = _finished(recording, chosen, job, calibrate, "cross-wire")
+    picked = choose_crossings(recording, seen, offsets) if len(seen) else seen
+    outcome = _finished(recording, picked, job, calibrate, "cross-wire")
     shots = tuple(
         replace(shot, candidates_px=seen.pixels[seen.frame == shot.frame]) for shot in outcome.shots
     )
@@ -276,36 +295,25 @@ def _finished(
     job: JobSettings,
     calibrate: Callable[[ImagePoints], ChainSolution],
     method: str,
+    settle: Callable[[ImagePoints], ChainSolution] | None = None,
 ) -> Outcome:
+    """Calibrate, with the clock's offset found first if asked for; `settle` calibrates once it is known."""
     if len(seen.frame) == 0:
         reasons = sorted(set(seen.dropped.values())) or ["no frames"]
         raise InsufficientDataError(f"expected the phantom in the images, got it in none: {reasons[0]}")
-    offset = None
+    points, dropped = paired(recording, seen, recording.time_offset_s)
+    offset, used_offset = None, recording.time_offset_s
     if job.estimate_offset:
-        timed = _covered_throughout(recording, seen)
-        offset = estimate_offset(
-            lambda offset_s: calibrate(paired(recording, timed, offset_s)[0]),
-            recording.time_offset_s,
-            SEARCH_S,
-        )
-    used_offset = recording.time_offset_s if offset is None else offset.seconds
-    points, dropped = paired(recording, seen, used_offset)
-    solution = calibrate(points)
+        offset = estimate_offset(calibrate, points, recording.readings, used_offset, SEARCH_S)
+        used_offset = offset.seconds
+        points, dropped = paired(recording, seen, used_offset)
+    solution = (settle or calibrate)(points)
+    if offset is not None:
+        solution = with_uncertain_offset(solution, recording.readings, used_offset)
     frames = FramesUsed(recording.images.shape[0], (), dropped)
     known = offset is not None or job.offset_given or recording.time_offset_s != 0.0
     calibration = as_calibration(solution, method, frames, used_offset if known else None)
     return Outcome(solution, calibration, seen, _shots(recording, seen, calibration), offset=offset)
-
-
-def _covered_throughout(recording: Recording, seen: Seen) -> Seen:
-    """Those frames that have a reading at every offset tried: all offsets are judged by the same frames."""
-    there = covered(recording.readings, recording.frame_time_s[seen.frame], recording.time_offset_s, SEARCH_S)
-    if not there.any():
-        raise InsufficientDataError(
-            f"expected readings from {SEARCH_S:g} s before to {SEARCH_S:g} s after some frames, to tell the "
-            "clock, got none"
-        )
-    return seen[there]
 
 
 def _shots(recording: Recording, seen: Seen, calibration: Calibration) -> tuple[Shot, ...]:

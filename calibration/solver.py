@@ -129,9 +129,7 @@ def agreed(
     prior: PixelPrior | None = None,
 ) -> tuple[Chain, BoolArray]:
     """Least squares of the frames that do not contradict the others, and which points those are."""
-    # Pixel sizes that are known somewhat are held while wrong frames still pull.
-    held = tuple(name for name in free if prior is None or name not in SCALES)
-    chain = first_guess(points, phantom, start, held)
+    chain = first_guess(points, phantom, start, at_first(free, prior))
     residuals = residuals_of(points, phantom, chain)
     used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
     round_ = 0
@@ -146,6 +144,11 @@ def agreed(
         if (agreeing == used).all():
             return chain, used
         used, round_ = agreeing, round_ + 1
+
+
+def at_first(free: tuple[str, ...], prior: PixelPrior | None) -> tuple[str, ...]:
+    """Those to estimate while wrong frames still pull: not pixel sizes that are known somewhat."""
+    return tuple(name for name in free if prior is None or name not in SCALES)
 
 
 def sigma_of(residuals: FloatArray) -> float:

@@ -37,6 +37,7 @@ def settle(
     chain: Chain,
     free: tuple[str, ...],
     prior: PixelPrior | None = None,
+    more: FloatArray | None = None,
 ) -> tuple[Chain, WanderingFit]:
     """Go from a least-squares solution to the one that knows that the sensor's errors wander.
 
@@ -49,36 +50,44 @@ def settle(
     free : tuple of str, length p
         The parameters estimated.
     prior : PixelPrior, optional
+    more : ndarray, shape (n r, k), optional
+        Derivatives of the residuals by further parameters, which are zero so far.
 
     Returns
     -------
     chain : Chain
     noise : WanderingFit
-        Its covariance is that of the free parameters in frames that lie on the image and on the phantom.
+        Its covariance is that of the free parameters in frames that lie on the image and on the phantom, and
+        of the further ones after them. Its step is the last one's, of the further ones the sum of all.
     """
     several = phantom.vanishing(points)[1].shape[1]
     group, time_s = np.repeat(points.frame, several), np.repeat(points.times, several)
     jitter = (0.0,) if len(group) == len(points.frames) else JITTER
     corrected, expected = points, np.zeros(len(group))
+    beside = np.zeros((len(group), 0)) if more is None else more
+    further = np.zeros(beside.shape[1])
     for _ in range(_STEPS):
         residuals, jacobian = near_jacobian(corrected, phantom, chain, free)
         error = sensor_error(corrected, phantom, chain)
         # What was taken out of the points, put back as the small thing that it is.
-        residuals = residuals + expected
-        noise = wandering_fit(jacobian, residuals, group, time_s, error, jitter, *_known(prior, chain, free))
+        residuals = residuals + expected + beside @ further
+        jacobian = np.hstack([jacobian, beside])
+        known = _known(prior, chain, free, len(further))
+        noise = wandering_fit(jacobian, residuals, group, time_s, error, jitter, *known)
         sensor, image = attributed(residuals + jacobian @ noise.step, group, error, noise)
-        chain = moved_by(chain, free, noise.step)
+        chain = moved_by(chain, free, noise.step[: len(free)])
+        further += noise.step[len(free) :]
         corrected, expected = _corrected(points, phantom, chain, sensor, image)
-    return chain, noise
+    return chain, replace(noise, step=np.append(noise.step[: len(free)], further))
 
 
 def _known(
-    prior: PixelPrior | None, chain: Chain, free: tuple[str, ...]
+    prior: PixelPrior | None, chain: Chain, free: tuple[str, ...], further: int
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Inverse covariance of a prior, and by how much the parameters exceed it."""
     if prior is None:
         return None, None
-    inverse, excess = np.zeros(len(free)), np.zeros(len(free))
+    inverse, excess = np.zeros(len(free) + further), np.zeros(len(free) + further)
     columns = [free.index(name) for name in SCALES]
     inverse[columns] = (prior.pixel_mm * prior.error) ** -2.0
     excess[columns] = chain.pixel_mm - prior.pixel_mm

@@ -27,6 +27,7 @@ from calibration.clock.offset import (
     minimum_between,
     require_peak,
 )
+from calibration.clock.smoothing import smooth
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import autocorrelation_time
@@ -103,8 +104,11 @@ def delay_from_lines(
     _require_clear(tried, misfit, best, returns)
     motion = _motion(readings, frame_time_s[there] - tried[best])
     _require_varied(wanted - wanted.mean(), motion, float(misfit[best]))
+    # Between the delays tried, samples joined by straight lines would pull the best one to a sample.
+    steady = smooth(readings)
+    misfit_at = _misfit(wanted - wanted.mean(), frame_time_s[there], steady)
     delay, least = minimum_between(misfit_at, tried, best, 1e-5)
-    motion = _motion(readings, frame_time_s[there] - delay)
+    motion = _motion(steady, frame_time_s[there] - delay)
     left = _residuals(wanted, motion)
     free = max(1.0, len(left) / autocorrelation_time(left) - motion.shape[1])
     error = curvature_error(misfit_at, delay, STEP_S, free)

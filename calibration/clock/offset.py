@@ -1,4 +1,4 @@
-"""A sensor's clock offset: the result, which frames have readings, and a search by calibrating anew."""
+"""A sensor's clock offset: the result, which frames have readings, and the search for the best delay."""
 
 from __future__ import annotations
 
@@ -8,18 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from calibration.chain import ChainSolution
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
 SEARCH_S = 0.5
 """How far to either side of the known delay others are tried."""
-
-_STEP_S = 0.02
-"""Coarse steps of the offset: half a frame at 25 frames/s, in which no hand reverses."""
-
-_TOLERANCE_S = 1e-4
 
 _AMBIGUOUS = 0.1
 """Another delay counts as a rival if it is worse by less than this share of what the best delay gains."""
@@ -58,52 +52,6 @@ def delays_around(around_s: float, search_s: float, step_s: float) -> FloatArray
     """Delays from `around_s` - `search_s` to `around_s` + `search_s`, a step apart."""
     steps = np.arange(-round(search_s / step_s), round(search_s / step_s) + 1)
     return np.asarray(around_s + steps * step_s, dtype=np.float64)
-
-
-def estimate_offset(
-    calibrate: Callable[[float], ChainSolution], around_s: float = 0.0, search_s: float = 0.4
-) -> ClockOffset:
-    """Find the clock offset with which a calibration explains its lines best.
-
-    Parameters
-    ----------
-    calibrate : callable
-        Calibrates with the sensor read at a given offset; may raise `InsufficientDataError`.
-    around_s, search_s : float
-        Offsets from `around_s` - `search_s` to `around_s` + `search_s` are tried.
-
-    Raises
-    ------
-    InsufficientDataError
-        If no offset gives a calibration, or the best is at the end of the range.
-    """
-    tried = delays_around(around_s, search_s, _STEP_S)
-    sigmas = np.array([_sigma(calibrate, float(offset)) for offset in tried])
-    best = int(np.argmin(sigmas))
-    if not np.isfinite(sigmas[best]):
-        raise InsufficientDataError(
-            f"expected a clock offset within {search_s:g} s that gives a calibration, got none"
-        )
-    # The curvature is measured a step further on, so the last step but one is refused too.
-    if not 1 < best < len(tried) - 2:
-        raise InsufficientDataError(
-            f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its end"
-        )
-    nearest = calibrate(float(tried[best]))
-    used, count = nearest.used, nearest.residuals[nearest.used].size
-
-    def cost(offset: float) -> float:
-        return float(np.sum(calibrate(offset).residuals[used] ** 2))
-
-    seconds, _ = minimum_between(cost, tried, best, _TOLERANCE_S)
-    return ClockOffset(seconds, curvature_error(cost, seconds, _STEP_S, count))
-
-
-def _sigma(calibrate: Callable[[float], ChainSolution], offset: float) -> float:
-    try:
-        return calibrate(offset).sigma
-    except InsufficientDataError:
-        return float("inf")
 
 
 def minimum_between(

@@ -10,7 +10,18 @@ import typer
 
 from speckle3d.cli.calibrate_phantoms import find_lines
 from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import Images, Json, PixelMm, Poses, Region, calibrate, emit, note, progress_bar
+from speckle3d.cli.common import (
+    Images,
+    Json,
+    PixelMm,
+    Poses,
+    Region,
+    Transform,
+    calibrate,
+    emit,
+    note,
+    progress_bar,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 
 if TYPE_CHECKING:
@@ -21,6 +32,7 @@ if TYPE_CHECKING:
 def calibrate_clock(
     images: Images,
     poses: Poses = None,
+    transform: Transform = None,
     pixel_mm: PixelMm = None,
     by: Annotated[
         Literal["line", "images"],
@@ -55,7 +67,7 @@ def calibrate_clock(
     require_unsized(images, pixel_mm)
     if by == "images":
         given_s = None if known is None else known.time_offset_s
-        tracked, mounting = open_tracked(images, poses, pixel_mm, given_s)
+        tracked, mounting = open_tracked(images, poses, pixel_mm, given_s, transform)
         mounting = mounting if known is None else known.sensor_from_image
         if mounting is None:
             raise InsufficientDataError(
@@ -67,7 +79,7 @@ def calibrate_clock(
         frames = len(tracked.frame_time_s)
         told = f"images of the two ways correlate by {found.followed:.2f}"
     else:
-        recording = open_recording(images, poses, pixel_mm, sensor)
+        recording = open_recording(images, poses, pixel_mm, sensor, transform)
         seen = find_lines(recording, region, images)
         frames, times = len(seen), recording.frame_time_s
         if frames < FEWEST_FRAMES:

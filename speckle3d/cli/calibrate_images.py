@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from speckle3d.cli.calibrations import require_free, write_with_report
-from speckle3d.cli.common import CalibrationOut, Json, PixelMm, calibrate, naming_options, note, progress_bar
+from speckle3d.cli.common import (
+    CalibrationOut,
+    Json,
+    PixelMm,
+    Transform,
+    calibrate,
+    naming_options,
+    note,
+    progress_bar,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -50,6 +59,7 @@ def calibrate_images(
     poses: Annotated[
         list[Path] | None, typer.Option(help="File with readings, if not in A and B; once for each.")
     ] = None,
+    transform: Transform = None,
     pixel_mm: PixelMm = None,
     method: Annotated[
         Literal["gauss-newton", "nelder-mead"],
@@ -84,9 +94,9 @@ def calibrate_images(
         require_unsized(path, pixel_mm)
     known = None if start is None else read_calibration(start)
     offset_s = known.time_offset_s if time_offset_s is None and known is not None else time_offset_s
-    one, mounting = open_tracked(first, readings[0], pixel_mm, offset_s)
-    other, _ = open_tracked(second, readings[1], pixel_mm, offset_s)
-    back = None if clock is None else open_tracked(clock, None, pixel_mm, offset_s)[0]
+    one, mounting = open_tracked(first, readings[0], pixel_mm, offset_s, transform)
+    other, _ = open_tracked(second, readings[1], pixel_mm, offset_s, transform)
+    back = None if clock is None else open_tracked(clock, None, pixel_mm, offset_s, transform)[0]
     begin = _start(known, start_mm, start_deg, mounting, first)
     if (far := math.hypot(*begin.translation)) > _FAR_MM:
         note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")

@@ -18,6 +18,7 @@ from speckle3d.cli.common import (
     PixelMm,
     Poses,
     Region,
+    Transform,
     calibrate,
     emit,
     emit_json,
@@ -61,6 +62,7 @@ def calibrate_plane(
     images: Images,
     out: CalibrationOut,
     poses: Poses = None,
+    transform: Transform = None,
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
     pixel_error: PixelError = 0.02,
@@ -95,7 +97,7 @@ def calibrate_plane(
     widths = () if reflector == "bar" else tuple(beam_mm or (1.0, 2.0, 3.0))
 
     def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
-        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma)
+        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma, transform)
         return recording, find_lines(recording, region, path, lines), job
 
     solve = partial(
@@ -109,6 +111,7 @@ def calibrate_orientation(
     images: Images,
     out: CalibrationOut,
     poses: Poses = None,
+    transform: Transform = None,
     pixel_mm: PixelMm = None,
     level: Annotated[
         bool, typer.Option("--level", help="The plane is level: three unknowns, not five.")
@@ -139,7 +142,7 @@ def calibrate_orientation(
     lines = from_options(LineSettings, locals())
 
     def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
-        recording, job = _prepared(path, readings, pixel_mm, sensor, time_offset, outlier_sigma)
+        recording, job = _prepared(path, readings, pixel_mm, sensor, time_offset, outlier_sigma, transform)
         return recording, find_lines(recording, region, path, lines), job
 
     solve = partial(orientation_job, level=level, viewed_from=viewed_from)
@@ -155,12 +158,16 @@ def calibrate_wires(
         Path | None, typer.Option(help="CSV of points picked by hand: frame,column_px,row_px[,wire].")
     ] = None,
     poses: Poses = None,
+    transform: Transform = None,
     pixel_mm: PixelMm = None,
     fixed_pixels: FixedPixels = False,
     registration: Annotated[
-        Literal["held", "turned", "free"],
-        typer.Option(help="The place a configuration says: hold it, its middle only, or estimate it."),
-    ] = "turned",
+        Literal["auto", "held", "turned", "free"],
+        typer.Option(
+            help="The place a configuration says: hold it, its middle only, or estimate it; auto: whichever "
+            "explains frames best that were left out."
+        ),
+    ] = "auto",
     region: Region = None,
     time_offset: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
@@ -186,7 +193,7 @@ def calibrate_wires(
     geometry = config.phantom if config else three_wires() if phantom == "three" else None
 
     def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
-        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma)
+        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma, transform)
         picked = validation_points if path is validation else points
         return recording, _seen_wires(recording, phantom, config, picked, region, path), job
 
@@ -213,7 +220,8 @@ def _calibrate(
     recording, seen, job = scan(images, poses)
     with naming(str(images)):
         outcome = solve(recording, seen, job)
-    notes = _nwire_notes(outcome, outcome.solution.points)
+    notes = [] if outcome.choice is None else [str(outcome.choice)]
+    notes += _nwire_notes(outcome, outcome.solution.points)
     if (found := outcome.offset) is not None:
         notes.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
     if validation is not None:
@@ -243,11 +251,12 @@ def _prepared(
     sensor: str,
     time_offset: str | None,
     outlier_sigma: float,
+    transform: str | None,
 ) -> tuple[Recording, JobSettings]:
     from calibration.job import JobSettings
     from speckle3d.cli.recordings import open_recording
 
-    recording = open_recording(images, poses, pixel_mm, sensor)
+    recording = open_recording(images, poses, pixel_mm, sensor, transform)
     if time_offset is None:
         return recording, JobSettings(outlier_sigma=outlier_sigma)
     if time_offset == "estimate":

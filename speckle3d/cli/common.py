@@ -48,6 +48,14 @@ CalibrationOut = Annotated[
 Poses = Annotated[
     Path | None, typer.Option("--poses", help="File with the sensor's readings, if not in IMAGES.")
 ]
+Transform = Annotated[
+    str | None,
+    typer.Option(
+        "--transform",
+        metavar="NAME",
+        help="Poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).",
+    ),
+]
 PixelMm = Annotated[
     tuple[float, float] | None,
     typer.Option(help="Distance between columns and rows, mm, if IMAGES does not say."),

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.calibrations import fitted_pixels, mount, resize
-from speckle3d.cli.common import CalibrationFiles, Json, app, emit, emit_rows, from_options, progress_bar
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    Json,
+    Transform,
+    app,
+    emit,
+    emit_rows,
+    from_options,
+    progress_bar,
+)
 from speckle3d.cli.outputs import require_own_place
 
 if TYPE_CHECKING:
@@ -110,6 +119,7 @@ def convert(
     row_spacing_mm: Annotated[float | None, typer.Option(help="B-mode: distance between rows.")] = None,
     dynamic_range_db: Annotated[float | None, typer.Option(help="B-mode: dynamic range.")] = None,
     frame_rate_hz: Annotated[float | None, typer.Option(help="For sequences without time stamps.")] = None,
+    transform: Transform = None,
     calibration: CalibrationFiles = None,
 ) -> None:
     """Turn an image sequence into a sweep file; options give what its header lacks.
@@ -117,6 +127,7 @@ def convert(
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
     """
+    from speckle3d.cli.recordings import require_sequence
     from speckle3d.io.load import load_sweep
     from speckle3d.io.metaimage import ImportSettings
     from speckle3d.io.sweep_writer import write_sweep
@@ -124,6 +135,9 @@ def convert(
     names = ImportSettings.__dataclass_fields__
     require_own_place(out, "sweep", source, *(calibration or ()))
     given = {k: v for k, v in locals().items() if k in names and v is not None}
+    if transform is not None:
+        require_sequence(source, transform)
+        given["tracker_transform"] = transform
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given}
     sweep = resize(load_sweep(source, ImportSettings(**(fitted | given))), fitted)
     sweep = mount(sweep, calibration or ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
 from speckle3d.io.load import load_sweep, sniff
-from speckle3d.io.metaimage import ImportSettings, MissingSettingError, read_poses
+from speckle3d.io.metaimage import ImportSettings, MissingSettingError, lacking_poses, read_poses
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
@@ -21,7 +22,11 @@ DYNAMIC_RANGE_DB = 60.0
 
 
 def open_recording(
-    images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, sensor: str
+    images: Path,
+    poses: Path | None,
+    pixel_mm: tuple[float, float] | None,
+    sensor: str,
+    transform: str | None = None,
 ) -> Recording:
     """Open images and the readings of one sensor.
 
@@ -30,6 +35,8 @@ def open_recording(
     poses : Path, optional
         Where the readings are, if not beside the images.
     sensor : {"tracker", "orientation"}
+    transform : str, optional
+        Name of the poses in an image sequence, as ``ToolToTracker``.
 
     Raises
     ------
@@ -38,8 +45,11 @@ def open_recording(
     """
     if sensor not in ("tracker", "orientation"):
         raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
-    sweep = _load(images, pixel_mm)
-    readings, offset = _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor)
+    require_sequence(images if poses is None else poses, transform)
+    sweep = _load(images, pixel_mm, transform if poses is None else None)
+    readings, offset = (
+        _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
+    )
     pictures, grid = _grey(sweep)
     size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
     return Recording(
@@ -48,7 +58,11 @@ def open_recording(
 
 
 def open_tracked(
-    images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, time_offset_s: float | None = None
+    images: Path,
+    poses: Path | None,
+    pixel_mm: tuple[float, float] | None,
+    time_offset_s: float | None = None,
+    transform: str | None = None,
 ) -> tuple[TrackedImages, RigidTransform | None]:
     """Open tracked images, with the mounting that their file holds, if any.
 
@@ -56,15 +70,18 @@ def open_tracked(
     ----------
     time_offset_s : float, optional
         In place of the file's own.
+    transform : str, optional
+        See `open_recording`.
 
     Raises
     ------
     InsufficientDataError
         If there is no tracker.
     """
-    sweep = _load(images, pixel_mm)
+    require_sequence(images if poses is None else poses, transform)
+    sweep = _load(images, pixel_mm, transform if poses is None else None)
     readings, offset = (
-        _readings(sweep, images, "tracker") if poses is None else _readings_of(poses, "tracker")
+        _readings(sweep, images, "tracker") if poses is None else _readings_of(poses, "tracker", transform)
     )
     assert isinstance(readings, TimedPoses)
     pictures, grid = _grey(sweep)
@@ -73,13 +90,13 @@ def open_tracked(
     return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset, images.name), mounting
 
 
-def _load(path: Path, pixel_mm: tuple[float, float] | None) -> Sweep:
-    given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB)
+def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
+    given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, tracker_transform=transform)
     if pixel_mm is not None:
         if not min(pixel_mm) > 0:
             raise InvalidInputError(f"--pixel-mm: expected two values above zero, got {pixel_mm}")
         column, row = pixel_mm
-        given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, column_pitch_mm=column, row_spacing_mm=row)
+        given = replace(given, column_pitch_mm=column, row_spacing_mm=row)
     try:
         return load_sweep(path, given)
     except MissingSettingError as error:
@@ -95,6 +112,20 @@ def _advice(lacking: str) -> str:
         f"the header does not say its {option}: make it a sweep file first, by `speckle3d convert IN OUT "
         f"--{option} ...` with what else that asks for"
     )
+
+
+def require_sequence(path: Path, transform: str | None) -> None:
+    """Refuse the name of a transform for a sweep file, which has one tracker at most.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    if transform is not None and sniff(path) == "hdf5":
+        raise InvalidInputError(
+            f"--transform: expected an image sequence with it, got {path}, a sweep file, whose poses have no "
+            "names"
+        )
 
 
 def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
@@ -119,19 +150,20 @@ def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
     found = sweep.orientation if sensor == "orientation" else sweep.tracker
     if found is None:
-        others = "a tracker (--sensor tracker uses its orientation)" if sweep.tracker else "none"
+        held = "none" if sniff(path) == "hdf5" else lacking_poses(path)
+        others = "a tracker (--sensor tracker uses its orientation)" if sweep.tracker else held
         raise InsufficientDataError(
             f"{path}: expected readings of the {sensor} sensor there or in --poses, got {others}"
             if sensor == "orientation"
-            else f"{path}: expected readings of a tracker there or in --poses, got none"
+            else f"{path}: expected readings of a tracker there or in --poses, got {others}"
         )
     return found.readings, found.time_offset_s
 
 
-def _readings_of(path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
+def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedPoses | TimedRotations, float]:
     if sniff(path) == "hdf5":
         return _readings(load_sweep(path), path, sensor)
-    tracker = read_poses(path)
+    tracker = read_poses(path, ImportSettings(tracker_transform=transform))
     if sensor == "orientation":
         turned = tracker.readings.world_from_sensor.rotation
         return TimedRotations(tracker.readings.time_s, turned), tracker.time_offset_s

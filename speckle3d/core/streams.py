@@ -61,6 +61,24 @@ class TimedSamples(Generic[Samples]):
         InsufficientDataError
             If a time is outside the samples or in a gap longer than `max_gap_s`.
         """
+        t = self.require_covered(times_s)
+        samples = self.world_from_sensor
+        if len(self) == 1:
+            return samples[np.zeros(t.shape, dtype=int)]
+        turned = self._slerp(t)
+        if isinstance(samples, RigidTransform):
+            moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
+            return RigidTransform.from_components(moved, turned)
+        return turned
+
+    def require_covered(self, times_s: npt.ArrayLike) -> FloatArray:
+        """Return `times_s` as an array if `at` can read them.
+
+        Raises
+        ------
+        InsufficientDataError
+            If a time is outside the samples or in a gap longer than `max_gap_s`.
+        """
         t = np.asarray(times_s, dtype=float)
         missing = np.flatnonzero(~np.atleast_1d(self.covers(t)))
         if missing.size:
@@ -70,14 +88,7 @@ class TimedSamples(Generic[Samples]):
                 f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s, "
                 f"gaps over {self.max_gap_s:g} s are not bridged"
             )
-        samples = self.world_from_sensor
-        if len(self) == 1:
-            return samples[np.zeros(t.shape, dtype=int)]
-        turned = self._slerp(t)
-        if isinstance(samples, RigidTransform):
-            moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
-            return RigidTransform.from_components(moved, turned)
-        return turned
+        return t
 
     @cached_property
     def _slerp(self) -> Slerp:

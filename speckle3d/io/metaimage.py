@@ -7,6 +7,7 @@ orientations such as ``MF`` (x towards the marked side, y far from the probe).
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -66,7 +67,9 @@ class ImportSettings:
     frame_rate_hz
         For sequences without time stamps.
     tracker_transform, reference_transform : str, optional
-        Names of the tracked frames; ``"none"`` for neither. By default PLUS's usual names where they occur.
+        Names of the tracked frames, as ``ToolToTracker``; ``"none"`` for neither. By default PLUS's usual
+        names where they occur: ``ProbeToTracker``, and ``ReferenceTo`` the same world. A transform of which
+        the header holds the inverse, ``TrackerToTool``, is inverted.
     image_to_probe : 4x4 nested tuple, optional
         PLUS's image calibration, pixels to mm; gives the pitch and spacing of B-mode too.
     """
@@ -129,10 +132,19 @@ def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Track
     tracker = _tracker(header, overrides or ImportSettings())
     if tracker is None:
         raise InvalidInputError(
-            f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), "
-            f"got {', '.join(header.transforms) or 'none'}"
+            f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
         )
     return tracker
+
+
+def lacking_poses(path: PathLike) -> str:
+    """Say which transforms an image sequence holds, if not those of the usual names."""
+    header = read_header(path)
+    return f"{', '.join(header.transforms) or 'none'}{_any_of(header)}"
+
+
+def _any_of(header: SequenceHeader) -> str:
+    return ": name the sensor's with --transform" if header.transforms else ""
 
 
 def _geometry(
@@ -210,14 +222,21 @@ def _timestamps(header: SequenceHeader) -> FloatArray:
 
 
 def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None:
-    sensor = _transform_name(header, settings.tracker_transform, "ProbeToTracker")
+    sensor = _transform(header, settings.tracker_transform, "ProbeToTracker")
     if sensor is None:
         return None
-    reference = _transform_name(header, settings.reference_transform, "ReferenceToTracker")
-    names = (sensor,) if reference is None else (sensor, reference)
-    valid = np.array([_status(frame, *(f"{n}TransformStatus" for n in names)) for frame in header.frames])
+    # Poses may be asked for by any name; a reference counts if both are tracked in the same world.
+    moving, world = _ends(sensor.name)
+    usual = "none" if moving == "Reference" else f"ReferenceTo{world}"
+    reference = _transform(header, settings.reference_transform, usual)
+    both = (sensor,) if reference is None else (sensor, reference)
+    valid = np.array(
+        [_status(frame, *(f"{one.held}TransformStatus" for one in both)) for frame in header.frames]
+    )
     if not valid.any():
-        raise InvalidInputError(f"{header.path}: {sensor}TransformStatus: expected a valid one, got none")
+        raise InvalidInputError(
+            f"{header.path}: {sensor.held}TransformStatus: expected a valid one, got none"
+        )
     poses = _poses(header, sensor, valid)
     if reference is not None:
         poses = _poses(header, reference, valid).inv() * poses
@@ -225,25 +244,43 @@ def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None
     return Tracker(TimedPoses(_timestamps(header)[valid], poses[valid]), calibration)
 
 
-def _transform_name(header: SequenceHeader, given: str | None, default: str) -> str | None:
+@dataclass(frozen=True)
+class _Transform:
+    """A tracked transform by the name asked for, and the one the header holds: that, or its inverse."""
+
+    name: str
+    held: str
+
+
+def _transform(header: SequenceHeader, given: str | None, default: str) -> _Transform | None:
+    """Find ``XToY``, which takes points of X to Y, or ``YToX``, its inverse."""
     name = default if given is None else given.removesuffix("Transform")
     if name == "none":
         return None
-    if any(f"{name}Transform" in frame for frame in header.frames):
-        return name
+    moving, world = _ends(name)
+    for held in (name, f"{world}To{moving}"):
+        if any(f"{held}Transform" in frame for frame in header.frames):
+            return _Transform(name, held)
     if given is not None:
-        held = ", ".join(header.transforms) or "none"
-        raise InvalidInputError(f"{header.path}: expected a transform {name}, got {held}")
+        there = ", ".join(header.transforms) or "none"
+        raise InvalidInputError(f"{header.path}: expected a transform {name}, got {there}")
     return None
 
 
-def _poses(header: SequenceHeader, name: str, valid: npt.NDArray[np.bool_]) -> RigidTransform:
-    where = f"{header.path}: {name}Transform"
+def _ends(name: str) -> tuple[str, str]:
+    """Split ``XToY`` as PLUS does, before a capital: ``ToolToTracker`` is of ``Tool`` in ``Tracker``."""
+    found = re.fullmatch(r"(.+?)To([A-Z].*)", name)
+    return (found[1], found[2]) if found else (name, "")
+
+
+def _poses(header: SequenceHeader, asked: _Transform, valid: npt.NDArray[np.bool_]) -> RigidTransform:
+    where = f"{header.path}: {asked.held}Transform"
     matrices = np.tile(np.eye(4), (len(header.frames), 1, 1))
     for i in np.flatnonzero(valid):
-        text = header.frames[i].get(f"{name}Transform", "")
+        text = header.frames[i].get(f"{asked.held}Transform", "")
         matrices[i] = np.reshape(numbers(text, 16, f"{where}[{i}]"), (4, 4))
-    return transforms_from_matrices(_squared(matrices), where)
+    poses = transforms_from_matrices(_squared(matrices), where)
+    return poses if asked.held == asked.name else poses.inv()
 
 
 def _squared(matrices: FloatArray) -> FloatArray:

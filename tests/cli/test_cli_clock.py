@@ -127,6 +127,19 @@ def test_what_a_header_lacks_is_named_by_options_that_there_are(refused, tmp_pat
         assert "_hz" not in line
 
 
+def test_poses_of_another_name_are_listed_and_used_when_asked_for(refused, back, tmp_path):
+    grey = image_sequence(tmp_path / "grey.mha", "BRIGHTNESS", "MET_UCHAR")
+    grey.write_bytes(grey.read_bytes().replace(b"ProbeToTracker", b"ToolToTracker"))
+    command = ("calibrate", "clock", grey, "--pixel-mm", "0.1", "0.1")
+    assert "got ToolToTracker: name the sensor's with --transform" in refused(*command)
+    assert "expected a transform StylusToTracker, got ToolToTracker" in refused(
+        *command, "--transform", "StylusToTracker"
+    )
+    # With poses, what is lacking next is a line in the images.
+    assert "20 frames" in refused(*command, "--transform", "ToolToTracker")
+    assert "--transform" in refused("calibrate", "clock", back, "--transform", "ToolToTracker")
+
+
 def test_tissue_is_not_taken_for_a_plane(refused, back):
     # In 43 frames something like a line is seen; it once followed the sensor by 98 %, 95 ms off.
     assert " 8 numbers" in refused("calibrate", "clock", back)

@@ -107,6 +107,53 @@ def test_transforms_are_chosen_by_name(tmp_path):
         read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
 
 
+def renamed(frames, old, new, change=lambda text: text):
+    return [
+        {
+            name.replace(old, new): change(text) if name == f"{old}Transform" else text
+            for name, text in frame.items()
+        }
+        for frame in frames
+    ]
+
+
+def inverted(text):
+    return text_of(np.linalg.inv(np.reshape([float(x) for x in text.split()], (4, 4))))
+
+
+def test_poses_of_any_name_are_found_with_the_reference_of_their_own_world(tmp_path):
+    probe, reference, frames = tracked(3)
+    tool = renamed(frames, "ProbeToTracker", "ToolToTracker")
+    path = write_mha(tmp_path / "tool.mha", grey(), frames=tool)
+    asked = ImportSettings(tracker_transform="ToolToTracker")
+    found = read_poses(path, asked).readings.world_from_sensor
+    expected = (reference.inv() * probe).as_matrix()
+    np.testing.assert_allclose(found.as_matrix(), expected, atol=3e-3)
+    assert read_metaimage(path, BMODE).tracker is None
+    with pytest.raises(InvalidInputError, match=r"ReferenceToTracker, ToolToTracker.*--transform"):
+        read_poses(path)
+    # In another world that reference says nothing; as a sensor it is not held against itself.
+    bed = write_mha(tmp_path / "bed.mha", grey(), frames=renamed(frames, "ProbeToTracker", "ToolToBed"))
+    found = read_poses(bed, ImportSettings(tracker_transform="ToolToBed")).readings.world_from_sensor
+    np.testing.assert_allclose(found.as_matrix(), probe.as_matrix(), atol=1e-3)
+    itself = read_poses(path, ImportSettings(tracker_transform="ReferenceToTracker"))
+    np.testing.assert_allclose(
+        itself.readings.world_from_sensor.as_matrix(), reference.as_matrix(), atol=1e-3
+    )
+
+
+def test_a_transform_of_which_the_inverse_is_there_is_inverted(tmp_path):
+    probe, reference, frames = tracked(3)
+    frames[1]["ProbeToTrackerTransformStatus"] = "INVALID"
+    turned = renamed(frames, "ProbeToTracker", "TrackerToTool", inverted)
+    path = write_mha(tmp_path / "a.mha", grey(), frames=turned)
+    found = read_poses(path, ImportSettings(tracker_transform="ToolToTracker")).readings
+    # Six digits of hundreds of mm in the inverse, whose rotation has six as well.
+    expected = (reference.inv() * probe)[[0, 2]].as_matrix()
+    np.testing.assert_allclose(found.world_from_sensor.as_matrix(), expected, atol=5e-3)
+    assert len(found) == 2
+
+
 @given(
     scale=st.tuples(st.floats(0.01, 1), st.floats(0.01, 1)),
     seed=st.integers(0, 99),

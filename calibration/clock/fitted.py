@@ -1,0 +1,199 @@
+"""A sensor's clock offset as one more parameter of a calibration with a phantom.
+
+The residuals change with the offset as the sensor moves: their derivative is one more column of the
+calibration's Jacobian, and the offset is solved for together with the calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.chain import Chain, ChainSolution, ImagePoints, as_directions
+from calibration.clock.offset import ClockOffset, covered, delays_around, require_peak
+from calibration.clock.smoothing import smooth
+from calibration.identifiability import InadequateError
+from calibration.solver import SOME_FRAMES, at_first, first_guess, residuals_of, sigma_of
+from calibration.wandering import settle
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.streams import TimedPoses, TimedRotations
+
+STEP_S = 0.02
+"""Steps of the offsets tried first: half a frame at 25 frames/s, in which no hand reverses."""
+
+_ANEW = 15
+"""Of so many offsets tried, one gets a calibration from nothing; others begin from the one beside them."""
+
+_ROUNDS = 3
+"""The next one leaves out the frames that contradict the others at the offset that was found, if it is not
+the one that the round began with."""
+_MOST_STEPS = 10
+_SETTLED = 0.1
+"""Steps end when one is below this share of the standard error."""
+_DERIVATIVE_S = 1e-3
+
+Calibrate = Callable[[ImagePoints], ChainSolution]
+
+
+def estimate_offset(
+    calibrate: Calibrate,
+    points: ImagePoints,
+    readings: TimedPoses | TimedRotations,
+    around_s: float = 0.0,
+    search_s: float = 0.4,
+) -> ClockOffset:
+    """Find the clock offset with which a calibration explains its points best.
+
+    Parameters
+    ----------
+    calibrate : callable
+        May raise `InsufficientDataError`.
+    points : ImagePoints
+        With times; those that have a reading at every offset tried are used, so that all offsets are judged
+        by the same points.
+    readings : TimedPoses or TimedRotations
+    around_s, search_s : float
+        Offsets from `around_s` - `search_s` to `around_s` + `search_s` are tried.
+
+    Raises
+    ------
+    InsufficientDataError
+        If readings cover no frame at all offsets, no offset gives a calibration, the best is at the end of
+        the range, or another is as good.
+    """
+    there = covered(readings, points.times, around_s, search_s)
+    if not there.any():
+        raise InsufficientDataError(
+            f"expected readings from {search_s:g} s before to {search_s:g} s after some frames, to tell the "
+            "clock, got none"
+        )
+    points_at = _Reader(points[there], smooth(readings)).at
+    tried = delays_around(around_s, search_s, STEP_S)
+    misfit = _sigmas(calibrate, points_at, tried) ** 2
+    best = int(np.argmin(misfit))
+    seconds, error = float(tried[best]), np.inf
+    if 0 < best < len(tried) - 1:
+        require_peak(tried, misfit, best)
+    for _ in range(_ROUNDS):
+        begun, solution = seconds, _adequate_or_not(calibrate, points_at(seconds))
+        for _ in range(_MOST_STEPS):
+            chain, step, covariance = _joint_fit(solution, points_at, seconds)
+            solution, error = replace(solution, chain=chain), float(np.sqrt(covariance[-1, -1]))
+            seconds += float(np.clip(step, -STEP_S, STEP_S))
+            if not abs(seconds - around_s) < search_s - STEP_S:
+                raise InsufficientDataError(
+                    f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its "
+                    "end"
+                )
+            if abs(step) < _SETTLED * error:
+                break
+        if abs(seconds - begun) < STEP_S:
+            break
+    return ClockOffset(seconds, error)
+
+
+def with_uncertain_offset(
+    solution: ChainSolution, readings: TimedPoses | TimedRotations, seconds: float
+) -> ChainSolution:
+    """Return a solution whose covariance includes that of the clock offset it was made with."""
+    there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
+    shown = replace(solution, points=solution.points[there], used=solution.used[there])
+    _, _, joint = _joint_fit(shown, _Reader(shown.points, smooth(readings)).at, seconds)
+    along, variance = joint[:-1, -1], joint[-1, -1]
+    covariance = solution.covariance + np.outer(along, along) / variance
+    return replace(solution, noise=replace(solution.noise, covariance=covariance))
+
+
+class _Reader:
+    """Points with the sensor read at another offset, each time of a frame once."""
+
+    def __init__(self, points: ImagePoints, readings: TimedPoses | TimedRotations) -> None:
+        self._points, self._readings = points, readings
+        self._times, self._of_point = np.unique(points.times, return_inverse=True)
+
+    def at(self, seconds: float) -> ImagePoints:
+        read: RigidTransform | Rotation = self._readings.at(self._times - seconds)
+        poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+        return replace(self._points, world_from_sensor=poses[self._of_point])
+
+
+def _joint_fit(
+    solution: ChainSolution, points_at: Callable[[float], ImagePoints], seconds: float
+) -> tuple[Chain, float, FloatArray]:
+    """Solve for chain and offset together: the chain, the offset's step, s, and their covariance.
+
+    The covariance is that of the free parameters, in frames that lie on the image and on the phantom, and of
+    the offset after them.
+    """
+    used, phantom, chain = solution.used, solution.phantom, solution.chain
+    here, later, sooner = (
+        _as_seen(solution, points_at(at))[used]
+        for at in (seconds, seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
+    )
+    change = residuals_of(later, phantom, chain) - residuals_of(sooner, phantom, chain)
+    column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
+    found, noise = settle(here, phantom, chain, solution.free, solution.prior, column)
+    return found, float(noise.step[-1]), noise.covariance
+
+
+def _as_seen(solution: ChainSolution, points: ImagePoints) -> ImagePoints:
+    """The points, or their directions without places for a solution that knows no more."""
+    if not solution.angular:
+        return points
+    if points.pixels.shape == solution.points.pixels.shape:
+        turns = RigidTransform.from_rotation(points.world_from_sensor.rotation)
+        return replace(points, world_from_sensor=turns)
+    return as_directions(points)
+
+
+def _sigmas(
+    calibrate: Calibrate, points_at: Callable[[float], ImagePoints], tried_s: FloatArray
+) -> FloatArray:
+    """Robust standard deviation of the residuals of some frames at every offset."""
+    some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried_s]
+    found = _anew(calibrate, some)
+    sigmas = np.empty(len(tried_s))
+    begins = np.array(sorted(found))
+    begin_of = begins[np.abs(np.arange(len(some))[:, None] - begins).argmin(axis=1)]
+    for begin, solution in found.items():
+        mine = np.flatnonzero(begin_of == begin)
+        # To both sides, each from the solution of the one beside it.
+        for side in (mine[mine >= begin], mine[mine < begin][::-1]):
+            chain = solution.chain
+            for number in side:
+                points = _as_seen(solution, some[number])
+                free = at_first(solution.free, solution.prior)
+                chain = first_guess(points, solution.phantom, chain, free)
+                sigmas[number] = sigma_of(residuals_of(points, solution.phantom, chain))
+    return sigmas
+
+
+def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolution]:
+    """Calibrations from nothing at some of the offsets; at all, until there is one, if those fail."""
+    first = list(range(len(some) // 2 % _ANEW, len(some), _ANEW))
+    found: dict[int, ChainSolution] = {}
+    refusal: InsufficientDataError | None = None
+    for number in first + [k for k in range(len(some)) if k not in first]:
+        if found and number not in first:
+            break
+        try:
+            found[number] = _adequate_or_not(calibrate, some[number])
+        except InsufficientDataError as error:
+            refusal = error
+    if not found:
+        raise InsufficientDataError(
+            f"expected a clock offset that gives a calibration, got none among {len(some)} tried: {refusal}"
+        )
+    return found
+
+
+def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> ChainSolution:
+    """Calibrate, whatever the motion: at a wrong offset it may seem to determine too little."""
+    try:
+        return calibrate(points)
+    except InadequateError as refused:
+        return refused.solution

@@ -1,0 +1,77 @@
+"""How much of a phantom's stated place is believed: what frames left out say, the simpler of two alike."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+from wire_scenes import PIXEL_MM, scene
+
+from calibration.chain import Seen
+from calibration.registration import calibrate_registered, choose
+from speckle3d.core.errors import InsufficientDataError
+
+CORNERS = np.array([[0.0, 0.0, 0.0], [70.0, 0.0, 0.0], [0.0, 48.0, 0.0], [70.0, 48.0, 0.0]])
+
+
+def recording(seed, frames=48):
+    """Dots known to 0.1 mm and poses to 0.1 mm and 0.05 degrees."""
+    shown = scene(seed, frames=frames, degrees=20.0)
+    rng = np.random.default_rng([seed, 1])
+    wires = shown.pixels.shape[1]
+    pixels = shown.pixels + 0.1 * rng.standard_normal(shown.pixels.shape) / PIXEL_MM
+    place, turn = shown.world_from_sensor.as_components()
+    jitter = Rotation.from_rotvec(np.deg2rad(0.05) * rng.standard_normal((frames, 3)))
+    poses = RigidTransform.from_components(place + 0.1 * rng.standard_normal(place.shape), turn * jitter)
+    frame = np.repeat(np.arange(frames), wires)
+    seen = Seen(frame, pixels.reshape(-1, 2), np.tile(np.arange(wires), frames))
+    return shown, seen.points(poses[frame], frame / 10.0)
+
+
+def stated(shown, shift_mm, turn_deg):
+    """The phantom with a place that is wrong, about its middle."""
+    middle = RigidTransform.from_translation([45.0, 20.0, 10.0])
+    wrong = RigidTransform.from_components(
+        shift_mm * np.array([0.6, 0.0, 0.8]),
+        Rotation.from_rotvec(np.deg2rad(turn_deg) * np.array([0.6, 0.8, 0.0])),
+    )
+    place = shown.phantom.world_from_phantom * middle * wrong * middle.inv()
+    return replace(shown.phantom, world_from_phantom=place)
+
+
+def corners_off_mm(solution, shown):
+    step = shown.sensor_from_image.inv() * solution.chain.sensor_from_image
+    return float(np.linalg.norm(step.apply(CORNERS) - CORNERS, axis=1).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shift_mm", "turn_deg", "expected"), [(0.0, 0.0, "held"), (0.0, 2.5, "turned"), (3.0, 2.5, "free")]
+)
+def test_as_much_is_believed_as_is_right(shift_mm, turn_deg, expected):
+    shown, points = recording(4)
+    solution, choice = calibrate_registered(points, stated(shown, shift_mm, turn_deg), PIXEL_MM)
+    assert choice.registration == expected
+    # Dots of 0.1 mm in 48 frames; with the place held, its own error of 3 mm or 2.5 degrees would remain.
+    assert corners_off_mm(solution, shown) < 0.8
+    assert f"place {expected}" in str(choice)
+    for name, missed_mm in choice.missed_mm.items():
+        assert f"{name} {missed_mm:.3f} mm" in str(choice)
+
+
+def test_the_simplest_within_a_standard_error_of_the_best_is_chosen():
+    rng = np.random.default_rng(0)
+    held = 0.3 + 0.02 * rng.standard_normal(8)
+    alike, better = held - 0.001 + 0.01 * np.tile([-1.0, 1.0], 4), held - 0.05
+    assert choose({"held": held, "turned": alike, "free": alike}).registration == "held"
+    assert choose({"held": held, "turned": better, "free": better - 1e-6}).registration == "free"
+    noisy = better - 0.001 + 0.01 * np.tile([-1.0, 1.0], 4)
+    assert choose({"held": held, "turned": better, "free": noisy}).registration == "turned"
+    # One that gives no calibration is no candidate.
+    assert choose({"turned": better, "free": better}).registration == "turned"
+
+
+def test_a_recording_that_no_registration_calibrates_says_why():
+    shown, points = recording(4, frames=4)
+    with pytest.raises(InsufficientDataError, match="at least 6 frames"):
+        calibrate_registered(points, shown.phantom, PIXEL_MM)
