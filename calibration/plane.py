@@ -21,6 +21,7 @@ from calibration.chain import (
     Chain,
     ChainSolution,
     ImagePoints,
+    Phantom,
     PixelPrior,
     SeenAs,
     as_directions,
@@ -43,6 +44,8 @@ _FEWEST_LINES = 6
 _PIXEL_MM = 0.15
 """Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
 
+_BEGINNING = 2
+"""Rounds after which starts that have met go on as one."""
 _HOPELESS = 3.0
 """Ends of iterations whose mean absolute residual is as many times the least are not looked at again."""
 _TRIED = 3
@@ -234,16 +237,24 @@ def settled_angles(
     phantom = LineDirections(np.array([ratio, 1.0]), level)
     free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
     starts = angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals)
-    settled = [first_guess(lines, phantom, start, free) for start in starts]
-    if not settled:
+    if not starts:
         raise InsufficientDataError("expected line directions that are finite, got others")
-    left = [float(np.abs(residuals_of(lines, phantom, chain)).mean()) for chain in settled]
-    order = sorted(range(len(left)), key=lambda k: left[k])
+    begun = [first_guess(lines, phantom, start, free, rounds=_BEGINNING) for start in starts]
+    # Few starts are left, for most meet on the way.
+    settled = [first_guess(lines, phantom, start, free) for start in _different(lines, phantom, begun)]
+    return _different(lines, phantom, settled, _HOPELESS)
+
+
+def _different(
+    lines: ImagePoints, phantom: Phantom, chains: list[Chain], hopeless: float = np.inf
+) -> list[Chain]:
+    """Those that are not one answer, the one that leaves least first, and none that leaves far more."""
+    left = [float(np.abs(residuals_of(lines, phantom, chain)).mean()) for chain in chains]
     found: list[Chain] = []
-    for k in order:
-        near = any(not apart(other, settled[k], lines, phantom) for other in found)
-        if not near and left[k] <= _HOPELESS * left[order[0]]:
-            found.append(settled[k])
+    for k in np.argsort(left):
+        alike = any(not apart(other, chains[k], lines, phantom) for other in found)
+        if not alike and left[k] <= hopeless * min(left):
+            found.append(chains[k])
     return found
 
 

@@ -170,10 +170,16 @@ def probe_parameters(
     return POSE, np.asarray(pixel_mm, dtype=float)
 
 
-def first_guess(points: ImagePoints, phantom: Phantom, start: Chain, free: tuple[str, ...]) -> Chain:
-    """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
+def first_guess(
+    points: ImagePoints,
+    phantom: Phantom,
+    start: Chain,
+    free: tuple[str, ...],
+    rounds: int = _REWEIGHTINGS,
+) -> Chain:
+    """Nearly least absolute residuals, by reweighting at most so often, so that wrong frames pull little."""
     chain, before = start, np.inf
-    for _ in range(_REWEIGHTINGS):
+    for _ in range(rounds):
         size = np.abs(residuals_of(points, phantom, chain))
         if size.mean() > _SETTLED * before:
             break

@@ -32,7 +32,7 @@ def test_times_of_frames_tell_what_wanders():
 def test_errors_of_a_plane_calibration_with_a_drifting_tracker_lie_within_those_claimed():
     found = [plane.judged(plane.Trial(seed, True, (0.15, 0.1), DRIFT)) for seed in range(24)]
     scores = np.abs([one for one in found if one is not None])
-    # In the others, of 8 to 17 s, the drift leaves a corner uncertain by more than 5 mm, and they are refused.
+    # In the others, of 8 to 17 s, the drift leaves a corner uncertain by more than 5 mm: refused.
     assert len(scores) >= 18
     # 160 figures, of which some 70 are independent: 68 and 95 % to 5 and 2.5; with one size of error and no
     # drift claimed they were 46 and 74 %.
