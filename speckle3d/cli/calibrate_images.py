@@ -91,7 +91,8 @@ def calibrate_images(
     if (far := math.hypot(*begin.translation)) > _FAR_MM:
         note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")
     sweeps = one, other
-    _angulation(sweeps, begin).require()
+    # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
+    _angulation(sweeps, begin).require(0.5)
     found = _solve(sweeps, begin, settings)
     told = []
     if back is not None:
