@@ -199,9 +199,8 @@ def _steps(angulation: Angulation, unit: float) -> FloatArray:
     shows = np.append(angulation.alone, [1.0, 1.0])
     shows[:3] /= np.deg2rad(1.0)
     shows[6:] = 0.5 * LEVERS_MM[6:]
-    return np.minimum(
-        WIDE_MM * unit / np.maximum(shows, 1e-6), _FARTHEST * np.repeat([1.0, unit, 1.0], [3, 3, 2])
-    )
+    farthest = _FARTHEST * np.repeat([1.0, unit, 1.0], [3, 3, 2])
+    return np.asarray(np.minimum(WIDE_MM * unit / np.maximum(shows, 1e-6), farthest))
 
 
 def _bends(

@@ -36,6 +36,8 @@ class SceneSettings:
         Tissue, one of `KINDS`.
     crossing_deg, fan_deg : float
         Between the sweeps' directions, and the probe's tilt within each.
+    contrast : float
+        Factor on the tissue's differences in dB.
     drift : float
         Size of the tracker's wandering error: 1 is 0.3 mm and 0.2 degrees over 5 s.
     """
@@ -44,6 +46,7 @@ class SceneSettings:
     kind: str = "mixture"
     crossing_deg: float = 90.0
     fan_deg: float = 40.0
+    contrast: float = 1.0
     drift: float = 0.0
 
 
@@ -67,14 +70,14 @@ def scene(settings: SceneSettings) -> Scene:
     length, frames = rng.uniform(10.0, 24.0), int(rng.integers(40, 60))
     side = max(length, grid.width_mm) + 12.0 + depth * np.tan(np.deg2rad(settings.fan_deg / 2.0))
     size = np.array([side, depth + 10.0, side])
-    level, tilt_of = _tissue(rng, settings.kind, size)
+    level, interfaces = _tissue(rng, settings.kind, size)
+    level *= np.float32(settings.contrast)
     scatterers = rng.standard_normal((2, *level.shape), dtype=np.float32)
     mounting = RigidTransform.from_components(rng.uniform(-90.0, 90.0, 3), Rotation.random(rng=rng))
     made = []
-    # Scanned one way or the other, and the tilt with or against the way.
     for number in range(2):
         poses = _path(rng, frames, length, settings, settings.crossing_deg * number, grid, size)
-        images = _images(rng, level, tilt_of, scatterers, poses, grid)
+        images = _images(rng, level, interfaces, scatterers, poses, grid)
         time_s = np.arange(frames) / rng.choice([8.3, 12.5, 20.0])
         errors = _tracker_errors(rng, time_s, settings.drift)
         about = RigidTransform.from_translation(size / 2.0)
@@ -95,7 +98,7 @@ def _displaced(rng, mounting, grid, amount):
 
 
 def _tissue(rng, kind, size_mm):
-    """Echogenicity in dB over a box (x, depth, z), and how much more its interfaces reflect when met squarely."""
+    """Echogenicity in dB over a box (x, depth, z), and where interfaces reflect when met squarely."""
     shape = tuple((size_mm / _VOXEL_MM).astype(int))
     x, y, z = np.meshgrid(
         *(np.arange(n, dtype=np.float32) * _VOXEL_MM for n in shape), indexing="ij", sparse=True
@@ -106,7 +109,7 @@ def _tissue(rng, kind, size_mm):
     level += (1.0 if kind == "layers" else rng.uniform(2.0, 4.0)) * fine / fine.std()
     interfaces = np.zeros(shape, np.float32)
     if kind in ("blobs", "mixture"):
-        for _ in range(rng.integers(18, 40)):
+        for _ in range(rng.integers(40, 80)):
             centre, radius = rng.uniform(0.05, 0.95, 3) * size_mm, rng.uniform(1.5, 6.0, 3)
             away = np.sqrt(
                 ((x - centre[0]) / radius[0]) ** 2
@@ -181,7 +184,7 @@ def _images(rng, level, interfaces, scatterers, poses, grid):
     thick = np.hypot(0.5, 0.05 * (points[..., 1] - focus))
     gain = rng.uniform(-4.0, 4.0) + rng.uniform(-4.0, 4.0) * (v / grid.samples) ** 2
     edge = -rng.uniform(0.0, 3.0) * np.abs(2.0 * u / grid.vectors - 1.0) ** 3
-    shade, mirror = rng.uniform(0.0, 0.03), rng.uniform(6.0, 14.0)
+    shade, mirror = rng.uniform(0.0, 0.015), rng.uniform(6.0, 14.0)
     frames = np.empty((len(poses), grid.vectors, grid.samples))
     slope = np.stack(np.gradient(gaussian_filter(interfaces, 1.0)), axis=0).astype(np.float32)
     steep = np.sqrt((slope**2).sum(axis=0)) + 1e-6
