@@ -40,6 +40,9 @@ patches, since neighbours show the same speckle and reflections."""
 STRETCH = 3
 """Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
 
+WANDERS = 1.0
+"""Time over which a tracker's error is like itself, in lengths of a sweep: seconds."""
+
 DEEP_MM = 0.1
 """Standard deviation of a displacement along the beam that all of the tissue shares, so that no differences
 between its parts show it, in units of the images' size: a thick beam displays echoes from beside the image
@@ -92,8 +95,8 @@ def certainty(
     """Covariance of an answer from the similarity's curvature, and from three kinds of errors.
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
-    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for a
-    sweep displaces one sweep against the other and shows in no such change; its effect is computed.
+    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
+    seconds displaces one sweep against the other and shows in no such change; its effect is computed.
 
     Parameters
     ----------
@@ -121,9 +124,9 @@ def certainty(
     condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
     tissue = _left_out(slopes, bends, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))), curvature)
     poses = _left_out(slopes, bends, _numbered(np.column_stack(_stretches(refined))), curvature)
-    shifted = np.linalg.solve(curvature, _moved_by_tracker(refined, pulls))
-    size = np.repeat(np.square(tracker), 3)
-    covariance = base @ (tissue + poses + shifted @ np.diag(size) @ shifted.T) @ base.T
+    moved = np.linalg.inv(curvature)
+    wander = moved @ _wandering(refined, pulls, np.repeat(np.square(tracker), 3)) @ moved.T
+    covariance = base @ (tissue + poses + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
     return Certainty(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]], stiffness)
 
@@ -251,11 +254,29 @@ def _fallen(refined: Refined, seen: list[Similarity]) -> FloatArray:
     return np.where(_throughout(refined, seen)[:, None], fallen, 0.0)
 
 
-def _moved_by_tracker(refined: Refined, pulls: FloatArray) -> FloatArray:
-    """Change of the slope as the second sweep is displaced and turned about the tissue, shape (f, 6)."""
+def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> FloatArray:
+    """Covariance of the slope from an error of each sweep's poses that wanders over the sweep's length.
+
+    An image's error counts where the image is compared, and as much again where it is cut.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (6,)
+        Of displacements (mm^2) and turns (rad^2) of one sweep against the other about the tissue.
+    """
     share = np.linalg.norm(pulls, axis=(1, 2))
     arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), 1e-300)
-    return np.hstack([pulls.sum(axis=0), np.einsum("pij,pjk->ik", pulls, -skew(arms))])
+    each = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
+    found = np.zeros((pulls.shape[1],) * 2)
+    for sweep, stack in enumerate(refined.comparison.stacks):
+        ours, image = refined.comparison.images.T
+        sums = np.zeros((len(stack), *each.shape[1:]))
+        np.add.at(sums, image[ours == sweep], each[ours == sweep])
+        lag = np.arange(len(stack)) / (WANDERS * len(stack))
+        alike = np.exp(-np.abs(lag[:, None] - lag))
+        # Half of the variance is this sweep's.
+        found += np.einsum("iak,ij,jbk,k->ab", sums, alike, sums, 0.5 * variance, optimize=True)
+    return found
 
 
 def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvature: FloatArray) -> FloatArray:

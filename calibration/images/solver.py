@@ -93,6 +93,7 @@ class ImageCalibration:
 
     Attributes
     ----------
+    settings : ImageSettings
     sensor_from_image : RigidTransform
     scales, scale_errors : ndarray, shape (2,)
         Factors on the pixel sizes across and along the beams, and their standard errors; one and zero
@@ -121,7 +122,7 @@ class ImageCalibration:
         What was compared, with the numbers of the frames used and held out.
     """
 
-    method: str
+    settings: ImageSettings
     start: RigidTransform
     sensor_from_image: RigidTransform
     scales: FloatArray
@@ -211,7 +212,7 @@ def calibrate_from_sweeps(
         require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, pool)
     covariance = known.covariance
     return ImageCalibration(
-        method=chosen.method,
+        settings=chosen,
         start=start,
         sensor_from_image=near,
         scales=found.scales,

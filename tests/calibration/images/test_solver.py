@@ -178,13 +178,20 @@ def test_delay_of_the_sensor_counts(scene):
     )
 
 
-def test_parallel_sweeps_leave_translation_undetermined():
-    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=0.0)
-    second, *_ = crossing_sweeps(2, frames=20, fan_deg=0.0, crossing_deg=4.0)
+def test_parallel_sweeps_are_refused_however_they_fan():
+    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=50.0, jitter=(0.0, 0.0))
+    second, *_ = crossing_sweeps(2, frames=20, fan_deg=50.0, crossing_deg=4.0, jitter=(0.0, 0.0))
     start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
-    parallel = calibrate_images(first, second, start, REFINE)
-    # Sweeps that cross know it to 0.1 mm.
-    assert np.sqrt(parallel.covariance[4, 4]) > 1.0
+    with pytest.raises(InsufficientDataError, match="turn the probe by about 90 degrees"):
+        calibrate_images(first, second, start, REFINE)
+
+
+@pytest.mark.slow
+def test_sweeps_without_fan_are_refused():
+    first, second, truth = crossing_sweeps(2, frames=30, fan_deg=0.0)
+    start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
+    with pytest.raises(InsufficientDataError, match="tilt the probe to and fro"):
+        calibrate_images(first, second, start, REFINE)
 
 
 def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, found):
