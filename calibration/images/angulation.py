@@ -23,10 +23,10 @@ from speckle3d.core.geometry import skew
 PARAMETERS = ("tilt", "yaw", "roll", "x", "y", "z")
 """Small turns about the image's x, y and z through its centre, and shifts along them."""
 
-REFUSED = 0.12
+REFUSED = 0.15
 """Disagreement in mm of a mm (or of an image's half size times a radian) of calibration error below which
-sweeps are refused: what a tracker displaces one sweep against the other by, 0.15 mm, would be an error of
-over a millimetre. Along the beam, fans of 17 degrees; across, sweeps that cross by 7."""
+sweeps are refused: what a tracker displaces one sweep against the other by, 0.15 mm, would be an error of a
+millimetre. Along the beam, fans of 21 degrees; across, sweeps that cross by 9."""
 
 WEAK = 0.2
 """As `REFUSED`: below, the verdict says "weak"; along the beam, fans of 28 degrees."""
@@ -35,7 +35,7 @@ LEAST_CROSSING_DEG = 10.0
 """Angle between two sweeps below which they are called parallel and refused. By crossing alone an error
 across the image shows by 2 sin(angle / 2), here 0.17 mm of a mm; what shows more comes of the hand's leaning,
 of which other errors take their part: of 28 simulated pairs of parallel sweeps that fan by 30 and 50 degrees
-two passed `REFUSED` by that."""
+one passed `REFUSED` by that."""
 
 _AMPLE = 0.3
 """Disagreement of a mm that crossing, or fans, should bring by themselves for advice not to ask for more."""
