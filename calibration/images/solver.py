@@ -208,7 +208,8 @@ def calibrate_from_sweeps(
         angles.require()
         tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
         known = certainty(refined, angles, crossing.unit, tracker, pool)
-        require_known(known, angles, crossing.centre_mm)
+        if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
+            require_known(known, angles, crossing.centre_mm)
         require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, pool)
     covariance = known.covariance
     return ImageCalibration(
