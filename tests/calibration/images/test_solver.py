@@ -76,8 +76,9 @@ def test_errors_are_within_what_the_covariance_says(scene, found):
     assert (np.abs(centre_error_mm(found.sensor_from_image, truth, grid)) < 4.0 * spread).all()
     turned = (truth.inv() * found.sensor_from_image).rotation.as_rotvec()
     assert (np.abs(turned) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
-    # Neither is it a bound that anything keeps.
-    assert (spread < 0.2).all()
+    # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up most
+    # of it: 0.1 mm across and out of plane, twice that along the beam.
+    assert (spread < [0.15, 0.3, 0.15]).all()
 
 
 def test_covariance_of_a_point_is_that_of_its_place(found):
@@ -159,6 +160,7 @@ def test_pixels_that_never_change_show_nothing(scene):
     np.testing.assert_array_equal(dark, columns < 19.5)
 
 
+@pytest.mark.slow
 def test_frames_without_readings_are_left_out(scene):
     first, second, truth = scene
     kept = slice(6, None)
