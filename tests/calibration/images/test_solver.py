@@ -76,8 +76,8 @@ def test_errors_are_within_what_the_covariance_says(scene, found):
     assert (np.abs(centre_error_mm(found.sensor_from_image, truth, grid)) < 4.0 * spread).all()
     turned = (truth.inv() * found.sensor_from_image).rotation.as_rotvec()
     assert (np.abs(turned) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
-    # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up most
-    # of it: 0.1 mm across and out of plane, twice that along the beam.
+    # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up
+    # most of it: 0.1 mm across and out of plane, twice that along the beam.
     assert (spread < [0.15, 0.3, 0.15]).all()
 
 
