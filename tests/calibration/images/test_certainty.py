@@ -65,6 +65,11 @@ def test_an_answer_that_is_not_known_is_refused_with_what_would_help(certainty, 
     assert f"expected sweeps that tell y to {MOST_MM:g} mm" in str(refusal.value)
 
 
+def test_layers_are_refused_whatever_is_claimed():
+    with pytest.raises(InsufficientDataError, match=r"by 0\.20 of the most, least across .* layers alone"):
+        require_known(known(0.1, (0.2, 1.0, 0.5)), FANNED, CENTRE)
+
+
 @pytest.fixture(scope="module")
 def scene():
     return crossing_sweeps(3, frames=24)
