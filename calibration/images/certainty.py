@@ -68,6 +68,11 @@ MOST_MM, MOST_DEG = 1.0, 2.5
 method agreed with phantoms in vivo (Wein and Khamene 2008), and 5 degrees. It agreed within 4 degrees;
 simulated sweeps of good motion over tissue of low contrast claim up to 2.1 degrees of standard error."""
 
+LEAST_SIMILARITY = 0.3
+"""Correlation of patches where speckle is blurred away, times the root of the share of them with support,
+below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
+0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
+
 RIVAL_MM, CLEAR_LEAD = 3.0, 2.0
 """Distance at which another place found by the search is another answer and not the same one unrefined; and
 the lead over it, in standard errors of their difference, that an answer must have."""
@@ -161,8 +166,8 @@ def require_known(known: Certainty, angulation: Angulation, centre_mm: FloatArra
             way = _SOFTEST[known.stiffness.argmin()]
             raise InsufficientDataError(
                 "expected tissue that changes in all directions, got images that as the sweeps are displaced "
-                f"become unlike by {least:.2f} of the most, least {way}; layers alone do not tell: scan tissue "
-                "with other structure too"
+                f"become unlike by {least:.2f} of the most, least {way}; layers alone do not tell: scan "
+                "tissue with other structure too"
             )
         return
     worst = int(np.argmax(np.concatenate([turns / MOST_DEG, shifts / MOST_MM])))
@@ -202,6 +207,8 @@ def require_one_answer(
         if apart < RIVAL_MM:
             continue
         there = comparison.at(rival, pool=pool)
+        if there.score < LEAST_SIMILARITY:
+            continue
         both = here.valid & there.valid
         lead = here.score - there.score
         blocks = _numbered(np.floor(comparison.places_mm(found.sensor_from_image)[both] / BLOCK_MM))

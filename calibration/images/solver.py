@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import Angulation, angulation, point_motion
-from calibration.images.certainty import certainty, require_known, require_one_answer
+from calibration.images.certainty import LEAST_SIMILARITY, certainty, require_known, require_one_answer
 from calibration.images.fit import refine, settle
 from calibration.images.search import DECIDED, climb, search
 from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress, prepare
@@ -34,11 +34,6 @@ images are worth more than overlapping patches, since the errors of their poses 
 
 SHOWN_SIGMA_MM = 1.0
 """Blur at which similarities are reported, in units of the crossing."""
-
-LEAST_SIMILARITY = 0.3
-"""Correlation of patches where speckle is blurred away, times the root of the share of them with support,
-below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
-0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
 
 SPECKLED_SIMILARITY = 0.45
 """Correlation below which the verdict warns: shadows and reflections that the sweeps do not share
