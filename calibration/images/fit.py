@@ -1,4 +1,4 @@
-"""Gauss-Newton on the correlation of patches, Newton's last steps, and the covariance of the answer.
+"""Gauss-Newton on the correlation of patches, and Newton's last steps.
 
 The patch and its cut, both without their mean and of unit length, differ by a vector whose squared length is
 2 (1 - correlation); its derivative gives Gauss-Newton its matrix, and the exact derivative of the correlation
@@ -6,8 +6,7 @@ its gradient. A patch that stays unlike, or has little structure, counts less (G
 
 Gauss-Newton's matrix is made of the images' squared slopes, in which the slopes of speckle count in full
 although the similarity does not fall off by them: where speckle is strong it is several times too stiff, its
-steps too short, and errors made from it too small. Differences of the exact slopes are free of that, so they
-give the last steps and the covariance.
+steps too short. Differences of the exact slopes are free of that, so they give the last steps.
 """
 
 from __future__ import annotations
@@ -18,10 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import eigh
 
-from calibration.images.angulation import PARAMETERS
 from calibration.images.similarity import Comparison, Estimate, Similarity
-from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
 
 ROBUST = 0.5
@@ -43,24 +40,9 @@ LEAST_CURVATURE = 0.02
 rises, it makes the standard errors so large that the direction is seen to be undetermined. Scenes that
 determine all parameters have shares of 0.1 to 0.7."""
 
-_MOST_STEPS, _LONGEST_MM = 8, 1.0
-"""Steps, and how far one may move the image's edge, mm: over speckle's blur the curvature changes."""
-
-BLOCK_MM = 16.0
-"""Side of the blocks of tissue whose patches have correlated errors, in units of the images' size: a few
-patches, since neighbours show the same reflections."""
-
-STRETCH = 3
-"""Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
-
-SHARED_RAD = np.deg2rad(0.1)
-SHARED_MM = (0.03, 0.1, 0.04)
-"""Standard deviations of errors common to all of the tissue, which differences between its parts cannot show:
-turns, and displacements of the image's centre across, along the beam and out of plane. They are root mean
-squares of the errors in six simulated pairs of sweeps, whatever the start; a thick beam displays echoes from
-beside the image plane too deep."""
-
-NAMES = (*PARAMETERS, "lateral pixel size", "axial pixel size")
+_MOST_STEPS, _LONGEST_MM, _SHORTER = 8, 1.0, 3
+"""Steps, how far one may move the image's edge, mm, since over speckle's blur the curvature changes, and how
+often a step that makes things worse is shortened to a quarter."""
 
 
 @dataclass(frozen=True)
@@ -186,12 +168,20 @@ def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> tuple[Re
         step = np.zeros(len(LEVERS_MM))
         step[list(now.free)] = np.linalg.solve(bend, now.system[1])
         size = float(np.abs(step * LEVERS_MM).max())
-        converged = size < SETTLED
-        if converged:
-            break
-        moved = _stepped(now, step * min(1.0, _LONGEST_MM / size), pool)
-        if not better(now.similarity, moved.similarity, now.weight):
+        step *= min(1.0, _LONGEST_MM / size) if size > 0.0 else 1.0
+        moved = now
+        for _ in range(_SHORTER):
+            converged = float(np.abs(step * LEVERS_MM).max()) < SETTLED
+            if converged:
+                break
+            moved = _stepped(now, step, pool)
+            if better(now.similarity, moved.similarity, now.weight):
+                break
+            step /= 4.0
+        else:
             converged = size < 10.0 * SETTLED  # no better within rounding
+            break
+        if converged:
             break
         now = moved
     return replace(now, converged=converged), bend
@@ -211,7 +201,7 @@ def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Float
             weight = np.where(seen.valid, refined.weight, 0.0)
             slopes.append((base.T @ (weight @ seen.gradient))[chosen])
         found[:, column] = (slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM)
-    return _positive(found, refined.system[0])
+    return positive(found, refined.system[0])
 
 
 def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None) -> Refined:
@@ -221,82 +211,9 @@ def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None
     return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)
 
 
-def _positive(found: FloatArray, normal: FloatArray) -> FloatArray:
-    """Symmetrise, and raise to at least `LEAST_CURVATURE` of Gauss-Newton's matrix in every direction."""
+def positive(found: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:
+    """Symmetrise, and raise to at least a share of a positive matrix in every direction."""
     firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
     part, axes = eigh((found + found.T) / 2.0, firm)
     back = firm @ axes
-    return np.asarray((back * np.maximum(part, LEAST_CURVATURE)) @ back.T)
-
-
-def covariance_at_origin(
-    refined: Refined, curvature: FloatArray, unit: float
-) -> tuple[FloatArray, float, str]:
-    """Sandwich of the curvature and the slopes' scatter over blocks of tissue and stretches of images.
-
-    Errors that differ between blocks of tissue (speckle, reflections) and between images (poses) are summed.
-    Poses count twice: for the images compared, and for as many images cut. Errors common to all of the tissue
-    are added (`SHARED_MM`).
-
-    Parameters
-    ----------
-    curvature : ndarray, shape (f, f)
-        Of the weighted similarity, by the free parameters at the pivot; positive definite.
-    unit : float
-        Size of the images relative to the usual.
-
-    Returns
-    -------
-    covariance : ndarray, shape (8, 8)
-        Of turns, displacements and relative pixel sizes at the image's origin.
-    condition_number : float
-    weakest : str
-        The parameter that makes up most of the least determined direction.
-
-    References
-    ----------
-    .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 5th
-       Berkeley Symposium on Mathematical Statistics and Probability, 1967.
-    """
-    chosen = np.array(refined.free)
-    base = about_pivot(refined.pivot_mm)[:, chosen]
-    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
-    norms = np.sqrt(np.diag(curvature))
-    values, vectors = np.linalg.eigh(curvature / np.outer(norms, norms))
-    condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
-    tissue = _scatter(slopes, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))))
-    poses = _scatter(slopes, _numbered(np.column_stack(_stretches(refined))))
-    moved = base @ np.linalg.inv(curvature)
-    covariance = moved @ (tissue + 2.0 * poses) @ moved.T + _shared(refined.pivot_mm, unit)
-    return covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]]
-
-
-def _shared(pivot_mm: FloatArray, unit: float) -> FloatArray:
-    """Covariance at the origin of errors common to all of the tissue; none for pixel sizes."""
-    variance = np.concatenate([np.full(3, SHARED_RAD), unit * np.array(SHARED_MM), np.zeros(2)]) ** 2
-    base = about_pivot(pivot_mm)
-    return np.asarray(base @ np.diag(variance) @ base.T)
-
-
-def _scatter(slopes: FloatArray, cluster: IntArray) -> FloatArray:
-    """Covariance of the sum of patches' slopes that are correlated within clusters."""
-    count = int(cluster.max()) + 1
-    if count < 2:
-        raise InsufficientDataError(
-            "expected sweeps that share more tissue, got too little to compare its parts"
-        )
-    sums = np.zeros((count, slopes.shape[1]))
-    np.add.at(sums, cluster, slopes)
-    sums -= sums.mean(axis=0)
-    return np.asarray(count / (count - 1.0) * sums.T @ sums)
-
-
-def _numbered(cells: FloatArray) -> IntArray:
-    """Number of each patch's cell, from zero."""
-    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
-
-
-def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
-    """Sweep, and stretch of `STRETCH` images in it, of each patch."""
-    sweep, image = refined.comparison.images.T
-    return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
+    return np.asarray((back * np.maximum(part, least)) @ back.T)

@@ -86,7 +86,9 @@ def notes_of(result: ImageCalibration, angulation: Angulation) -> list[str]:
         f"{angulation.fan_deg[1]:.0f}; they share {100 * angulation.overlap[0]:.0f} % and "
         f"{100 * angulation.overlap[1]:.0f} % of their images",
         "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
-        f"{result.evaluations} comparisons by {result.method}",
+        f"claimed errors allow for a tracker that displaces one sweep against the other by "
+        f"{result.settings.tracker_mm:g} mm and {result.settings.tracker_deg:g} degrees",
+        f"{result.evaluations} comparisons by {result.settings.method}",
     ]
 
 

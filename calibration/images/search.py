@@ -63,13 +63,15 @@ def search(
     capture_rad: float,
     pool: ThreadPoolExecutor,
     progress: Progress | None = None,
-) -> tuple[Estimate, int]:
+) -> tuple[list[Estimate], int]:
     """Search a box of six parameters about the start, from coarse to fine.
 
     Returns
     -------
-    tuple of Estimate and int
-        The best place, and how many were compared.
+    list of Estimate
+        The best places, best first.
+    int
+        How many were compared.
 
     Raises
     ------
@@ -100,7 +102,7 @@ def search(
     decided = box.refined(DECIDED, _distinct(best_first, crossing)[:_DECIDED], "deciding")
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
-    return decided[0].estimate, looks
+    return _distinct(decided, crossing), looks
 
 
 def climb(
@@ -219,12 +221,12 @@ def _distinct(found: list[Refined], crossing: CrossingSweeps) -> list[Estimate]:
     """Estimates without those within `_SAME_MM` of a better one."""
     kept: list[Estimate] = []
     for one in found:
-        if all(_apart(one.estimate, other, crossing.centre_mm) > _SAME_MM for other in kept):
+        if all(apart_mm(one.estimate, other, crossing.centre_mm) > _SAME_MM for other in kept):
             kept.append(one.estimate)
     return kept
 
 
-def _apart(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
+def apart_mm(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
     """Distance between estimates, mm: of the image's centre and of points that turn 20 mm away from it."""
     step = other.sensor_from_image.inv() * one.sensor_from_image
     moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))

@@ -19,8 +19,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.angulation import point_motion
-from calibration.images.fit import covariance_at_origin, curvature, refine, settle
+from calibration.images.angulation import Angulation, angulation, point_motion
+from calibration.images.certainty import LEAST_SIMILARITY, certainty, require_known, require_one_answer
+from calibration.images.fit import refine, settle
 from calibration.images.search import DECIDED, climb, search
 from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress, prepare
 from calibration.images.stacks import TrackedImages
@@ -33,11 +34,6 @@ images are worth more than overlapping patches, since the errors of their poses 
 
 SHOWN_SIGMA_MM = 1.0
 """Blur at which similarities are reported, in units of the crossing."""
-
-LEAST_SIMILARITY = 0.3
-"""Correlation of patches where speckle is blurred away, times the root of the share of them with support,
-below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
-0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
 
 SPECKLED_SIMILARITY = 0.45
 """Correlation below which the verdict warns: shadows and reflections that the sweeps do not share
@@ -58,6 +54,9 @@ class ImageSettings(BaseModel):
     capture_mm, capture_deg : float
         How far each parameter of the start may be off; with zero both, the start is only refined.
         The published method has no such range.
+    tracker_mm, tracker_deg : float
+        Standard deviations, on each axis, of what the tracker displaces and turns one sweep against the
+        other by. No comparison of the images shows it; it is part of the claimed errors.
     threads : int
     """
 
@@ -67,6 +66,8 @@ class ImageSettings(BaseModel):
     scales: bool = False
     capture_mm: float = Field(20.0, ge=0, le=100)
     capture_deg: float = Field(20.0, ge=0, le=90)
+    tracker_mm: float = Field(0.15, ge=0, le=10)
+    tracker_deg: float = Field(0.1, ge=0, le=10)
     threads: int = Field(2, ge=1)
 
 
@@ -87,6 +88,7 @@ class ImageCalibration:
 
     Attributes
     ----------
+    settings : ImageSettings
     sensor_from_image : RigidTransform
     scales, scale_errors : ndarray, shape (2,)
         Factors on the pixel sizes across and along the beams, and their standard errors; one and zero
@@ -94,14 +96,16 @@ class ImageCalibration:
     covariance : ndarray, shape (6, 6)
         Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
         then displacements along them in mm. From how the answer changes when one part of the scanned tissue,
-        or one stretch of a sweep, after another is left out, so it knows of speckle, reflections and jitter;
-        not of an error that all of them share, such as an uncorrected delay of the sensor or a wrong speed of
-        sound. Infinite where the sweeps determine nothing.
+        or one stretch of a sweep, after another is left out, and from what the tracker may displace one sweep
+        against the other by. It does not know of an uncorrected delay of the sensor or a wrong speed of
+        sound.
     condition_number : float
         Of the normal matrix's root with columns scaled to unit norm; a large one means that the sweeps leave
         some motion of the image undetermined.
     weakest : str
         The parameter that makes up most of the least determined direction.
+    stiffness : ndarray, shape (3,)
+        See `Certainty`.
     alike : float
         Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
         support; see `LEAST_SIMILARITY`.
@@ -113,7 +117,7 @@ class ImageCalibration:
         What was compared, with the numbers of the frames used and held out.
     """
 
-    method: str
+    settings: ImageSettings
     start: RigidTransform
     sensor_from_image: RigidTransform
     scales: FloatArray
@@ -122,6 +126,7 @@ class ImageCalibration:
     covariance: FloatArray
     condition_number: float
     weakest: str
+    stiffness: FloatArray
     alike: float
     similarity: Improvement
     held_out: Improvement
@@ -156,7 +161,8 @@ def calibrate_images(
     InvalidInputError, MismatchError
         If the images, grids and start are not what they must be.
     InsufficientDataError
-        If there are too few frames, or the sweeps do not overlap or have nothing in common.
+        If there are too few frames, the sweeps do not overlap or have nothing in common, their motion or the
+        tissue leaves the answer open, or another answer is as good.
     """
     return calibrate_from_sweeps(prepare(first, second, progress), start, settings, progress)
 
@@ -172,7 +178,7 @@ def calibrate_from_sweeps(
         raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageSettings()
     first = found = Estimate(start, np.ones(2))
-    free, looks = tuple(range(8 if chosen.scales else 6)), 0
+    free, looks, rivals = tuple(range(8 if chosen.scales else 6)), 0, list[Estimate]()
     with ThreadPoolExecutor(chosen.threads) as pool:
         if chosen.method == "nelder-mead":
             found, looks, converged = climb(crossing, first, chosen.scales, pool, progress)
@@ -180,31 +186,38 @@ def calibrate_from_sweeps(
             comparison = crossing.level(FINE[-1], found.sensor_from_image)
             refined = refine(comparison, found, free, max_steps=1, pool=pool)
             alike = _require_alike(crossing, found, pool)
-            bend = curvature(refined, pool)
         else:
             if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
                 reach = float(np.deg2rad(chosen.capture_deg))
-                found, looks = search(crossing, first, chosen.capture_mm, reach, pool, progress)
+                (found, *rivals), looks = search(crossing, first, chosen.capture_mm, reach, pool, progress)
             for number, level in enumerate(FINE):
                 refined = refine(crossing.level(level, found.sensor_from_image), found, free, pool=pool)
                 found, looks = refined.estimate, looks + refined.evaluations
                 if progress:
                     progress("refining", number + 1, len(FINE))
             alike = _require_alike(crossing, found, pool)
-            refined, bend = settle(refined, pool)
+            refined, _ = settle(refined, pool)
             found, converged = refined.estimate, refined.converged
-    covariance, condition_number, weakest = covariance_at_origin(refined, bend, crossing.unit)
-    near = found.sensor_from_image
+        near = found.sensor_from_image
+        angles = _angulation(crossing, near)
+        angles.require()
+        tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
+        known = certainty(refined, angles, crossing.unit, tracker, pool)
+        if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
+            require_known(known, angles, crossing.centre_mm)
+        require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, pool)
+    covariance = known.covariance
     return ImageCalibration(
-        method=chosen.method,
+        settings=chosen,
         start=start,
         sensor_from_image=near,
         scales=found.scales,
         scale_errors=np.sqrt(np.diag(covariance)[6:8]),
         pixel_mm=crossing.pixel_mm * found.scales,
         covariance=covariance[:6, :6],
-        condition_number=condition_number,
-        weakest=weakest,
+        condition_number=known.condition_number,
+        weakest=known.weakest,
+        stiffness=known.stiffness,
         alike=alike,
         similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, 10, near), first, found),
         held_out=_improvement(crossing.check(SHOWN_SIGMA_MM, near), first, found),
@@ -212,6 +225,12 @@ def calibrate_from_sweeps(
         converged=converged,
         sweeps=crossing,
     )
+
+
+def _angulation(crossing: CrossingSweeps, sensor_from_image: RigidTransform) -> Angulation:
+    first, second = crossing.used
+    poses = first.world_from_sensor, second.world_from_sensor
+    return angulation(*poses, sensor_from_image, first.corners_mm)
 
 
 def _require_alike(crossing: CrossingSweeps, found: Estimate, pool: ThreadPoolExecutor) -> float:

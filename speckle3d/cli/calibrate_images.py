@@ -68,6 +68,10 @@ def calibrate_images(
     scales: Annotated[bool, typer.Option("--scales", help="Estimate the pixel size too.")] = False,
     capture_mm: Annotated[float, typer.Option(help="How far the start may be off, each way.")] = 20.0,
     capture_deg: Annotated[float, typer.Option(help="The same for its turns.")] = 20.0,
+    tracker_mm: Annotated[
+        float, typer.Option(help="What the tracker may displace one sweep against the other by, each way.")
+    ] = 0.15,
+    tracker_deg: Annotated[float, typer.Option(help="The same for turns.")] = 0.1,
     clock: Annotated[
         Path | None,
         typer.Option(help="Sweep forward and back: solve, find the clock offset from it, solve again."),
@@ -89,7 +93,14 @@ def calibrate_images(
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
     with naming_options():
-        settings = ImageSettings(method=method, scales=scales, capture_mm=capture_mm, capture_deg=capture_deg)
+        settings = ImageSettings(
+            method=method,
+            scales=scales,
+            capture_mm=capture_mm,
+            capture_deg=capture_deg,
+            tracker_mm=tracker_mm,
+            tracker_deg=tracker_deg,
+        )
     for path in (first, second):
         require_unsized(path, pixel_mm)
     known = None if start is None else read_calibration(start)
@@ -101,7 +112,8 @@ def calibrate_images(
     if (far := math.hypot(*begin.translation)) > _FAR_MM:
         note(f"the start puts the image {far:.0f} mm from the sensor: is that so?")
     sweeps = one, other
-    _angulation(sweeps, begin).require()
+    # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
+    _angulation(sweeps, begin).require(0.5)
     found = _solve(sweeps, begin, settings)
     told = []
     if back is not None:

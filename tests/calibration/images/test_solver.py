@@ -76,8 +76,9 @@ def test_errors_are_within_what_the_covariance_says(scene, found):
     assert (np.abs(centre_error_mm(found.sensor_from_image, truth, grid)) < 4.0 * spread).all()
     turned = (truth.inv() * found.sensor_from_image).rotation.as_rotvec()
     assert (np.abs(turned) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
-    # Neither is it a bound that anything keeps.
-    assert (spread < 0.2).all()
+    # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up
+    # most of it: 0.1 mm across and out of plane, twice that along the beam.
+    assert (spread < [0.15, 0.3, 0.15]).all()
 
 
 def test_covariance_of_a_point_is_that_of_its_place(found):
@@ -159,6 +160,7 @@ def test_pixels_that_never_change_show_nothing(scene):
     np.testing.assert_array_equal(dark, columns < 19.5)
 
 
+@pytest.mark.slow
 def test_frames_without_readings_are_left_out(scene):
     first, second, truth = scene
     kept = slice(6, None)
@@ -178,13 +180,20 @@ def test_delay_of_the_sensor_counts(scene):
     )
 
 
-def test_parallel_sweeps_leave_translation_undetermined():
-    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=0.0)
-    second, *_ = crossing_sweeps(2, frames=20, fan_deg=0.0, crossing_deg=4.0)
+def test_parallel_sweeps_are_refused_however_they_fan():
+    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=50.0, jitter=(0.0, 0.0))
+    second, *_ = crossing_sweeps(2, frames=20, fan_deg=50.0, crossing_deg=4.0, jitter=(0.0, 0.0))
     start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
-    parallel = calibrate_images(first, second, start, REFINE)
-    # Sweeps that cross know it to 0.1 mm.
-    assert np.sqrt(parallel.covariance[4, 4]) > 1.0
+    with pytest.raises(InsufficientDataError, match="turn the probe by about 90 degrees"):
+        calibrate_images(first, second, start, REFINE)
+
+
+@pytest.mark.slow
+def test_sweeps_without_fan_are_refused():
+    first, second, truth = crossing_sweeps(2, frames=30, fan_deg=0.0)
+    start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
+    with pytest.raises(InsufficientDataError, match="tilt the probe to and fro"):
+        calibrate_images(first, second, start, REFINE)
 
 
 def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, found):
