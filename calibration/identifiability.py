@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.chain import CHAIN, ChainSolution, ImagePoints, corners_moved, residuals_and_jacobian
+from calibration.chain import CHAIN, ChainSolution, ImagePoints, residuals_and_jacobian
 from calibration.motions import Motion, absent, extents, on_phantom, with_motion
+from calibration.near import corners_moved
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 

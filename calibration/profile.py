@@ -17,15 +17,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.chain import (
-    CHAIN,
-    Chain,
-    ImagePoints,
-    Phantom,
-    corners_moved,
-    on_image,
-    residuals_and_jacobian,
-)
+from calibration.chain import CHAIN, Chain, ImagePoints, Phantom, residuals_and_jacobian
+from calibration.near import corners_moved, on_image
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.leastsquares import levenberg_marquardt
 

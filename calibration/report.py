@@ -13,8 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.chain import SCALES, ChainSolution, free_jacobian, near_jacobian
+from calibration.chain import SCALES, ChainSolution, free_jacobian
 from calibration.identifiability import judge
+from calibration.near import near_jacobian
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
 from speckle3d.core.geometry import roll_yaw_tilt

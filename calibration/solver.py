@@ -22,10 +22,9 @@ from calibration.chain import (
     Phantom,
     PixelPrior,
     free_jacobian,
-    moved_to,
-    on_image,
     residuals_and_jacobian,
 )
+from calibration.near import moved_to, on_image
 from calibration.profile import widened
 from calibration.wandering import settle
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray

@@ -18,7 +18,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import SCALES, Chain, ImagePoints, Phantom, PixelPrior, moved_by, near_jacobian
+from calibration.chain import SCALES, Chain, ImagePoints, Phantom, PixelPrior
+from calibration.near import moved_by, near_jacobian
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
 from speckle3d.core.wander import JITTER, SensorError, WanderingFit, attributed, wandering_fit
