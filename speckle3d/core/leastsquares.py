@@ -1,4 +1,4 @@
-"""Least squares: nonlinear with standard errors, linear and robust, and covariance of clustered residuals.
+"""Least squares: nonlinear with standard errors, linear and robust; how residuals are correlated.
 
 `levenberg_marquardt` solves the chains of calibrations with a phantom and the curves of the drift correction.
 Other nonlinear fits need no standard errors and call SciPy themselves. `robust_linear` serves whatever is
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 
 Residuals = Callable[[FloatArray], FloatArray]
@@ -234,72 +234,6 @@ def robust_linear(
     return RobustFit(np.asarray(found), residuals.reshape(wanted.shape), weight, int(rank))
 
 
-def clustered_covariance(
-    jacobian: FloatArray, residuals: FloatArray, cluster: IntArray, lags: int | None = None
-) -> FloatArray:
-    """Covariance of least squares whose residuals are correlated within clusters and between close ones.
-
-    Parameters
-    ----------
-    jacobian : ndarray, shape (m, p)
-    residuals : ndarray, shape (m,)
-        The same number for each point, in the order of the points.
-    cluster : ndarray of int, shape (n,)
-        Of each point; ascending in time, unless `lags` is zero.
-    lags : int, optional
-        How many clusters apart residuals are still correlated; by default `correlated_lags`.
-
-    Returns
-    -------
-    ndarray, shape (p, p)
-
-    References
-    ----------
-    .. [1] R. M. Bell and D. F. McCaffrey, "Bias reduction in standard errors for linear regression with
-       multi-stage samples", Survey Methodology, 2002 (the jackknife form, CR3).
-    .. [2] W. K. Newey and K. D. West, "A simple, positive semi-definite, heteroskedasticity and
-       autocorrelation consistent covariance matrix", Econometrica, 1987.
-    """
-    index = _cluster_of_each(residuals, cluster)
-    bread = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-15, hermitian=True)
-    order = np.argsort(index, kind="stable")
-    counts = np.bincount(index)
-    starts = np.cumsum(counts) - counts
-    scores = np.zeros((len(counts), jacobian.shape[1]))
-    for size in np.unique(counts):
-        alike = np.flatnonzero(counts == size)
-        members = order[starts[alike][:, None] + np.arange(size)]
-        rows = jacobian[members]
-        # Residuals from the solution without the cluster, which does not pull it towards itself.
-        left = np.eye(size) - rows @ bread @ np.swapaxes(rows, 1, 2)
-        unpulled = np.linalg.pinv(left, rcond=1e-9, hermitian=True) @ residuals[members][:, :, None]
-        scores[alike] = (np.swapaxes(rows, 1, 2) @ unpulled)[:, :, 0]
-    spread = scores.T @ scores
-    reach = correlated_lags(residuals, cluster) if lags is None else lags
-    for lag in range(1, min(reach, len(scores) - 1) + 1):
-        together = scores[lag:].T @ scores[:-lag]
-        spread += (1.0 - lag / (reach + 1.0)) * (together + together.T)
-    return np.asarray(bread @ spread @ bread)
-
-
-def correlated_lags(residuals: FloatArray, cluster: IntArray) -> int:
-    """How many clusters apart the clusters' mean residuals are correlated by more than chance.
-
-    Parameters
-    ----------
-    residuals, cluster
-        See `clustered_covariance`.
-    """
-    index = _cluster_of_each(residuals, cluster)
-    means = np.bincount(index, residuals) / np.bincount(index)
-    means = means - means.mean()
-    energy, most = float(means @ means), len(means) // 4
-    for lag in range(1, most + 1):
-        if means[lag:] @ means[:-lag] < 2.0 * energy / np.sqrt(len(means)):
-            return lag - 1
-    return most
-
-
 def autocorrelation_time(residuals: FloatArray, least_energy: float = 0.0) -> float:
     """How many neighbouring residuals count as one: m / this many of m residuals are independent.
 
@@ -323,11 +257,6 @@ def autocorrelation_time(residuals: FloatArray, least_energy: float = 0.0) -> fl
             break
         time += 2.0 * rho
     return time
-
-
-def _cluster_of_each(residuals: FloatArray, cluster: IntArray) -> IntArray:
-    """Number of the cluster of each residual, from zero and without gaps."""
-    return np.unique(np.repeat(cluster, len(residuals) // len(cluster)), return_inverse=True)[1]
 
 
 def _column_norms(jacobian: FloatArray) -> FloatArray:
