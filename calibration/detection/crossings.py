@@ -25,9 +25,9 @@ from scipy import fft, ndimage
 from skimage.feature import peak_local_max
 
 from calibration.chain import Seen
+from calibration.detection.everyframe import in_every_frame, require_image
 from calibration.detection.region import checked_pixel, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
-from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
 
@@ -103,8 +103,7 @@ def crossings_in_image(
     """
     s = settings or CrossingSettings()
     size = checked_pixel(pixel_mm)
-    if image.ndim != 2 or not np.isrealobj(image):
-        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
+    require_image(image)
     inside = None if region_px is None else region_mask(image.shape, region_px)
     return _crossings(image, size, s, inside, standing)
 
@@ -135,12 +134,7 @@ def crossings_in_frames(
     size, count = checked_pixel(pixel_mm), frames.shape[0]
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
     standing = standing_still(frames)
-    found = []
-    for index in range(count):
-        with naming(f"frame {index}"):
-            found.append(_crossings(np.asarray(frames[index]), size, s, inside, standing)[0])
-        if progress:
-            progress(index + 1, count)
+    found = in_every_frame(frames, lambda image: _crossings(image, size, s, inside, standing)[0], progress)
     held = [len(pixels) for pixels in found]
     return Seen(
         np.repeat(np.arange(count), held),

@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy import ndimage
 from skimage.feature import peak_local_max
 
+from calibration.detection.everyframe import in_every_frame, require_image
 from calibration.detection.region import checked_pixel, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import Frames
@@ -110,8 +110,7 @@ def dots_in_image(
     """
     s = settings or DotSettings()
     size = checked_pixel(pixel_mm)
-    if image.ndim != 2 or not np.isrealobj(image):
-        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
+    require_image(image)
     inside = None if region_px is None else region_mask(image.shape, region_px)
     return _dots(image, size, s, inside)
 
@@ -141,12 +140,7 @@ def dots_in_frames(
     s = settings or DotSettings()
     size, count = checked_pixel(pixel_mm), frames.shape[0]
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    found = []
-    for index in range(count):
-        with naming(f"frame {index}"):
-            found.append(_dots(np.asarray(frames[index]), size, s, inside))
-        if progress:
-            progress(index + 1, count)
+    found = in_every_frame(frames, lambda image: _dots(image, size, s, inside), progress)
     held = [len(score) for _, score in found]
     return Dots(
         frame=np.repeat(np.arange(count), held),
