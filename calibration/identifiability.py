@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.chain import CHAIN, ChainSolution, ImagePoints, residuals_and_jacobian
-from calibration.motions import Motion, absent, extents, on_phantom, with_motion
+from calibration.motions import UP_AND_DOWN, Motion, absent, extents, on_phantom, with_motion
 from calibration.near import corners_moved
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
@@ -148,14 +148,19 @@ def judge(solution: ChainSolution) -> Adequacy:
         )
         return Adequacy(error, condition, (), True, misfit)
     tied = solution.rival is not None and solution.rival.evidence < TIE
+    lacking = absent(solution)
     # Dots of wires tell the image's place from a few frames; what they lack is in their errors.
-    allowed = _ALLOWED_LACKING if absent(solution) and solution.phantom.seen_as != "dot" else 1.0
-    refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied)
+    allowed = _ALLOWED_LACKING if lacking and solution.phantom.seen_as != "dot" else 1.0
+    # Of a plane always equally deep, errors in the poses shrink free pixels, more than any error claimed.
+    unsized = _pixels_unknown(solution) and UP_AND_DOWN in lacking
+    refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied or unsized)
     weak = errors.of_limit(WEAK_MM, WEAK_RAD) > 1
     missing: list[Motion] = []
     if weak or refused:
         scale = errors.of_limit(WEAK_MM, WEAK_RAD) / white.of_limit(WEAK_MM, WEAK_RAD)
         missing = _uncertain(solution, information, min(max(scale, 1.0), _INFLATION) ** 2)
+    if unsized and UP_AND_DOWN not in missing:
+        missing.append(UP_AND_DOWN)
     if tied:
         missing += [motion for motion in _telling(solution) if motion not in missing]
     where = "" if angular else " at the image's corners"
@@ -179,6 +184,11 @@ def judge(solution: ChainSolution) -> Adequacy:
     else:
         verdict = f"the motion was sufficient ({state})"
     return Adequacy(error, condition, tuple(motion.advice for motion in missing), refused, verdict)
+
+
+def _pixels_unknown(solution: ChainSolution) -> bool:
+    """Whether a plane alone is to tell the pixel size."""
+    return solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
 
 
 def _size(error: float, angular: bool) -> str:
@@ -271,7 +281,9 @@ def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float])
         others = [one for one in lacking if one not in needed]
         needed.append(min(others, key=lambda one: error([*needed, one])))
     if needed:
-        return needed
+        # And those that would have helped, had they been there instead.
+        also = [one for one in lacking if one not in needed and _HELPS * error([one]) < now]
+        return [*needed, *also]
     some = [one for one in lacking if without[one] > _HELPS_LITTLE * least] or list(extents(solution))
     best = min(some, key=lambda one: error([one]))
     return [best] if best in lacking or now > _HELPS * error([best]) else []

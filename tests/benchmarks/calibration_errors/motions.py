@@ -224,7 +224,7 @@ def with_wrong_lines(made: Scan, seed: int, share: float = 0.08) -> ImagePoints:
     )
     face = rng.uniform(0.02, 0.06) * rows + 0.005 * rows * rng.standard_normal((len(wrong), 2))
     twice = np.minimum(2.0 * ends[wrong, :, 1], rows)
-    ends[wrong, :, 1] = np.choose(np.broadcast_to(kinds, len(wrong))[:, None], [anywhere * rows, face, twice])
+    ends[wrong, :, 1] = np.choose(np.broadcast_to(kinds, len(wrong))[:, None], [anywhere, face, twice])
     return ImagePoints.of_lines(np.arange(len(ends)), ends, made.readings, made.time_s)
 
 
