@@ -20,7 +20,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import Angulation, angulation, point_motion
-from calibration.images.certainty import LEAST_SIMILARITY, certainty, require_known, require_one_answer
+from calibration.images.certainty import (
+    LEAST_SIMILARITY,
+    RESTARTED,
+    certainty,
+    require_known,
+    require_one_answer,
+)
 from calibration.images.fit import refine, settle
 from calibration.images.search import DECIDED, climb, search
 from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress, prepare
@@ -96,9 +102,9 @@ class ImageCalibration:
     covariance : ndarray, shape (6, 6)
         Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
         then displacements along them in mm. From how the answer changes when one part of the scanned tissue,
-        or one stretch of a sweep, after another is left out, and from what the tracker may displace one sweep
-        against the other by. It does not know of an uncorrected delay of the sensor or a wrong speed of
-        sound.
+        or one stretch of a sweep, after another is left out, from what the tracker may displace one sweep
+        against the other by, and from the scatter of fits that start beside the answer. It does not know of
+        an uncorrected delay of the sensor or a wrong speed of sound.
     condition_number : float
         Of the normal matrix's root with columns scaled to unit norm; a large one means that the sweeps leave
         some motion of the image undetermined.
@@ -202,7 +208,8 @@ def calibrate_from_sweeps(
         angles = _angulation(crossing, near)
         angles.require()
         tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
-        known = certainty(refined, angles, crossing.unit, tracker, pool)
+        restarted = crossing.level(RESTARTED, near)
+        known = certainty(refined, restarted, angles, crossing.unit, tracker, pool)
         if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
             require_known(known, angles, crossing.centre_mm)
         require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, pool)

@@ -260,10 +260,10 @@ def test_settings_are_checked(wrong):
 @pytest.mark.slow
 def test_no_bias_along_the_beams():
     errors = []
-    for seed in range(4):
+    for seed in range(3):
         first, second, truth = crossing_sweeps(seed, frames=36, jitter=(0.0, 0.0))
         start = displaced(truth, np.random.default_rng(seed), 0.5, 0.5)
         result = calibrate_images(first, second, start, REFINE)
         errors.append(centre_error_mm(result.sensor_from_image, truth, first.grid)[1])
-    # Published: 2 mm. A scene's own reflections leave 0.1 mm, half as much of four.
+    # Published: 2 mm. A scene's own reflections leave 0.1 mm, 0.06 mm of the mean of three.
     assert abs(np.mean(errors)) < 0.15
