@@ -98,11 +98,11 @@ class InadequateError(InsufficientDataError):
 
     Attributes
     ----------
-    solution : ChainSolution
-        Still a start for others.
+    solution : ChainSolution, optional
+        Still a start for others; none once the error is shown with the name of what it came from.
     """
 
-    def __init__(self, message: str, solution: ChainSolution) -> None:
+    def __init__(self, message: str, solution: ChainSolution | None = None) -> None:
         super().__init__(message)
         self.solution = solution
 

@@ -196,4 +196,6 @@ def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> ChainSolution
     try:
         return calibrate(points)
     except InadequateError as refused:
+        if refused.solution is None:
+            raise
         return refused.solution
