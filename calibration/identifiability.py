@@ -282,7 +282,8 @@ def _needed(solution: ChainSolution, error: Callable[[Sequence[Motion]], float])
         needed.append(min(others, key=lambda one: error([*needed, one])))
     if needed:
         # And those that would have helped, had they been there instead.
-        also = [one for one in lacking if one not in needed and _HELPS * error([one]) < now]
+        others = [one for one in lacking if one not in needed and solution.phantom.seen_as != "dot"]
+        also = [one for one in others if _HELPS * error([one]) < now]
         return [*needed, *also]
     some = [one for one in lacking if without[one] > _HELPS_LITTLE * least] or list(extents(solution))
     best = min(some, key=lambda one: error([one]))

@@ -76,7 +76,7 @@ def test_pixels_far_from_square_and_unknown_are_found():
     np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM / [1.0, 3.0], rtol=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_any_mounting_is_found(seed):
     rng = np.random.default_rng(seed)
@@ -165,13 +165,13 @@ def test_a_probe_held_still_is_refused():
 def test_claimed_standard_errors_are_those_of_repetition():
     names = ("gamma", "beta", "alpha", "x", "y", "z")
     scores = []
-    for seed in range(120):
+    for seed in range(60):
         scan = scan_plane(np.random.default_rng([seed, 5]), 120, line_noise_mm=0.2)
         solution = calibrate_plane(scan.lines)
         shift, turn = (TRIAL_1.inv() * solution.chain.sensor_from_image).as_components()
         claims = np.sqrt(np.diag(solution.image_covariance(names)))
         scores.append(np.array([*turn.as_rotvec(), *shift]) / claims)
-    # The standard deviation of 120 is known to 6.5 %; three times that, and twelve for the linearisation.
+    # The standard deviation of 60 is known to 9 %; three times that, and a little for the linearisation.
     np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.3)
 
 
