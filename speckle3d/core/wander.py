@@ -30,7 +30,7 @@ WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 JITTER = (0.0, 0.5, 1.5)
 """Sizes tried of the error that is new in every frame and moves all its residuals together."""
 
-STEADY = 0.1
+STEADY = 0.5
 """Probability, before anything is measured, that nothing wanders."""
 
 _TIMES = 4

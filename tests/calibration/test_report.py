@@ -54,8 +54,8 @@ def test_standard_errors_of_the_published_parameters_are_those_of_repetition(sol
     # A standard deviation is known to 1 / sqrt(2 n), a mean to 1 / sqrt(n): three times either.
     np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=3 / np.sqrt(2 * trials))
     # Residuals in mm shrink with the pixels: least squares, as published, prefers smaller ones, by half
-    # a standard error here.
-    few = np.where(np.char.startswith(names, "s_"), 0.7, 0.0)
+    # a standard error here; what of it is left moves the others by a tenth.
+    few = np.where(np.char.startswith(names, "s_"), 0.7, 0.1)
     assert (np.abs(np.mean(scores, axis=0)) < few + 3 / np.sqrt(trials)).all()
 
 
