@@ -156,14 +156,14 @@ def _solved(
     probe: tuple[str, ...],
     outlier_sigma: float,
 ) -> ChainSolution:
-    if stages == "one":
-        given = held if prior is None else prior.pixel_mm
-        starts = _one_stage(lines, given)
-    elif held is not None or prior is not None:
-        starts = _three_stages(lines, held if prior is None else prior.pixel_mm)
-    else:
-        starts = [*_three_stages(lines, None), *_three_stages(lines, np.full(2, _PIXEL_MM))]
-    return best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
+    given = held if prior is None else prior.pixel_mm
+    starts = _one_stage(lines, given) if stages == "one" else _three_stages(lines, given)
+    found = best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
+    if given is not None or stages == "one" or not judge(found).refused:
+        return found
+    # Free pixels may shrink to nothing on the way where the motion is poor.
+    also = _three_stages(lines, np.full(2, _PIXEL_MM))
+    return best_solution(lines, Plane(), [found.chain, *also], probe, outlier_sigma)
 
 
 def _without_prior(

@@ -20,12 +20,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import SCALES, Chain, ImagePoints, Phantom, PixelPrior
 from calibration.near import moved_by, near_jacobian
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.geometry import skew
 from speckle3d.core.wander import JITTER, SensorError, WanderingFit, attributed, wandering_fit
 
 _STEPS = 3
 """The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
+_SETTLED = 0.05
+"""Standard errors of a second step below which there is no third."""
 
 _PROPORTIONS_MM = (0.5, 2.0, 8.0)
 """Errors of position over errors of rotation that are tried, mm per degree: trackers are specified at 0.25 mm
@@ -67,18 +69,22 @@ def settle(
     corrected, expected = points, np.zeros(len(group))
     beside = np.zeros((len(group), 0)) if more is None else more
     further = np.zeros(beside.shape[1])
-    for _ in range(_STEPS):
+    likely: BoolArray | None = None
+    for number in range(_STEPS):
         residuals, jacobian = near_jacobian(corrected, phantom, chain, free)
         error = sensor_error(corrected, phantom, chain)
         # What was taken out of the points, put back as the small thing that it is.
         residuals = residuals + expected + beside @ further
         jacobian = np.hstack([jacobian, beside])
         known = _known(prior, chain, free, len(further))
-        noise = wandering_fit(jacobian, residuals, group, time_s, error, jitter, *known)
+        noise = wandering_fit(jacobian, residuals, group, time_s, error, jitter, *known, likely)
+        likely = noise.likely
         sensor, image = attributed(residuals + jacobian @ noise.step, group, error, noise)
         chain = moved_by(chain, free, noise.step[: len(free)])
         further += noise.step[len(free) :]
         corrected, expected = _corrected(points, phantom, chain, sensor, image)
+        if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
+            break
     return chain, replace(noise, step=np.append(noise.step[: len(free)], further))
 
 

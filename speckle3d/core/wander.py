@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
 
 WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -39,6 +39,9 @@ _TIMES = 4
 _SHORTEST, _LONGEST = 4.0, 2.0
 """Shortest and longest time constant tried: four frames, of which fewer look like white noise; twice the
 recording, which looks like a straight line."""
+
+_NEGLIGIBLE = 1e-4
+"""Weight over the largest below which a size and a time have no say."""
 
 _SINGULAR = 1e-15
 """Ratio of eigenvalues below which a direction counts as not determined."""
@@ -81,6 +84,8 @@ class WanderingFit:
         Its time constant, in the unit of the times given; NaN where nothing wanders.
     spread : ndarray, shape (k,)
         Variances of the components of the sensor's error in a frame, wandering and jitter together.
+    likely : ndarray of bool, shape (g,)
+        Which sizes and times of the grid have a say.
     """
 
     step: FloatArray
@@ -89,6 +94,7 @@ class WanderingFit:
     wander: float
     time_s: float
     spread: FloatArray
+    likely: BoolArray
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,11 @@ class _Grid:
     """Variance of each component of the error whose root mean square effect is one, shape (g, k)."""
     prior: FloatArray
 
+    def __getitem__(self, some: BoolArray) -> _Grid:
+        return _Grid(
+            self.wander[some], self.jitter[some], self.time_s[some], self.unit[some], self.prior[some]
+        )
+
 
 def wandering_fit(
     jacobian: FloatArray,
@@ -112,6 +123,7 @@ def wandering_fit(
     jitter: Sequence[float] = JITTER,
     prior: FloatArray | None = None,
     excess: FloatArray | None = None,
+    likely: BoolArray | None = None,
 ) -> WanderingFit:
     """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
 
@@ -131,6 +143,8 @@ def wandering_fit(
         Inverse covariance of what is known of the parameters besides, in the units of the parameters.
     excess : ndarray, shape (p,), optional
         By how much the present parameters exceed what is known; by default not at all.
+    likely : ndarray of bool, shape (g,), optional
+        `WanderingFit.likely` of the same problem nearby: others of the grid are left out, for time.
 
     Raises
     ------
@@ -141,7 +155,9 @@ def wandering_fit(
     if len(lengths) > 1:
         raise MismatchError(f"expected as many rows of each, got {sorted(lengths)}")
     starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
-    grid = _grid(error, time_s[starts], jitter)
+    whole = _grid(error, time_s[starts], jitter)
+    tried = np.ones(len(whole.prior), dtype=bool) if likely is None else likely
+    grid = whole[tried]
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     known = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
@@ -172,6 +188,7 @@ def wandering_fit(
         float(np.sqrt(weight @ (variance * grid.wander**2))),
         time,
         (weight * variance * (grid.wander**2 + grid.jitter**2)) @ grid.unit,
+        np.isin(np.arange(len(tried)), np.flatnonzero(tried)[weight > _NEGLIGIBLE * weight.max()]),
     )
 
 

@@ -87,9 +87,7 @@ def centre_error_mm(solution):
     return np.linalg.norm(found - TRIAL_1.apply(np.append(pixel * PIXEL_MM, 0.0)))
 
 
-@pytest.mark.parametrize(
-    "done", [tuple(w for k, w in enumerate(SOME) if n >> k & 1) for n in (0, 1, 2, 3, 4, 8, 9, 12)]
-)
+@pytest.mark.parametrize("done", [tuple(w for k, w in enumerate(SOME) if n >> k & 1) for n in (0, 2, 4, 9)])
 def test_doing_as_told_cures_a_plane_calibration(done):
     moves = {word: FULL[word] for word in done}
     told, solution = cured(calibrate_lines, moves, rounds=2)
@@ -100,9 +98,7 @@ def test_doing_as_told_cures_a_plane_calibration(done):
 
 
 @pytest.mark.parametrize("level", [True, False])
-@pytest.mark.parametrize(
-    "done", [("tilt",), ("roll",), ("tilt", "roll"), ("roll", "rotate"), ("tilt", "rotate")]
-)
+@pytest.mark.parametrize("done", [("tilt",), ("tilt", "roll"), ("roll", "rotate")])
 def test_doing_as_told_cures_an_orientation_calibration(done, level):
     solution = cured(
         lambda moves: calibrate_directions(moves, level), {word: FULL[word] for word in done}, rounds=2
