@@ -62,7 +62,7 @@ def test_heights_that_never_change_say_nothing():
     assert np.isnan(bias_along_beam_mm(tilted(np.full(10, 0.1)), 1.0))
 
 
-@pytest.mark.parametrize(("seed", "width_mm"), [(0, 3.0), (1, 1.0)])
+@pytest.mark.parametrize(("seed", "width_mm"), [(0, 3.0)])
 def test_what_is_predicted_is_what_a_thick_beam_does(seed, width_mm):
     thin, thick = (
         calibrate_plane(scan_plane(np.random.default_rng(seed), beam_mm=w).lines, outlier_sigma=np.inf)

@@ -87,7 +87,7 @@ def centre_error_mm(solution):
     return np.linalg.norm(found - TRIAL_1.apply(np.append(pixel * PIXEL_MM, 0.0)))
 
 
-@pytest.mark.parametrize("done", [tuple(w for k, w in enumerate(SOME) if n >> k & 1) for n in (0, 2, 4, 9)])
+@pytest.mark.parametrize("done", [tuple(w for k, w in enumerate(SOME) if n >> k & 1) for n in (2, 9)])
 def test_doing_as_told_cures_a_plane_calibration(done):
     moves = {word: FULL[word] for word in done}
     told, solution = cured(calibrate_lines, moves, rounds=2)
@@ -131,6 +131,7 @@ def test_pixels_that_shrink_to_nothing_are_refused():
         calibrate_lines({"tilt": 25.0, "roll": 15.0, "rotate": 25.0})
 
 
+@pytest.mark.slow
 def test_three_words_for_three_states():
     moves = {"roll": 15.0, "move": 11.0}
     good, weak = lines_of(moves | {"tilt": 25.0}), lines_of(moves | {"tilt": 8.0}, noise_mm=0.4)
@@ -147,6 +148,7 @@ def test_three_words_for_three_states():
     assert weakly.missing == (MOTIONS[0].advice,)
 
 
+@pytest.mark.slow
 def test_exact_lines_do_not_make_any_motion_sufficient():
     lines = lines_of({"tilt": 0.3, "roll": 0.3, "move": 11.0}, noise_mm=0.0)
     with pytest.raises(InsufficientDataError, match="tilt"):

@@ -76,6 +76,7 @@ def test_pixels_far_from_square_and_unknown_are_found():
     np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM / [1.0, 3.0], rtol=1e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_any_mounting_is_found(seed):

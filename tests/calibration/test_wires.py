@@ -110,6 +110,7 @@ def test_wrong_points_in_a_tenth_of_the_frames_hardly_move_a_crossing(seed):
     assert (np.abs(moved_in_errors(spoilt, calibrate_cross_wire(points))) < 1.0).all()
 
 
+@pytest.mark.slow
 def test_few_right_points_are_lost():
     # Noise lies in the image only, and so is not of one size in the phantom's frame: more than one in 16,000
     # exceeds four robust standard deviations.

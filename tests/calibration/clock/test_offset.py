@@ -87,7 +87,7 @@ def orientation_offset(frame_s, pixels, readings, **options):
 @pytest.mark.parametrize(
     ("estimate", "seed"),
     [
-        (from_truth, 0),
+        pytest.param(from_truth, 0, marks=pytest.mark.slow),
         pytest.param(tracker_offset, 0, marks=pytest.mark.slow),
         pytest.param(tracker_offset, 1, marks=pytest.mark.slow),
         pytest.param(orientation_offset, 0, marks=pytest.mark.slow),
