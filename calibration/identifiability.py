@@ -48,6 +48,7 @@ to be the phantom's."""
 _HELPS, _MATTERS = 1.5, 0.5
 """A motion matters if without it the error stays as many times larger, and above this share of a weak one."""
 _HELPS_LITTLE = 1.05
+"""A motion helps at all if without it the error stays larger by a twentieth: less is rounding."""
 _HOPELESS = 10.0
 """Error, as a multiple of a weak one, above which the answer does not even say where the image's axes are:
 all motions that a scan of a plane has not are named."""

@@ -1,4 +1,4 @@
-"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes. The plane module solves for them.
+"""Calibration with wires: a crossing, three orthogonal wires, or N-shapes; solved as planes are.
 
 References
 ----------
