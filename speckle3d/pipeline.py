@@ -20,6 +20,7 @@ from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
+from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import correct_mode, require_modes, sensor_of
@@ -42,7 +43,7 @@ from speckle3d.matching.texture import doubt_band
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import doubt_depths, doubt_widths
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import MIRROR, PairReader, SignedPair
+from speckle3d.motion.estimate import PairReader, SignedPair
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
@@ -73,8 +74,11 @@ class Tracked:
         Share of measured patches outside the consistent subset; NaN without one.
     flags : ndarray of int, shape (n,)
         `FrameFlag` of every frame; zero for those to be trusted.
-    pairs : int
-        Frame pairs that the trajectory was solved from.
+    edges : RelativePoses
+        The frame pairs that the trajectory was solved from, in the sense of motion of `image`; their
+        covariances are those of pairs independent of each other.
+    scale_sigma : float
+        Relative standard deviation of the scale of distances, which all pairs share.
     direction : int
         Sign of the elevational motion, +1 or -1.
     direction_from : str
@@ -94,13 +98,19 @@ class Tracked:
     subset: RigidTransform | None
     rejected_share: float
     flags: IntArray
-    pairs: int
+    edges: RelativePoses
+    scale_sigma: float
     direction: int
     direction_from: str
     coherence: Coherence | None
     slopes: SlopeEvidence
     times: StageTimes
     doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def pairs(self) -> int:
+        """Frame pairs that the trajectory was solved from."""
+        return len(self.edges)
 
 
 def track(
@@ -228,7 +238,8 @@ def track(
         subset=None if subset is None else _seen_from(direction, subset),
         rejected_share=float("nan") if subset is None else _rejected_share(pairs, used),
         flags=_with_unjoined(flags, reader, pairs),
-        pairs=len(pairs),
+        edges=edges if direction > 0 else edges.mirrored(),
+        scale_sigma=scale_sigma(coherence),
         direction=direction,
         direction_from=source,
         coherence=coherence,

@@ -65,6 +65,11 @@ def simulate(
     ] = None,
     reverse: Annotated[bool | None, typer.Option("--reverse", help="rotation: come back.")] = None,
     drift_mm: Annotated[float | None, typer.Option(help="Slow lateral and axial wander (0.5).")] = None,
+    wobble_mm: Annotated[
+        float | None, typer.Option(help="Deliberate to and fro along the sweep (0).")
+    ] = None,
+    wobble_hz: Annotated[float | None, typer.Option(help="Its frequency (3).")] = None,
+    tremor_mm: Annotated[float | None, typer.Option(help="Tremor of the hand in each axis (0.012).")] = None,
     snr_db: Annotated[float | None, typer.Option(help="Speckle over electronic noise (40).")] = None,
     reflector: Annotated[
         str | None, typer.Option(help="plane: wall, or bar (the Cambridge phantom).")

@@ -12,6 +12,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.reconstruction import FramePairs
+from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
@@ -21,7 +22,6 @@ from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, Ech
 from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings, consistent_subset
 from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, SignResolver, pair_signs
 from speckle3d.motion.trajectory import (
-    RelativePoses,
     Trajectory,
     held,
     joined,
@@ -32,8 +32,6 @@ from speckle3d.motion.uncertainty import SlopeEvidence, weigh_slopes
 
 ROWS_AT_ONCE = 1024
 ENOUGH_PAIRS = 3
-MIRROR = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
-"""What a mirror in the first image's plane does to (x, y, z, tilt, yaw, roll)."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import rotation_from_fixed_angles, skew
+from speckle3d.core.relative import RelativePoses
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.planes import PairPlane
@@ -23,27 +24,6 @@ HELD_MM, HELD_RAD = 1.0, 0.05
 """How far a probe may go between two frames: 25 mm and 70 degrees in a second at 25 frames."""
 KNOWN_FRAMES = 80
 """Frames whose covariance is computed; those of the others are interpolated."""
-
-
-@dataclass(frozen=True)
-class RelativePoses:
-    """Edges of the graph: the second frame's pose in the first, about the image's centre.
-
-    Attributes
-    ----------
-    first, second : ndarray, shape (e,)
-    poses : RigidTransform, length e
-    covariance : ndarray, shape (e, 6, 6)
-        Of (x, y, z, tilt, yaw, roll), mm and rad.
-    """
-
-    first: IntArray
-    second: IntArray
-    poses: RigidTransform
-    covariance: FloatArray
-
-    def __len__(self) -> int:
-        return int(self.first.size)
 
 
 def relative_poses_of(

@@ -55,6 +55,8 @@ class HandMotion:
         Physiological tremor, in every axis.
     reverse : bool
         Sweep forward, then back over the same tissue.
+    wobble_mm, wobble_hz : float
+        Deliberate to and fro along the elevational axis: amplitude and frequency, both uneven.
     """
 
     speed_variation: float = 0.3
@@ -68,6 +70,8 @@ class HandMotion:
     tremor_mm: float = 0.012
     tremor_rad: float = np.deg2rad(0.016)
     reverse: bool = False
+    wobble_mm: float = 0.0
+    wobble_hz: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -162,6 +166,8 @@ def hand_sweep(
         if axis != 2:
             columns[:, axis] += slow * band_noise(time, (0.0, 1.0 / duration_s), rng)
         columns[:, axis] += fast * band_noise(time, motion.tremor_band_hz, rng)
+    if motion.wobble_mm > 0:
+        columns[:, 2] += _wobble(time, duration_s, motion, rng)
     return Trajectory(time, columns, pivot, medium_from_start, world_from_medium)
 
 
@@ -237,6 +243,15 @@ def _progress(
     else:
         speed /= speed.sum()
     return np.cumsum(_smoothed(speed))
+
+
+def _wobble(time: FloatArray, duration_s: float, motion: HandMotion, rng: np.random.Generator) -> FloatArray:
+    """To and fro during the sweep, as evenly as a hand can: phase and amplitude wander."""
+    uneven = band_noise(time, (0.0, 0.3), rng)
+    strength = 1.0 + 0.15 * np.tanh(band_noise(time, (0.0, 0.5), rng))
+    during = np.clip(time / 0.5, 0.0, 1.0) * np.clip((duration_s - time) / 0.5, 0.0, 1.0)
+    phase = 2.0 * np.pi * motion.wobble_hz * time + uneven
+    return np.asarray(motion.wobble_mm * strength * _smooth_step(during) * np.sin(phase))
 
 
 def _smoothed(speed: FloatArray) -> FloatArray:

@@ -123,7 +123,13 @@ class _Scene:
 
 
 def _motion(settings: SimulationSettings) -> HandMotion:
-    motion = HandMotion(drift_mm=settings.drift_mm, reverse=_comes_back(settings))
+    motion = HandMotion(
+        drift_mm=settings.drift_mm,
+        reverse=_comes_back(settings),
+        wobble_mm=settings.wobble_mm,
+        wobble_hz=settings.wobble_hz,
+        tremor_mm=settings.tremor_mm,
+    )
     if settings.preset == "crossed":
         fan = float(np.deg2rad(settings.fan_deg))
         return replace(motion, start_rad=(-fan / 2.0, 0.0, 0.0), turn_rad=(fan, 0.0, 0.0))

@@ -39,6 +39,10 @@ class SimulationSettings(BaseModel):
         Of `crossed`: leave it to a calibration to find how the sensors sit on the probe.
     drift_mm : float
         Of hand-held sweeps: slow lateral and axial wander, standard deviation.
+    wobble_mm, wobble_hz : float
+        Of hand-held sweeps: deliberate to and fro along the elevational axis, amplitude and frequency.
+    tremor_mm : float
+        Of hand-held sweeps: tremor in every axis, standard deviation.
     snr_db : float
         Speckle over electronic noise at the transmit focus.
     reflector : str
@@ -74,6 +78,9 @@ class SimulationSettings(BaseModel):
     fan_deg: float = Field(0.0, ge=0, le=90)
     uncalibrated: bool = False
     drift_mm: float = Field(0.5, ge=0, le=20)
+    wobble_mm: float = Field(0.0, ge=0, le=5)
+    wobble_hz: float = Field(3.0, ge=0.5, le=8)
+    tremor_mm: float = Field(0.012, ge=0, le=1)
     snr_db: float = Field(40.0, ge=-10, le=80)
     reflector: Reflector = "wall"
     duration_s: float = Field(30.0, gt=0, le=600)

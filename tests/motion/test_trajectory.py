@@ -10,12 +10,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import relative_poses
+from speckle3d.core.relative import RelativePoses
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import PairSchedule, TrajectorySettings
 from speckle3d.motion import trajectory
 from speckle3d.motion.planes import PairPlane
 from speckle3d.motion.signs import SignResolver, pair_signs
-from speckle3d.motion.trajectory import RelativePoses, held, joined, relative_poses_of, solve_trajectory
+from speckle3d.motion.trajectory import held, joined, relative_poses_of, solve_trajectory
 
 CENTRE_MM = np.array([19.0, 20.0, 0.0])
 SIGMA_MM = 0.45

@@ -1,0 +1,39 @@
+"""Relative poses measured between frames: the edges of a graph whose nodes are the frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.geometry import mirrored
+
+MIRROR = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+"""What a mirror in the first image's plane does to (x, y, z, tilt, yaw, roll)."""
+
+
+@dataclass(frozen=True)
+class RelativePoses:
+    """Edges of the graph: the second frame's pose in the first, about the image's centre.
+
+    Attributes
+    ----------
+    first, second : ndarray, shape (e,)
+    poses : RigidTransform, length e
+    covariance : ndarray, shape (e, 6, 6)
+        Of (x, y, z, tilt, yaw, roll), mm and rad.
+    """
+
+    first: IntArray
+    second: IntArray
+    poses: RigidTransform
+    covariance: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.first.size)
+
+    def mirrored(self) -> RelativePoses:
+        """The same edges of the sweep that went the other way."""
+        return RelativePoses(self.first, self.second, mirrored(self.poses), MIRROR @ self.covariance @ MIRROR)

@@ -1,0 +1,128 @@
+"""RF sweeps whose length is to be found, and curves that do not belong to their probe.
+
+``python tests/benchmarks/length/scenes.py [--first-seed N] [--count N] [--kind KIND ...]`` makes them ahead.
+"""
+
+import argparse
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from cache import DEFAULT, key_of
+
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.io.curves import read_curves, write_curves
+from speckle3d.io.load import load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.phantom_curves import calibrate_curves
+from speckle3d.simulation.beam import Probe, tabulate_beam
+from speckle3d.simulation.medium import fully_developed
+from speckle3d.simulation.movement import stepped_poses
+from speckle3d.simulation.presets import simulate
+from speckle3d.simulation.scan import SimulatedFrames
+from speckle3d.simulation.settings import SimulationSettings
+
+FIRST_SEED = 970_001
+"""Judged seeds count from here; development used 1 to 99."""
+LENGTH_MM = 24.0
+_CROSSED = {"preset": "crossed", "vectors": 96, "samples": 2600, "length_mm": LENGTH_MM, "frames": 150}
+_INERTIAL = {"preset": "tissue", "vectors": 48, "samples": 2600, "length_mm": LENGTH_MM, "frames": 250}
+_STEPS = {"steps": 41, "step_mm": 0.05, "blocks": 3}
+KINDS = ("crossed", "oblique", "wobble", "tremor", "short")
+
+
+def crossing_pair(seed: int, angle_deg: float, folder: Path = DEFAULT) -> tuple[Path, Path]:
+    """Two tissue sweeps of 24 mm that cross in their middle; the first is the same at all angles."""
+    settings = [SimulationSettings(seed=seed, crossing_deg=a, **_CROSSED) for a in (90.0, angle_deg)]
+    stem = f"length-{seed}-{key_of(settings[0].model_dump_json())}"
+    paths = folder / f"{stem}.h5", folder / f"{stem}-crossing-{angle_deg:g}.h5"
+    for number, path in enumerate(paths):
+        _made(path, settings[number], number)
+    return paths
+
+
+def wobbled(seed: int, kind: str, folder: Path = DEFAULT) -> Path:
+    """A tissue sweep of 24 mm in 10 s with an orientation sensor, wobbled on purpose or merely trembling."""
+    motion = {"wobble_mm": 0.5, "wobble_hz": 3.0} if kind == "wobble" else {"tremor_mm": 0.05}
+    settings = SimulationSettings(seed=seed, **_INERTIAL, **motion)
+    return _made(folder / f"{kind}-{seed}-{key_of(settings.model_dump_json())}.h5", settings)
+
+
+def short(seed: int, folder: Path = DEFAULT) -> Path:
+    """A sweep of 3.6 to 6 mm with both sensors, over tissue or a phantom."""
+    settings = SimulationSettings(
+        preset=("tissue", "phantom")[seed % 2],
+        seed=seed,
+        vectors=48,
+        samples=2600,
+        length_mm=3.6 + 0.4 * (seed % 7),
+        frames=45,
+    )
+    return _made(folder / f"short-{seed}-{key_of(settings.model_dump_json())}.h5", settings)
+
+
+def _made(path: Path, settings: SimulationSettings, number: int = 0) -> Path:
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".part{number}.h5")
+        write_sweep(part, simulate(settings)[number].sweep)
+        part.replace(path)
+    return path
+
+
+def stepped_phantom(probe: Probe, attenuation_db_cm_mhz: float, seed: int, folder: Path = DEFAULT) -> Sweep:
+    """Exact steps over fully developed speckle, as decorrelation curves are measured on."""
+    path = folder / f"steps-{seed}-{key_of(f'{probe}{attenuation_db_cm_mhz}{_STEPS}')}.h5"
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        medium = fully_developed(seed, LENGTH_MM)
+        beam = tabulate_beam(probe, attenuation_db_cm_mhz=attenuation_db_cm_mhz)
+        gap_mm = 2.0 * float(beam.elevation_extent_mm.max())
+        poses = stepped_poses(_STEPS["steps"], _STEPS["step_mm"], _STEPS["blocks"], gap_mm)
+        grid = ImageGrid(48, 3818, probe.pitch_mm, probe.signal.sample_spacing_mm)
+        frames = SimulatedFrames(beam, medium, poses, grid, 40.0, seed)
+        times = [number / 25.0 for number in range(len(poses))]
+        write_sweep(path, Sweep(frames, grid, probe.signal, times, truth=poses, name=f"steps-{seed}"))
+    return load_sweep(path)
+
+
+def borrowed_curves(
+    focus_mm: float, attenuation_db_cm_mhz: float, folder: Path = DEFAULT
+) -> DecorrelationCurves:
+    """Curves of a phantom and a lens that are not the sweeps': theirs are 20 mm and 0.5 dB/cm/MHz."""
+    probe = Probe(elevation_focus_mm=focus_mm)
+    path = folder / f"curves-{key_of(f'{probe}{attenuation_db_cm_mhz}{_STEPS}')}.h5"
+    if not path.is_file():
+        sweeps = [stepped_phantom(probe, attenuation_db_cm_mhz, seed, folder) for seed in (11, 12)]
+        write_curves(path, calibrate_curves(sweeps))
+    return read_curves(path)
+
+
+def _make(kind: str, seed: int, folder: Path) -> list[Path]:
+    if kind in ("crossed", "oblique"):
+        return list(crossing_pair(seed, 90.0 if kind == "crossed" else 45.0, folder))
+    return [short(seed, folder) if kind == "short" else wobbled(seed, kind, folder)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--count", type=int, default=6)
+    parser.add_argument("--kind", nargs="*", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--cache", type=Path, default=DEFAULT)
+    options = parser.parse_args()
+    seeds = range(options.first_seed, options.first_seed + options.count)
+    # Spawned, not forked: numba's threads do not survive a fork.
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        for kind in options.kind:
+            for made in pool.map(_make, [kind] * len(seeds), seeds, [options.cache] * len(seeds)):
+                print(*made, flush=True)
+
+
+if __name__ == "__main__":
+    main()
