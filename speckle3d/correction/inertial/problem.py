@@ -8,6 +8,7 @@ beyond the smoothed orientation readings. Unknown numbers: `GLOBALS`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -228,11 +229,10 @@ class InertialProblem:
 
     def _basis(self, time_s: FloatArray, order: int) -> sparse.csr_matrix:
         """Derivatives of the B-splines at some times, one column per coefficient."""
-        design = BSpline.design_matrix(time_s, self._knots, _DEGREE - order)
-        rows = sparse.csr_matrix((design.data, design.indices, design.indptr), shape=design.shape)
+        rows: Any = BSpline.design_matrix(time_s, self._knots, _DEGREE - order)
         for _ in range(order):
-            rows = sparse.csr_matrix((rows[:, :-1] - rows[:, 1:]) / self._h)
-        return rows
+            rows = (rows[:, :-1] - rows[:, 1:]) / self._h
+        return sparse.csr_matrix(rows)
 
     def _interleaved(self, *blocks: sparse.spmatrix) -> sparse.csr_matrix:
         """Columns of position, tilt and yaw coefficient by coefficient, so that little fills in."""
