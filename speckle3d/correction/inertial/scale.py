@@ -42,6 +42,7 @@ _CERTAIN = 25.0
 """Squared deviations by which the accelerometer's sign must be the better one: five sigma."""
 _MOST_TURNED = 0.3
 """Share of the steps that may go the other way than the images have them."""
+_SIGN_ROUNDS = 3
 _BLIND_MM = 1e3
 """Deviation of image steps that say nothing."""
 _CORRELATED_S = 0.4
@@ -98,9 +99,7 @@ def correct_inertial(
     _require_shapes(image, covariance, time_s, centre)
     readings = inertial_readings(sensor, time_s)
     steps = (relative_poses(image).apply(centre) - centre)[:, 2]
-    signs = _signs(readings, time_s, steps, s)
-    steps = np.where(signs.turned, -steps, steps)
-    problem, found = _solved(readings, ImageSteps(time_s, steps, _expected_error(steps)), signs, s)
+    signs, problem, found = _settled(readings, time_s, steps, s)
     sigma = _scale_error(problem, found, s)
     _require_told(found, sigma, scale_sigma, s)
     log_scale = float(found.values[0])
@@ -151,7 +150,32 @@ def _knot_hz(readings: Readings, s: InertialSettings) -> float:
     return min(s.knot_hz, 0.6 / float(np.median(np.diff(readings.time_s))))
 
 
-def _signs(readings: Readings, time_s: FloatArray, steps: FloatArray, s: InertialSettings) -> SettledSigns:
+def _settled(
+    readings: Readings, time_s: FloatArray, steps: FloatArray, s: InertialSettings
+) -> tuple[SettledSigns, InertialProblem, Solution]:
+    """Signs of the steps, and the answer with them: twice, because lever arm and signs need each other."""
+    signs = _signs(readings, time_s, steps, _prior(s), s)
+    for _ in range(_SIGN_ROUNDS):
+        right = np.where(signs.turned, -steps, steps)
+        problem, found = _solved(readings, ImageSteps(time_s, right, _expected_error(steps)), signs, s)
+        again = _signs(readings, time_s, steps, _known(problem.prior, found), s)
+        if (again.turned == signs.turned).all():
+            break
+        signs = again
+    return signs, problem, found
+
+
+def _known(prior: Prior, found: Solution) -> Prior:
+    """What is known of sensor and lever arm after a first answer."""
+    values, sigma = found.values.copy(), np.sqrt(np.diag(found.covariance))
+    # Clock and scale are tried anew.
+    values[:3], sigma[:3] = prior.mean[:3], prior.sigma[:3]
+    return Prior(values, np.minimum(sigma, prior.sigma))
+
+
+def _signs(
+    readings: Readings, time_s: FloatArray, steps: FloatArray, prior: Prior, s: InertialSettings
+) -> SettledSigns:
     """Signs of the steps by the accelerometer, as far as it is certain of them.
 
     Raises
@@ -161,7 +185,7 @@ def _signs(readings: Readings, time_s: FloatArray, steps: FloatArray, s: Inertia
     """
     clock_range = _CLOCK_RANGE * s.clock_sigma_s
     blind = ImageSteps(time_s, steps, np.full(steps.size, _BLIND_MM))
-    problem = InertialProblem(readings, blind, _prior(s), _knot_hz(readings, s), clock_range)
+    problem = InertialProblem(readings, blind, prior, _knot_hz(readings, s), clock_range)
     alone = problem.solve(rounds=2)
     signs = settled_signs(lambda t: problem.position(alone, t), time_s, steps, clock_range)
     if signs.certainty < _CERTAIN:
