@@ -26,7 +26,6 @@ from speckle3d.correction.inertial.problem import (
     Prior,
     Readings,
     Solution,
-    reweighted,
 )
 from speckle3d.correction.inertial.readings import inertial_readings
 from speckle3d.correction.inertial.settings import ASSUMPTION, InertialSettings
@@ -42,7 +41,7 @@ _CERTAIN = 25.0
 """Squared deviations by which the accelerometer's sign must be the better one: five sigma."""
 _MOST_TURNED = 0.3
 """Share of the steps that may go the other way than the images have them."""
-_SIGN_ROUNDS = 3
+_SIGN_ROUNDS, _NOISE_ROUNDS = 3, 4
 _BLIND_MM = 1e3
 """Deviation of image steps that say nothing."""
 _CORRELATED_S = 0.4
@@ -153,16 +152,21 @@ def _knot_hz(readings: Readings, s: InertialSettings) -> float:
 def _settled(
     readings: Readings, time_s: FloatArray, steps: FloatArray, s: InertialSettings
 ) -> tuple[SettledSigns, InertialProblem, Solution]:
-    """Signs of the steps, and the answer with them: twice, because lever arm and signs need each other."""
-    signs = _signs(readings, time_s, steps, _prior(s), s)
+    """Signs of the steps, and the answer with them: in turn, because lever arm and signs need each other."""
+    blind = ImageSteps(time_s, steps, np.full(steps.size, _BLIND_MM))
+    clock_range = 3.0 * _CLOCK_RANGE * s.clock_sigma_s
+    problem = InertialProblem(readings, blind, _prior(s), _knot_hz(readings, s), clock_range)
+    signs = _signs(problem, None, s)
+    found: Solution | None = None
     for _ in range(_SIGN_ROUNDS):
-        right = np.where(signs.turned, -steps, steps)
-        problem, found = _solved(readings, ImageSteps(time_s, right, _expected_error(steps)), signs, s)
-        again = _signs(readings, time_s, steps, _known(problem.prior, found), s)
+        right = ImageSteps(time_s, np.where(signs.turned, -steps, steps), _expected_error(steps))
+        seeing, found = _solved(problem.told(right), signs, found)
+        again = _signs(problem.told(blind, _known(problem.prior, found)), found, s)
         if (again.turned == signs.turned).all():
             break
         signs = again
-    return signs, problem, found
+    assert found is not None
+    return signs, seeing, found
 
 
 def _known(prior: Prior, found: Solution) -> Prior:
@@ -173,21 +177,27 @@ def _known(prior: Prior, found: Solution) -> Prior:
     return Prior(values, np.minimum(sigma, prior.sigma))
 
 
-def _signs(
-    readings: Readings, time_s: FloatArray, steps: FloatArray, prior: Prior, s: InertialSettings
-) -> SettledSigns:
+def _signs(blind: InertialProblem, nearby: Solution | None, s: InertialSettings) -> SettledSigns:
     """Signs of the steps by the accelerometer, as far as it is certain of them.
+
+    Parameters
+    ----------
+    blind : InertialProblem
+        In which steps say nothing.
+    nearby : Solution, optional
 
     Raises
     ------
     MismatchError
-        If it is, and they are not the images'.
+        If it is certain, and they are not the images'.
     """
-    clock_range = _CLOCK_RANGE * s.clock_sigma_s
-    blind = ImageSteps(time_s, steps, np.full(steps.size, _BLIND_MM))
-    problem = InertialProblem(readings, blind, prior, _knot_hz(readings, s), clock_range)
-    alone = problem.solve(rounds=2)
-    signs = settled_signs(lambda t: problem.position(alone, t), time_s, steps, clock_range)
+    steps, alone = blind.steps.steps_mm, blind.solve(nearby, rounds=2)
+    signs = settled_signs(
+        lambda time_s: blind.position(alone, time_s),
+        blind.steps.time_s,
+        steps,
+        _CLOCK_RANGE * s.clock_sigma_s,
+    )
     if signs.certainty < _CERTAIN:
         return replace(signs, turned=np.zeros(steps.size, dtype=bool), clock_s=0.0, log_scale=0.0)
     share = float(np.abs(steps[signs.turned]).sum() / np.abs(steps).sum())
@@ -200,21 +210,21 @@ def _signs(
 
 
 def _solved(
-    readings: Readings, steps: ImageSteps, signs: SettledSigns, s: InertialSettings
+    problem: InertialProblem, signs: SettledSigns, nearby: Solution | None
 ) -> tuple[InertialProblem, Solution]:
-    """Solve twice or more, until the error of the image steps is what is left of them."""
-    problem = InertialProblem(
-        readings, steps, _prior(s), _knot_hz(readings, s), 3.0 * _CLOCK_RANGE * s.clock_sigma_s
-    )
-    start = problem.prior.mean.copy()
-    start[0], start[2] = signs.log_scale, signs.clock_s
-    found = problem.solve(start)
-    for _ in range(4):
+    """Solve, and again with the error of the image steps that is left of them."""
+    if nearby is None:
+        start = problem.prior.mean.copy()
+        start[0], start[2] = signs.log_scale, signs.clock_s
+        found = problem.solve(start)
+    else:
+        found = problem.solve(nearby)
+    for _ in range(_NOISE_ROUNDS):
         left = found.image_residuals / np.sqrt(np.maximum(1.0 - found.leverage, 0.05))
         factor = robust_sigma(left, 0.05)
-        problem = reweighted(problem, problem.steps.sigma_mm * factor)
-        found = problem.solve(found.values)
-        if abs(np.log(factor)) < 0.03:
+        problem = problem.told(replace(problem.steps, sigma_mm=problem.steps.sigma_mm * factor))
+        found = problem.solve(found)
+        if abs(np.log(factor)) < 0.05:
             break
     return problem, found
 

@@ -13,7 +13,7 @@ from speckle3d.core.leastsquares import robust_sigma
 _SCALES = np.exp(np.linspace(-0.3, 0.3, 7))
 _CLOCK_STEP_S = 0.005
 _ERROR_MM = 0.01
-"""Least error of a felt change of step: white noise of a good accelerometer, integrated twice over a frame."""
+"""Least error of a felt change of step: a good accelerometer's noise, integrated twice over a frame."""
 _SHARE = 0.1
 """Error of a step over its size while clock and scale are settled roughly."""
 _TURN_COST = 12.0

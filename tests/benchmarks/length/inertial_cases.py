@@ -1,6 +1,6 @@
 """Poses and inertial readings of hand-held sweeps whose images misjudge distances, without any images.
 
-The motion is the simulator's, with a wobble that may rock the probe; the sensor is the simulator's, at another
+The motion is the simulator's, with a wobble that may rock the probe; the sensor is, too, at another
 place, rate, quality and clock each time. What images do wrong is drawn here, after what was measured on RF
 sweeps and beyond it: a common scale, one that changes along the sweep with the tissue, noise of frames and of
 steps, a quadrature bias, single wrong steps, runs of the wrong sign, turns that drift.
