@@ -16,7 +16,7 @@ _SMOOTH_S = 0.15
 _NODE_S = 0.05
 _TREMOR_HZ = 12.0
 """Hands do not tremble faster; above, readings are noise."""
-_LEAST_HZ = 40.0
+LEAST_HZ = 40.0
 """Fewer readings a second do not follow a tremor of 12 Hz: 3.3 in a period."""
 _HELD = 3
 """Readings in a row at the same extreme value that show a sensor's range."""
@@ -97,9 +97,9 @@ def _require_sampling(time_s: FloatArray, frame_time_s: FloatArray, gap_s: float
             f"inertial scale: expected readings of the orientation sensor over the frames, got {time_s.size}"
         )
     hz = 1.0 / float(np.median(np.diff(time_s)))
-    if hz < _LEAST_HZ:
+    if hz < LEAST_HZ:
         raise InsufficientDataError(
-            f"inertial scale: expected at least {_LEAST_HZ:g} readings a second, got {hz:.0f}; set the "
+            f"inertial scale: expected at least {LEAST_HZ:g} readings a second, got {hz:.0f}; set the "
             "sensor to a higher rate"
         )
     gap = float(np.diff(time_s).max())

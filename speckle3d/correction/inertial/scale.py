@@ -132,11 +132,14 @@ def _require_shapes(
         )
 
 
-def _expected_error(steps: FloatArray) -> FloatArray:
-    return np.hypot(_STEP_MM, _STEP_SHARE * steps)
+def expected_error(
+    steps_mm: FloatArray, constant_mm: float = _STEP_MM, share: float = _STEP_SHARE
+) -> FloatArray:
+    """Standard deviation of image steps, a constant and a share of each."""
+    return np.hypot(constant_mm, share * steps_mm)
 
 
-def _prior(s: InertialSettings) -> Prior:
+def prior_of(s: InertialSettings) -> Prior:
     """Means and deviations of `GLOBALS`; those of the scale tell nothing."""
     bias = float(np.deg2rad(s.gyroscope_bias_deg_s))
     mean = np.array([0.0, 0.0, 0.0, *s.lever_mm, 0.0, 0.0, 0.0, 0.0])
@@ -144,9 +147,9 @@ def _prior(s: InertialSettings) -> Prior:
     return Prior(mean, np.array(sigma))
 
 
-def _knot_hz(readings: Readings, s: InertialSettings) -> float:
+def knot_hz(read_s: FloatArray, s: InertialSettings) -> float:
     """Knots a second: fewer than readings, or there would be nothing to check them by."""
-    return min(s.knot_hz, 0.6 / float(np.median(np.diff(readings.time_s))))
+    return min(s.knot_hz, 0.6 / float(np.median(np.diff(read_s))))
 
 
 def _settled(
@@ -155,11 +158,11 @@ def _settled(
     """Signs of the steps, and the answer with them: in turn, because lever arm and signs need each other."""
     blind = ImageSteps(time_s, steps, np.full(steps.size, _BLIND_MM))
     clock_range = 3.0 * _CLOCK_RANGE * s.clock_sigma_s
-    problem = InertialProblem(readings, blind, _prior(s), _knot_hz(readings, s), clock_range)
+    problem = InertialProblem(readings, blind, prior_of(s), knot_hz(readings.time_s, s), clock_range)
     signs = _signs(problem, None, s)
     found: Solution | None = None
     for _ in range(_SIGN_ROUNDS):
-        right = ImageSteps(time_s, np.where(signs.turned, -steps, steps), _expected_error(steps))
+        right = ImageSteps(time_s, np.where(signs.turned, -steps, steps), expected_error(steps))
         seeing, found = _solved(problem.told(right), signs, found)
         again = _signs(problem.told(blind, _known(problem.prior, found)), found, s)
         if (again.turned == signs.turned).all():
