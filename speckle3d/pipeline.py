@@ -43,7 +43,7 @@ from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import PairReader, SignedPair
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
-from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
+from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
@@ -64,7 +64,7 @@ class Tracked:
     image : RigidTransform, length n
         Poses from all patches.
     covariance : ndarray, shape (n, 6, 6)
-        Of `image`; see `speckle3d.motion.uncertainty`.
+        Of `image`; see `speckle3d.motion.uncertainty`. What the curves' mismatch does is in it.
     subset : RigidTransform, length n, or None
         Poses from the orientation-consistent patches.
     rejected_share : float
@@ -75,7 +75,10 @@ class Tracked:
         The frame pairs that the trajectory was solved from, in the sense of motion of `image`; their
         covariances are those of pairs independent of each other.
     scale_sigma : float
-        Relative standard deviation of the scale of distances, which all pairs share.
+        Relative standard deviation of the scale of distances, which all pairs share: that of the images' own
+        adaptation and `curves_sigma`, the root of the sum of squares.
+    curves_sigma : float
+        The part of it that is the curves' mismatch with this probe and tissue.
     direction : int
         Sign of the elevational motion, +1 or -1.
     direction_from : str
@@ -97,6 +100,7 @@ class Tracked:
     flags: IntArray
     edges: RelativePoses
     scale_sigma: float
+    curves_sigma: float
     direction: int
     direction_from: str
     coherence: Coherence | None
@@ -215,6 +219,12 @@ def track(
             sweep, trajectory.poses, covariance, found.table, pairs, matcher, curves, flags
         )
 
+    # Checks ask what contradicts images and curves as given: a mismatch shows in them and excuses nothing.
+    # Claimed errors include it.
+    mismatch = curves.mismatch(settings.curves.same_probe)
+    whole = with_common_scale(covariance, trajectory.poses, matcher.centre_mm, mismatch)
+    sigma = float(np.hypot(scale_sigma(coherence), mismatch))
+
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
         sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
@@ -227,16 +237,17 @@ def track(
         subset, used = _consistent(sensors.trusted, table, pairs, direction, reader, settings)
 
     if sink:
-        for rows in reader.rows(table, pairs, edges, used, direction, scale_sigma(coherence)):
+        for rows in reader.rows(table, pairs, edges, used, direction, sigma):
             sink(rows)
     return Tracked(
         image=_seen_from(direction, trajectory.poses),
-        covariance=covariance if direction > 0 else MIRROR @ covariance @ MIRROR,
+        covariance=whole if direction > 0 else MIRROR @ whole @ MIRROR,
         subset=None if subset is None else _seen_from(direction, subset),
         rejected_share=float("nan") if subset is None else _rejected_share(pairs, used),
         flags=_with_unjoined(flags, reader, pairs),
         edges=edges if direction > 0 else edges.mirrored(),
-        scale_sigma=scale_sigma(coherence),
+        scale_sigma=sigma,
+        curves_sigma=mismatch,
         direction=direction,
         direction_from=source,
         coherence=coherence,
