@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import Sweep
@@ -9,6 +11,7 @@ from speckle3d.correction.crossing.pair import CrossedPair, CrossingSweep, cross
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.trust import believed
 from speckle3d.matching.intensity import IntensityExtractor
+from speckle3d.motion.corrected_curves import corrected_curves
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.pipeline import Progress, Tracked, after, track
 
@@ -67,4 +70,20 @@ def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Con
         float(tracked.slopes.deviation_per_mm.max()),
         sensed_orientation(believed(sweep, tracked.doubts), config.sensors),
         tracked.flags,
+    )
+
+
+def curves_from(
+    tracked: Sequence[Tracked], pair: CrossedPair, curves: DecorrelationCurves
+) -> DecorrelationCurves:
+    """Correct the curves that a crossing pair was read with by what the crossing says of its lengths.
+
+    Parameters
+    ----------
+    tracked : sequence of Tracked
+        The first and the second sweep.
+    """
+    sides = pair.first, pair.second
+    return corrected_curves(
+        curves, tracked, [side.log_scale for side in sides], [side.log_scale_sigma for side in sides]
     )

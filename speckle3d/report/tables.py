@@ -242,10 +242,12 @@ def summary_lines(
     if words := reference_words(references or {}):
         lines.append(f"{words[0].upper()}{words[1:]}.")
     if fitted_to_reference({row["mode"] for row in means}, references or {}):
-        pose = label_of("pose")
+        fitted = [label_of(row["mode"]) for row in means if row["mode"] in FITTED_TO_TRACKER]
+        named = " and ".join(fitted)
         lines.append(
-            f"{pose[0].upper()}{pose[1:]} was fitted to the tracker that it is compared with: its errors say "
-            "how well it fits, not how right it is."
+            f"{named[0].upper()}{named[1:]} {'was' if len(fitted) == 1 else 'were'} fitted to the tracker that "
+            f"{'it is' if len(fitted) == 1 else 'they are'} compared with: the errors say how well it fits, not "
+            "how right it is."
         )
     if broken:
         lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below.")

@@ -63,5 +63,4 @@ class Companion:
     def curves(self, tracked: Tracked, pair: CrossedPair) -> DecorrelationCurves:
         """The curves, corrected by what the crossing says of both sweeps' lengths."""
         assert self._tracked is not None
-        sweeps = (self.first, self.second)
-        return curves_from(sweeps, self._curves, (tracked, self._tracked), pair, self._config)
+        return curves_from((tracked, self._tracked), pair, self._curves)

@@ -143,18 +143,21 @@ def write_results(
     settings, modes, source = request.config, request.modes, request.source
     began = time.perf_counter()
     sweep, mounted = apply_calibrations(request.sweep, request.calibrations)
-    crossing = None if request.crossing is None else request.crossing[0]
+    crossing = None
+    if request.crossing is not None:
+        crossing, _ = apply_calibrations(request.crossing[0], request.calibrations)
     compared = require_possible(sweep, modes, request.reference, settings, crossing is not None)
-    strip, side = Strip(sweep, settings), CrossedSide.of(sweep, crossing, settings)
+    strip = Strip(sweep, settings)
+    side = None if crossing is None else Companion(sweep, crossing, request.curves, settings)
     path = directory / RESULTS.primary
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
         held = None if blocks is None else partial(blocks.read, strip=strip)
         sink = strip.keep if side is None else side.beside(strip.keep)
-        shown = progress if side is None else after(progress, 0, len(sweep) + len(side.second))
+        shown = progress if side is None else after(progress, 0, side.frames)
         tracked = track(sweep, request.curves, settings, shown, writer.append_pairs, sink, held)
         crossed, refusal = None, ""
         if side is not None:
-            crossed, refusal = side.cross(tracked, request.curves, settings, progress)
+            crossed, refusal = side.cross(tracked, progress)
         corrections, left_out = _corrected(tracked, sweep, modes, settings, crossed, refusal)
         poses = {"image": tracked.image}
         if tracked.subset is not None and SUBSET in modes:
@@ -176,9 +179,9 @@ def write_results(
         len(sweep),
         share,
         _errors(sweep, poses, moved, compared),
-        details_of(tracked, corrections, crossed, moved, provenance),
-        tracked.doubts,
-        doubted_modes(sweep, poses, tracked, corrections),
+        details_of(tracked, corrections, moved, provenance),
+        (*tracked.doubts, *contradictions(corrections)),
+        doubted_modes(sweep, tracked, poses, corrections),
         left_out,
         claims_of(tracked, sweep.grid.centre_mm, corrections),
     )
@@ -186,7 +189,7 @@ def write_results(
     files += [save_figure(figure_drift(moved, _title(summary)), directory / "drift.png")]
     files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
     table, seconds = summary_text(summary), time.perf_counter() - began
-    curves = None if side is None or crossed is None else side.corrected_curves(tracked, crossed)
+    curves = None if side is None or crossed is None else side.curves(tracked, crossed)
     return JobResult(directory, summary, table, tuple(files), seconds, curves)
 
 

@@ -10,10 +10,12 @@ from pathlib import Path
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.printable import written_path
+from speckle3d.core.reconstruction import SourceFile
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.modes import require_modes
 from speckle3d.correction.trust import cleaned_readings
-from speckle3d.io.hdf5 import PathLike
+from speckle3d.io.hdf5 import PathLike, sha256_of
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.scoring.references import Reference, find_reference
 
@@ -38,8 +40,8 @@ class Request:
     config : Config
     calibrations : sequence of path
         Calibration files, at most one for each sensor, in place of what the sweep says of its sensors.
-    crossing : Sweep, optional
-        A second sweep over the same tissue, for mode `crossed`.
+    crossing : tuple of Sweep and path, optional
+        A second sweep over the same tissue and its file, for the modes `crossed` and `fused`.
     """
 
     sweep: Sweep
@@ -49,7 +51,15 @@ class Request:
     reference: str | None = None
     config: Config = field(default_factory=Config)
     calibrations: Sequence[PathLike] = ()
-    crossing: Sweep | None = None
+    crossing: tuple[Sweep, Path] | None = None
+
+    @property
+    def crossing_file(self) -> SourceFile | None:
+        """The crossing sweep's file, for the record."""
+        if self.crossing is None:
+            return None
+        path = self.crossing[1]
+        return SourceFile(written_path(path), sha256_of(path))
 
 
 def require_possible(
