@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
-from speckle3d.correction.crossing.settings import CrossingSettings
+from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
-from speckle3d.correction.fused.settings import FusedSettings
+from speckle3d.correction.fused.fuse import FusedSettings
 from speckle3d.correction.inertial.settings import InertialSettings
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings

@@ -1,10 +1,9 @@
-"""Tracked sweeps corrected in every mode: by cubics, by a crossing sweep, by inertia, by all that is known."""
+"""Tracked sweeps corrected in every mode: by cubics, a crossing sweep, inertia, all that is known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, MismatchError
@@ -114,11 +113,6 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
     with suppress(InsufficientDataError, MismatchError):
         require_modes(sweep, ["inertial"])
         evidence += _inertial(tracked, sweep, config).evidence
-    usable = {
-        name: sensor if sensor is not None and sensor.sensor_from_image is not None else None
-        for name, sensor in (("orientation", sweep.orientation), ("tracker", sweep.tracker))
-    }
-    sweep = replace(sweep, **usable)
     return fuse(
         tracked.edges,
         tracked.image,

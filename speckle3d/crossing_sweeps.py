@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.crossing.pair import CrossedPair, CrossingSweep, crossed
+from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
+from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.correction.trust import believed
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.corrected_curves import corrected_curves

@@ -46,7 +46,7 @@ def reconstruct(
     drift: Annotated[
         list[str] | None,
         typer.Option(
-            help="Correction mode: orientation, pose, fused, inertial, crossed or image+subset; may be repeated."
+            help="Correction mode: orientation, pose, fused, inertial, crossed or image+subset; repeatable."
         ),
     ] = None,
     crossing_file: Annotated[

@@ -10,7 +10,6 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, nami
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 from speckle3d.correction.drift import DriftCorrection, DriftSettings, correct_orientation, correct_pose
 
-
 PUBLISHED = ("orientation", "pose")
 """The modes of Housden et al. 2008, which fit cubics."""
 DRIFT_MODES = (*PUBLISHED, "crossed", "inertial", "fused")
@@ -37,7 +36,9 @@ def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) ->
         where = f"{sweep.name}: drift mode {mode}"
         if mode == "crossed":
             if not crossing:
-                raise InsufficientDataError(f"{where}: expected a crossing sweep (--crossing SWEEP), got none")
+                raise InsufficientDataError(
+                    f"{where}: expected a crossing sweep (--crossing SWEEP), got none"
+                )
             continue
         sensor = sensor_of(sweep, mode)
         if sensor is None:

@@ -200,12 +200,13 @@ def _read_provenance(file: h5py.File) -> Provenance:
     # Older files have no such group.
     held = find_group(file, "calibrations") or {}
     calibrations = [
-        CalibrationFile(sensor, **read_attributes(require_group(held, sensor), _SOURCE))
-        for sensor in held
+        CalibrationFile(sensor, **read_attributes(require_group(held, sensor), _SOURCE)) for sensor in held
     ]
     crossed = find_group(file, "crossing")
     crossing = None if crossed is None else SourceFile(**read_attributes(crossed, _SOURCE))
-    return Provenance(**read_attributes(file, _PROVENANCE), calibrations=tuple(calibrations), crossing=crossing)
+    return Provenance(
+        **read_attributes(file, _PROVENANCE), calibrations=tuple(calibrations), crossing=crossing
+    )
 
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:

@@ -11,6 +11,7 @@ import numpy as np
 from speckle3d.report.data import Record
 from speckle3d.study.figures import colour_of, label_of
 from speckle3d.study.overall import (
+    FITTED_TO_TRACKER,
     QUANTITIES,
     beats,
     counted,
@@ -243,11 +244,10 @@ def summary_lines(
         lines.append(f"{words[0].upper()}{words[1:]}.")
     if fitted_to_reference({row["mode"] for row in means}, references or {}):
         fitted = [label_of(row["mode"]) for row in means if row["mode"] in FITTED_TO_TRACKER]
-        named = " and ".join(fitted)
+        named, (were, are) = " and ".join(fitted), (("was", "it is"), ("were", "they are"))[len(fitted) > 1]
         lines.append(
-            f"{named[0].upper()}{named[1:]} {'was' if len(fitted) == 1 else 'were'} fitted to the tracker that "
-            f"{'it is' if len(fitted) == 1 else 'they are'} compared with: the errors say how well it fits, not "
-            "how right it is."
+            f"{named[0].upper()}{named[1:]} {were} fitted to the tracker that {are} compared with: the errors "
+            "say how well it fits, not how right it is."
         )
     if broken:
         lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below.")

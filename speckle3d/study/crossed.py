@@ -47,9 +47,7 @@ class Companion:
         """Track the second sweep and cross it with the first, which is tracked; or say why that fails."""
         shown = after(progress, len(self.first), self.frames)
         try:
-            self._tracked = track(
-                self.second, self._curves, self._config, shown, images=self._stacks[1].keep
-            )
+            self._tracked = track(self.second, self._curves, self._config, shown, images=self._stacks[1].keep)
             sides = [
                 crossing_side(sweep, each, stack, self._config)
                 for sweep, each, stack in zip(

@@ -110,5 +110,3 @@ def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
         "parameters": dict(zip(fit.names, fit.parameters.tolist(), strict=True)),
         "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
     }
-
-

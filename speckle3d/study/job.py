@@ -3,40 +3,43 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import require_modes, sensor_of
-from speckle3d.correction.trust import believed, cleaned_readings, name_of, require_believed
+from speckle3d.correction.crossing.pair import CrossedPair
+from speckle3d.correction.fused.fuse import FusedPoses
+from speckle3d.correction.modes import PUBLISHED
+from speckle3d.correction.trust import believed, require_believed
+from speckle3d.corrections import Correction, correct
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike, sha256_of
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.matching.quality import describe
-from speckle3d.motion.direction import sensed_orientation
-from speckle3d.pipeline import Progress, Tracked, correct, track
+from speckle3d.pipeline import Progress, Tracked, after, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
-from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
+from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
+from speckle3d.study.crossed import Companion
+from speckle3d.study.details import claims_of, details_of, doubted_modes
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_plane
+from speckle3d.study.request import SUBSET, Request, require_possible
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
+
 
 @dataclass(frozen=True)
 class JobResult:
@@ -180,7 +183,7 @@ def write_results(
         share,
         _errors(sweep, poses, moved, compared),
         details_of(tracked, corrections, moved, provenance),
-        (*tracked.doubts, *contradictions(corrections)),
+        (*tracked.doubts, *_contradictions(corrections)),
         doubted_modes(sweep, tracked, poses, corrections),
         left_out,
         claims_of(tracked, sweep.grid.centre_mm, corrections),
@@ -250,6 +253,12 @@ def _corrected(
                 raise
             left_out[mode] = str(error)
     return corrections, left_out
+
+
+def _contradictions(corrections: Mapping[str, Correction]) -> tuple[Doubt, ...]:
+    """What fusing found of the sensors that checks before had not."""
+    fused = [each for each in corrections.values() if isinstance(each, FusedPoses)]
+    return tuple(doubt for each in fused for doubt in each.contradictions)
 
 
 def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:

@@ -134,7 +134,19 @@ def plan_sweep(
     folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
     mounted = tuple(each.resolve() for each in calibrations)
     return SweepJob(
-        name, path, folder, found, settings_toml, modes, reference, mounted, sha256, key, frames, stamp, crossing
+        name,
+        path,
+        folder,
+        found,
+        settings_toml,
+        modes,
+        reference,
+        mounted,
+        sha256,
+        key,
+        frames,
+        stamp,
+        crossing,
     )
 
 

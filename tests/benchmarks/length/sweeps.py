@@ -1,7 +1,7 @@
-"""RF sweeps through the public command: lengths by crossing, inertia and fusion, with curves right and wrong.
+"""RF sweeps through the public command: lengths by crossing, inertia, fusion, with curves right and wrong.
 
-A case is `wrong` where its length is off by more than three of its own claimed standard deviations and by more
-than twice the case's target.
+A sweep is confident and wrong where its length is off by more than three of its own claimed standard deviations
+and by more than twice the case's target.
 """
 
 import json
@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from length.rows import Row
 from length.scenes import borrowed_curves, crossing_pair, short, wobbled
-
 from speckle3d.io.curves import write_curves
 
 RIGHT = Path(__file__).resolve().parents[3] / "data" / "curves.h5"
@@ -25,8 +25,7 @@ RIGHT = Path(__file__).resolve().parents[3] / "data" / "curves.h5"
 SHEET = """# A data sheet whose focal length is 15 % off: the sweeps' lens focuses at 20 mm.
 elevation_aperture_mm = 5.0
 elevation_focus_mm = 23.0
-centre_frequency_hz = 7.5e6
-bandwidth_hz = [5e6, 10e6]
+band_mhz = [5.0, 10.0]
 attenuation_db_cm_mhz = 0.5
 """
 
@@ -72,7 +71,7 @@ class Case:
 
 
 def wrong_curves(cache: Path) -> Path:
-    """Curves of a lens that focuses at 22 mm, in a phantom of 0.8 dB/cm/MHz; the sweeps have 20 mm and 0.5."""
+    """Curves of a lens that focuses at 22 mm, in 0.8 dB/cm/MHz; the sweeps have 20 mm and 0.5."""
     path = cache / "wrong-curves.h5"
     if not path.is_file():
         write_curves(path, borrowed_curves(22.0, 0.8, cache))
@@ -200,7 +199,10 @@ def measure(seeds: Sequence[int], cache: Path, workers: int = 2, only: str = "")
             for mode in case.modes:
                 mine = [each for some in found for each in some if each.mode == mode]
                 rows.append(_row(case, mode, mine))
-                print(f"  {rows[-1].case}\n      {rows[-1].figures}\n      target: {rows[-1].target}", flush=True)
+                print(
+                    f"  {rows[-1].case}\n      {rows[-1].figures}\n      target: {rows[-1].target}",
+                    flush=True,
+                )
     return rows
 
 
