@@ -246,8 +246,8 @@ def summary_lines(
         fitted = [label_of(row["mode"]) for row in means if row["mode"] in FITTED_TO_TRACKER]
         named, (were, are) = " and ".join(fitted), (("was", "it is"), ("were", "they are"))[len(fitted) > 1]
         lines.append(
-            f"{named[0].upper()}{named[1:]} {were} fitted to the tracker that {are} compared with: the errors "
-            "say how well it fits, not how right it is."
+            f"{named[0].upper()}{named[1:]} {were} fitted to the tracker that {are} compared with: the "
+            "errors say how well it fits, not how right it is."
         )
     if broken:
         lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below.")

@@ -37,7 +37,7 @@ _MODES = {
     "inertial": ("inertial scale", "#56B4E9"),
     "fused": ("all that is known, fused", "#882255"),
 }
-"""Label and colour of each mode, from Okabe and Ito's palette and Tol's: told apart with any colour vision."""
+"""Label and colour of each mode, from Okabe and Ito's and Tol's palettes, told apart with any vision."""
 
 _SPARE_COLOURS = ("#F0E442", "#999999", "#44AA99")
 _REFERENCE_COLOUR = "#000000"

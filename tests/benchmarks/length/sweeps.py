@@ -1,7 +1,7 @@
 """RF sweeps through the public command: lengths by crossing, inertia, fusion, with curves right and wrong.
 
-A sweep is confident and wrong where its length is off by more than three of its own claimed standard deviations
-and by more than twice the case's target.
+A sweep is confident and wrong where its length is off by more than three of its own claimed deviations and
+by more than twice the case's target.
 """
 
 import json
