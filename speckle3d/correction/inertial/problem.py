@@ -40,6 +40,7 @@ GRAVITY_M_S2 = 9.80665
 
 _SCALE, _SLOPE, _CLOCK, _LEVER, _FORCE, _RATE, _QUADRATURE = 0, 1, 2, slice(3, 6), 6, slice(7, 9), 9
 _DEGREE = 5
+_PROBES = 8
 _ROUNDS = 12
 _SETTLED = 0.03
 """Change of the globals, over the deviation that each would have were all others known, at which iteration
@@ -169,6 +170,7 @@ class InertialProblem:
         self._m = self._knots.size - _DEGREE - 1
         self._phase = np.linspace(-0.5, 0.5, steps.time_s.size)
         self._phase = (self._phase[1:] + self._phase[:-1]) / 2.0
+        self._anchor_s = np.arange(self._knots[_DEGREE], self._knots[-_DEGREE - 1], 1.0 / _ANCHORS_HZ)
         t = readings.time_s
         self._value, self._rate, self._acceleration = (self._basis(t, order) for order in (0, 1, 2))
         self._fixed = self._fixed_rows()
@@ -202,6 +204,26 @@ class InertialProblem:
             if turn > least and np.abs(step[-len(GLOBALS) :] / sigma).max() < _SETTLED:
                 break
         return self._solution(x, weights)
+
+    def sensor_misfit(self, found: Solution) -> float:
+        """Squared residuals of accelerometer, gyroscope and slow orientation over those expected: about one.
+
+        The share that the fit follows is found by random probes.
+
+        References
+        ----------
+        .. [1] M. F. Hutchinson, "A stochastic estimator of the trace of the influence matrix for Laplacian
+           smoothing splines", Commun. Stat. Simul. Comput. 19, 1990.
+        """
+        jacobian, residual = self._system(found.coefficients, found.weights)
+        first = self.steps.steps_mm.size
+        rows = slice(first, first + 3 * self.readings.time_s.size + 2 * self._anchor_s.size)
+        sensed, left = jacobian[rows], residual[rows]
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], (sensed.shape[0], _PROBES))
+        pulled = sensed.T @ probes
+        solver = splu((jacobian.T @ jacobian).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0)
+        followed = float(np.sum(pulled * solver.solve(pulled))) / _PROBES
+        return float(left @ left) / max(left.size - followed, 1.0)
 
     def position(self, found: Solution, time_s: FloatArray) -> FloatArray:
         """Elevational position at any times on the sensor's clock, mm."""
@@ -262,8 +284,7 @@ class InertialProblem:
             self._with_globals(self._interleaved(none, self._rate, none), {_RATE.start: one}),
             self._with_globals(self._interleaved(none, none, self._rate), {_RATE.start + 1: one}),
         ]
-        anchor_s = np.arange(self._knots[_DEGREE], self._knots[-_DEGREE - 1], 1.0 / _ANCHORS_HZ)
-        anchors = self._basis(anchor_s, 0)
+        anchors = self._basis(self._anchor_s, 0)
         empty = sparse.csr_matrix(anchors.shape)
         knots = self._knots[_DEGREE:-_DEGREE]
         bend = self._basis(knots, 2)
