@@ -36,6 +36,8 @@ _REMEDY = "wobble the probe by half a millimetre, two or three times a second"
 _FEWEST_FRAMES = 30
 _STEP_MM, _STEP_SHARE = 0.005, 0.02
 """Error of an image step: a constant and a share of it, in proportion; their size is found from the data."""
+_EXPECTED_COUNT = 20.0
+"""How many independent steps the error expected of them counts for against what is left of them."""
 _CLOCK_RANGE = 2.0
 """Clock offsets are tried up to so many times their standard deviation."""
 _CERTAIN = 25.0
@@ -236,13 +238,17 @@ def _solved(
         found = problem.solve(start)
     else:
         found = problem.solve(nearby)
+    ratio = 1.0
     for _ in range(_NOISE_ROUNDS):
-        left = found.image_residuals / np.sqrt(np.maximum(1.0 - found.leverage, 0.05))
-        factor = robust_sigma(left, 0.05)
-        problem = problem.told(replace(problem.steps, sigma_mm=problem.steps.sigma_mm * factor))
+        free = np.maximum(1.0 - found.leverage, 0.05)
+        left, count = ratio * robust_sigma(found.image_residuals / np.sqrt(free)), float(free.sum())
+        # Where the fit follows nearly every step, what is left of them tells little.
+        new = float(np.sqrt((_EXPECTED_COUNT + count * left**2) / (_EXPECTED_COUNT + count)))
+        problem = problem.told(replace(problem.steps, sigma_mm=problem.steps.sigma_mm * (new / ratio)))
         found = problem.solve(found)
-        if abs(np.log(factor)) < 0.05:
+        if abs(np.log(new / ratio)) < 0.05:
             break
+        ratio = new
     return problem, found
 
 
