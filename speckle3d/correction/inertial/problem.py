@@ -7,7 +7,8 @@ beyond the smoothed orientation readings. Unknown numbers: `GLOBALS`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,11 @@ GRAVITY_M_S2 = 9.80665
 
 _SCALE, _SLOPE, _CLOCK, _LEVER, _FORCE, _RATE, _QUADRATURE = 0, 1, 2, slice(3, 6), 6, slice(7, 9), 9
 _DEGREE = 5
+_PROBES = 8
 _ROUNDS = 12
-_SETTLED = 1e-4
-"""Change of the globals over their standard deviation at which iteration stops."""
+_SETTLED = 0.03
+"""Change of the globals, over the deviation that each would have were all others known, at which iteration
+stops."""
 _FREE_M_S2, _FREE_RAD_S2 = 30.0, 300.0
 """Accelerations that no hand exceeds: a prior that matters only where nothing was measured."""
 _ANCHORS_HZ, _ANCHOR_RAD = 2.0, float(np.deg2rad(0.5))
@@ -167,27 +170,60 @@ class InertialProblem:
         self._m = self._knots.size - _DEGREE - 1
         self._phase = np.linspace(-0.5, 0.5, steps.time_s.size)
         self._phase = (self._phase[1:] + self._phase[:-1]) / 2.0
+        self._anchor_s = np.arange(self._knots[_DEGREE], self._knots[-_DEGREE - 1], 1.0 / _ANCHORS_HZ)
         t = readings.time_s
         self._value, self._rate, self._acceleration = (self._basis(t, order) for order in (0, 1, 2))
         self._fixed = self._fixed_rows()
 
-    def solve(self, start: FloatArray | None = None, rounds: int = _ROUNDS) -> Solution:
-        """Gauss-Newton from the prior's mean, or from `start`."""
-        values = np.array(self.prior.mean if start is None else start, dtype=float)
-        x = np.concatenate([np.zeros(3 * self._m), values])
-        weights = np.ones(self.steps.steps_mm.size)
+    def told(self, steps: ImageSteps, prior: Prior | None = None) -> InertialProblem:
+        """The same readings with other steps of the same frames, or another prior."""
+        again = copy(self)
+        again.steps = steps
+        if prior is not None:
+            again.prior = prior
+            again._fixed = again._fixed_rows()
+        return again
+
+    def solve(self, start: Solution | FloatArray | None = None, rounds: int = _ROUNDS) -> Solution:
+        """Gauss-Newton from the prior's mean, from `GLOBALS`, or from a solution nearby."""
+        if isinstance(start, Solution):
+            x, weights = start.coefficients, cauchy_weights(self._image(start.coefficients)[1])
+        else:
+            values = self.prior.mean if start is None else start
+            x, weights = np.concatenate([np.zeros(3 * self._m), values]), np.ones(self.steps.steps_mm.size)
+        least = 0 if isinstance(start, Solution) else 2
         for turn in range(rounds):
             jacobian, residual = self._system(x, weights)
             normal = (jacobian.T @ jacobian).tocsc()
             solver = splu(normal, permc_spec="NATURAL", diag_pivot_thresh=0.0)
             step = solver.solve(-(jacobian.T @ residual))
             x = x + self._limited(step)
-            if turn > 1:
+            if turn >= least:
                 weights = cauchy_weights(self._image(x)[1])
             sigma = np.sqrt(1.0 / normal.diagonal()[-len(GLOBALS) :])
-            if turn > 3 and np.abs(step[-len(GLOBALS) :] / sigma).max() < _SETTLED:
+            if turn > least and np.abs(step[-len(GLOBALS) :] / sigma).max() < _SETTLED:
                 break
         return self._solution(x, weights)
+
+    def sensor_misfit(self, found: Solution) -> float:
+        """Squared residuals of accelerometer, gyroscope and slow orientation over those expected: about one.
+
+        The share that the fit follows is found by random probes.
+
+        References
+        ----------
+        .. [1] M. F. Hutchinson, "A stochastic estimator of the trace of the influence matrix for Laplacian
+           smoothing splines", Commun. Stat. Simul. Comput. 19, 1990.
+        """
+        jacobian, residual = self._system(found.coefficients, found.weights)
+        first = self.steps.steps_mm.size
+        rows = slice(first, first + 3 * self.readings.time_s.size + 2 * self._anchor_s.size)
+        sensed, left = jacobian[rows], residual[rows]
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], (sensed.shape[0], _PROBES))
+        pulled = sensed.T @ probes
+        solver = splu((jacobian.T @ jacobian).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0)
+        followed = float(np.sum(pulled * solver.solve(pulled))) / _PROBES
+        return float(left @ left) / max(left.size - followed, 1.0)
 
     def position(self, found: Solution, time_s: FloatArray) -> FloatArray:
         """Elevational position at any times on the sensor's clock, mm."""
@@ -248,8 +284,7 @@ class InertialProblem:
             self._with_globals(self._interleaved(none, self._rate, none), {_RATE.start: one}),
             self._with_globals(self._interleaved(none, none, self._rate), {_RATE.start + 1: one}),
         ]
-        anchor_s = np.arange(self._knots[_DEGREE], self._knots[-_DEGREE - 1], 1.0 / _ANCHORS_HZ)
-        anchors = self._basis(anchor_s, 0)
+        anchors = self._basis(self._anchor_s, 0)
         empty = sparse.csr_matrix(anchors.shape)
         knots = self._knots[_DEGREE:-_DEGREE]
         bend = self._basis(knots, 2)
@@ -345,11 +380,3 @@ class InertialProblem:
         columns[_FORCE] = np.ones(r.time_s.size)
         rows = self._with_globals(self._interleaved(1e-3 * self._acceleration, by_tilt, by_yaw), columns)
         return sparse.csr_matrix(rows / r.force_sigma), (model - r.force_m_s2) / r.force_sigma
-
-
-def reweighted(problem: InertialProblem, sigma_mm: FloatArray) -> InertialProblem:
-    """The same problem with other standard deviations of the image steps."""
-    again = object.__new__(InertialProblem)
-    again.__dict__.update(problem.__dict__)
-    again.steps = replace(problem.steps, sigma_mm=sigma_mm)
-    return again

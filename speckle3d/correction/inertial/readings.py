@@ -7,21 +7,23 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.sweep import OrientationSensor
-from speckle3d.correction.inertial.problem import Readings
+from speckle3d.correction.inertial.problem import GRAVITY_M_S2, Readings
 
 _SMOOTH_S = 0.15
 """Standard deviation of the Gaussian that leaves of the orientation readings what is slower than a wobble."""
 _NODE_S = 0.05
 _TREMOR_HZ = 12.0
 """Hands do not tremble faster; above, readings are noise."""
-_LEAST_HZ = 40.0
+LEAST_HZ = 40.0
 """Fewer readings a second do not follow a tremor of 12 Hz: 3.3 in a period."""
 _HELD = 3
 """Readings in a row at the same extreme value that show a sensor's range."""
 _RANGE_STEPS = 50
 """How many quantization steps an extreme lies off the median when it is a range and not a coarse scale."""
+_GRAVITY_SHARE = 0.03
+"""Gravity on earth is 9.78 to 9.83 m/s^2, and a bias of 0.2 m/s^2 is another 2 %."""
 _MARGIN_S = 0.25
 """Readings this long before and after the frames are used, too."""
 
@@ -33,6 +35,8 @@ def inertial_readings(sensor: OrientationSensor, frame_time_s: FloatArray) -> Re
     ------
     InsufficientDataError
         If gyroscope, accelerometer or mounting are missing, readings are too few or saturated.
+    MismatchError
+        If the accelerometer does not feel gravity as 9.8 m/s^2.
     """
     force, rate, mounting = sensor.accelerometer_m_s2, sensor.gyroscope_rad_s, sensor.sensor_from_image
     if mounting is None:
@@ -51,6 +55,7 @@ def inertial_readings(sensor: OrientationSensor, frame_time_s: FloatArray) -> Re
     _require_sampling(time_s[some], frame_time_s, sensor.readings.max_gap_s)
     _require_unsaturated(force[some], "accelerometer", "m/s^2")
     _require_unsaturated(rate[some], "gyroscope", "rad/s")
+    _require_gravity(force[some])
     time_s, turned = time_s[some], sensor.readings.world_from_sensor[some] * mounting
     image_from_sensor = mounting.inv()
     felt = image_from_sensor.apply(force[some])
@@ -87,7 +92,7 @@ def _white(values: FloatArray, hz: float) -> float:
     frequency = np.fft.rfftfreq(values.size, 1.0 / hz)
     above = frequency > max(_TREMOR_HZ * 1.3, 0.3 * hz)
     energy = np.sum(np.hanning(values.size) ** 2)
-    return float(np.sqrt(np.median(power[above]) / np.log(2.0) / energy)) + 1e-9
+    return float(np.sqrt(np.mean(power[above]) / energy)) + 1e-9
 
 
 def _require_sampling(time_s: FloatArray, frame_time_s: FloatArray, gap_s: float) -> None:
@@ -97,9 +102,9 @@ def _require_sampling(time_s: FloatArray, frame_time_s: FloatArray, gap_s: float
             f"inertial scale: expected readings of the orientation sensor over the frames, got {time_s.size}"
         )
     hz = 1.0 / float(np.median(np.diff(time_s)))
-    if hz < _LEAST_HZ:
+    if hz < LEAST_HZ:
         raise InsufficientDataError(
-            f"inertial scale: expected at least {_LEAST_HZ:g} readings a second, got {hz:.0f}; set the "
+            f"inertial scale: expected at least {LEAST_HZ:g} readings a second, got {hz:.0f}; set the "
             "sensor to a higher rate"
         )
     gap = float(np.diff(time_s).max())
@@ -107,6 +112,15 @@ def _require_sampling(time_s: FloatArray, frame_time_s: FloatArray, gap_s: float
         raise InsufficientDataError(
             f"inertial scale: expected readings from {first:.2f} to {last:.2f} s and gaps up to {gap_s:g} s, "
             f"got {time_s[0]:.2f} to {time_s[-1]:.2f} s with one of {gap:.2f} s"
+        )
+
+
+def _require_gravity(force: FloatArray) -> None:
+    felt = float(np.median(np.linalg.norm(force, axis=1)))
+    if abs(felt / GRAVITY_M_S2 - 1.0) > _GRAVITY_SHARE:
+        raise MismatchError(
+            f"inertial scale: expected an accelerometer that feels gravity as 9.8 m/s^2, got {felt:.3g}; its "
+            "readings are in other units, or its scale is not calibrated"
         )
 
 

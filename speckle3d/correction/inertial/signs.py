@@ -8,15 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.leastsquares import robust_sigma
 
 _SCALES = np.exp(np.linspace(-0.3, 0.3, 7))
 _CLOCK_STEP_S = 0.005
-_ERROR_MM = 0.02
-"""Error of a felt change of step: what gravity and lever arm leave while they are not settled."""
+_ERROR_MM = 0.01
+"""Least error of a felt change of step: a good accelerometer's noise, integrated twice over a frame."""
 _SHARE = 0.1
 """Error of a step over its size while clock and scale are settled roughly."""
-_TURN_COST = 4.0
-"""Squared deviations by which the accelerometer must speak for a turn that the images do not have."""
+_TURN_COST = 12.0
+"""Squared deviations by which the accelerometer must speak for a turn that the images do not have, or against
+one that they have. A run of wrong signs has two wrong turns, and every change of speed within speaks."""
 _CAP = 25.0
 """Most squared deviations that one change of step counts for: some frames are wrong altogether."""
 
@@ -65,10 +67,13 @@ def settled_signs(
     changes -= np.median(changes, axis=1, keepdims=True)
     clock, scale = (grid.ravel() for grid in np.meshgrid(np.arange(clocks.size), _SCALES, indexing="ij"))
     felt, steps = changes[clock], scale[:, None] * steps_mm
-    variance = _ERROR_MM**2 + _SHARE**2 * (steps[:, 1:] ** 2 + steps[:, :-1] ** 2)
-    cost, signs = _viterbi(steps, felt, variance)
-    best = int(np.argmin(cost))
-    change = np.diff(signs[best] * steps[best])
+    error_mm = _ERROR_MM
+    for _ in range(2):
+        variance = error_mm**2 + _SHARE**2 * (steps[:, 1:] ** 2 + steps[:, :-1] ** 2)
+        cost, signs = _viterbi(steps, felt, variance)
+        best = int(np.argmin(cost))
+        change = np.diff(signs[best] * steps[best])
+        error_mm = robust_sigma(change - felt[best], _ERROR_MM)
     straight, mirrored = (
         np.minimum((sign * change - felt[best]) ** 2 / variance[best], _CAP).sum() for sign in (1.0, -1.0)
     )
