@@ -189,5 +189,6 @@ def _sizes(problem: Problem, solution: Solution) -> dict[str, float]:
             sizes |= {"inclination_wander_deg": float(inclination), "heading_wander_deg": float(heading)}
     if problem.sensors:
         common, changing = solution.sizes.images.common, solution.sizes.images.changing
-        sizes |= {"image_turn_factor": float(common[1]), "image_scale_change_factor": float(changing[0])}
+        sizes |= {"image_turn_factor": float(common[1]), "image_turn_change_factor": float(changing[1])}
+        sizes |= {"image_scale_change_factor": float(changing[0])}
     return sizes

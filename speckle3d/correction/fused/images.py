@@ -26,6 +26,9 @@ RETURN_MM = 1.0
 are apart."""
 RETURN_RAD = 0.03
 """How far a probe may be turned that comes back to a place: two degrees."""
+SLOW, SLOW_RAD = 3, 0.005
+"""Number of slow curves by which tilt and yaw are off, and the deviation of the slowest: 0.3 degrees. A hand
+turns by as much in a sweep, which images hardly see."""
 LEAST_STEP_MM = 0.005
 """Steps count as at least so long in what errors may change over them: no step is exact."""
 HUBER = TrajectorySettings().huber
@@ -56,11 +59,14 @@ class ImageErrors:
     ----------
     common : ndarray, shape (3,)
         Logarithm of the scale; tilt and yaw per mm that the images lack.
+    slow : ndarray, shape (3, 2)
+        Weights of three slow curves in tilt and yaw, rad.
     changing : ndarray, shape (k + 1, 3)
         What is wrong beyond that at the knots: z, mm; tilt and yaw, rad. Zero at the first.
     """
 
     common: FloatArray
+    slow: FloatArray
     changing: FloatArray
 
     @property
@@ -229,7 +235,9 @@ class ImageEvidence:
         weight = (TAIL + 1.0) / (TAIL + (errors.common / sigma) ** 2)
         each = np.diag(np.sqrt(weight) / sigma)
         common = Block((each @ errors.common)[None], ((self.common_columns[None], each[None]),))
-        return [common, self._changes(errors, size)]
+        known = 1.0 / (SLOW_RAD * np.outer(1.0 / np.arange(1, SLOW + 1), size.common[1:]).ravel())
+        slow = Block((errors.slow.ravel() * known)[None], ((self.slow_columns[None], np.diag(known)[None]),))
+        return [common, slow, self._changes(errors, size)]
 
     @cached_property
     def knots(self) -> IntArray:
@@ -246,16 +254,21 @@ class ImageEvidence:
     @property
     def error_size(self) -> int:
         """Number of the last of these, which are not poses."""
-        return 3 * (self.knots.size - 1) + 3
+        return 3 + 2 * SLOW + 3 * (self.knots.size - 1)
 
     @property
     def common_columns(self) -> IntArray:
         """Columns of the common errors."""
         return 6 * (len(self) - 1) + np.arange(3)
 
+    @property
+    def slow_columns(self) -> IntArray:
+        """Columns of the slow curves' weights."""
+        return 6 * (len(self) - 1) + 3 + np.arange(2 * SLOW)
+
     def knot_columns(self, knots: IntArray) -> IntArray:
         """Columns of the changing errors at some knots, shape (m, 3); below zero for the first."""
-        columns = 6 * (len(self) - 1) + 3 * knots[:, None] + np.arange(3)
+        columns = 6 * (len(self) - 1) + 2 * SLOW + 3 * knots[:, None] + np.arange(3)
         return np.where(knots[:, None] > 0, columns, -1)
 
     @cached_property
@@ -271,7 +284,14 @@ class ImageEvidence:
         changed = (
             errors.changing[before] * (1 - share)[:, None] + errors.changing[before + 1] * share[:, None]
         )
+        changed[:, 1:] += self.curves @ errors.slow
         return np.asarray(errors.per_mm * self.along_mm[:, None] + changed)
+
+    @cached_property
+    def curves(self) -> FloatArray:
+        """Slow curves, zero at the first frame, shape (n, 3)."""
+        part = np.linspace(0.0, np.pi, len(self))
+        return np.asarray(1.0 - np.cos(np.outer(part, np.arange(1, SLOW + 1))))
 
     def distortion_parts(
         self, frames: IntArray, errors: ImageErrors, slope: FloatArray
@@ -283,6 +303,10 @@ class ImageEvidence:
             (self.knot_columns(before), slope * (1 - share)[:, None, None]),
             (self.knot_columns(before + 1), slope * share[:, None, None]),
             (common, slope @ errors.per_mm_slope * self.along_mm[frames][:, None, None]),
+            (
+                np.broadcast_to(self.slow_columns, (frames.size, 2 * SLOW)),
+                np.einsum("fs,fkt->fkst", self.curves[frames], slope[:, :, 1:]).reshape(*slope.shape[:2], -1),
+            ),
         )
 
     def _with_errors(self, poses: RigidTransform, errors: ImageErrors) -> Block:

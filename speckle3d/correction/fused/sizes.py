@@ -23,6 +23,7 @@ GROWN = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Sizes tried of the images' errors over those claimed, and how probable each is over the one before: a
 probe that is turned on purpose turns several times as far as images expect."""
 LESS_LIKELY = 0.4
+SAME = np.ones(3)
 
 
 @dataclass(frozen=True)
@@ -75,23 +76,26 @@ def steady(sensor: SensorEvidence) -> Wander:
 
 
 def turns(sizes: Sizes) -> Grid:
-    """How far the images' tilt and yaw are off."""
-    images = sizes.images
-    found = []
-    for factor in GROWN:
-        both = (np.array([each[0], factor, factor]) for each in (images.common, images.changing))
-        found.append(replace(sizes, images=ErrorSize(*both)))
+    """How far the images' tilt and yaw are off on the whole: any size, as a probe is turned at will."""
+    found = [_grown(sizes, common=np.array([1.0, factor, factor])) for factor in GROWN]
+    return Grid(tuple(found), np.ones(len(GROWN)))
+
+
+def turn_changes(sizes: Sizes) -> Grid:
+    """How far the images' tilt and yaw are off from place to place."""
+    found = [_grown(sizes, changing=np.array([1.0, factor, factor])) for factor in GROWN]
     return Grid(tuple(found), LESS_LIKELY ** np.arange(float(len(GROWN))))
 
 
-def changes(sizes: Sizes) -> Grid:
+def scale_changes(sizes: Sizes) -> Grid:
     """How much the images' scale changes along the sweep."""
-    images = sizes.images
-    found = [
-        replace(sizes, images=ErrorSize(images.common, np.array([factor, *images.changing[1:]])))
-        for factor in GROWN
-    ]
+    found = [_grown(sizes, changing=np.array([factor, 1.0, 1.0])) for factor in GROWN]
     return Grid(tuple(found), LESS_LIKELY ** np.arange(float(len(GROWN))))
+
+
+def _grown(sizes: Sizes, common: FloatArray = SAME, changing: FloatArray = SAME) -> Sizes:
+    """Sizes with those of the images' errors multiplied, where a factor is not one."""
+    return replace(sizes, images=ErrorSize(sizes.images.common * common, sizes.images.changing * changing))
 
 
 def wanders(sizes: Sizes, number: int, sensor: SensorEvidence, expected: Wander | None) -> Grid:

@@ -10,10 +10,19 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.correction.fused.images import ErrorSize, ImageErrors, ImageEvidence, pose_columns
+from speckle3d.correction.fused.images import SLOW, ErrorSize, ImageErrors, ImageEvidence, pose_columns
 from speckle3d.correction.fused.problem import Block, Normal, evidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorState
-from speckle3d.correction.fused.sizes import Grid, Sizes, Wander, changes, steady, turns, wanders
+from speckle3d.correction.fused.sizes import (
+    Grid,
+    Sizes,
+    Wander,
+    scale_changes,
+    steady,
+    turn_changes,
+    turns,
+    wanders,
+)
 from speckle3d.correction.scale import ScaleEvidence
 
 ROUNDS = 15
@@ -39,13 +48,17 @@ class State:
     def moved(self, step: FloatArray, sensors: Sequence[SensorEvidence]) -> State:
         """The state after a step of all variables, in the order of the problem's columns."""
         n, knots = len(self.poses), len(self.errors.changing) - 1
-        lengths = [6 * (n - 1), 3, 3 * knots, *(sensor.size for sensor in sensors)]
-        motion, common, changing, *own = np.split(step, np.cumsum(lengths)[:-1])
+        lengths = [6 * (n - 1), 3, 2 * SLOW, 3 * knots, *(sensor.size for sensor in sensors)]
+        motion, common, slow, changing, *own = np.split(step, np.cumsum(lengths)[:-1])
         every = np.concatenate([np.zeros((1, 6)), motion.reshape(-1, 6)])
         change = np.concatenate([np.zeros((1, 3)), changing.reshape(-1, 3)])
         return State(
             self.poses * RigidTransform.from_exp_coords(every),
-            ImageErrors(self.errors.common + common, self.errors.changing + change),
+            ImageErrors(
+                self.errors.common + common,
+                self.errors.slow + slow.reshape(-1, 2),
+                self.errors.changing + change,
+            ),
             tuple(sensor.moved(part) for sensor, part in zip(self.sensors, own, strict=True)),
         )
 
@@ -124,7 +137,7 @@ class Problem:
     def start(self) -> State:
         """The images' own poses."""
         poses = self.images.start
-        errors = ImageErrors(np.zeros(3), np.zeros((self.images.knots.size, 3)))
+        errors = ImageErrors(np.zeros(3), np.zeros((SLOW, 2)), np.zeros((self.images.knots.size, 3)))
         return State(poses, errors, tuple(sensor.start(poses) for sensor in self.sensors))
 
     def expected_sizes(self) -> Sizes:
@@ -143,7 +156,7 @@ class Problem:
             state = state.moved(step, self.sensors)
             if number in SIZED and self.sensors:
                 problem = problem._with_jitter(state)
-                sizes = problem._sizes(state, sizes)
+                sizes = problem._sizes(state)
             elif np.abs(step[: 6 * (len(self.images) - 1)]).max() < SETTLED and number > max(SIZED):
                 break
         return Solution(state, problem.normal(state, sizes), sizes, self.images), problem
@@ -190,13 +203,14 @@ class Problem:
             ),
         )
 
-    def _sizes(self, state: State, sizes: Sizes) -> Sizes:
+    def _sizes(self, state: State) -> Sizes:
         """Sizes of errors, one kind after the other."""
         first = 6 * (len(self.images) - 1)
         matrix, gradient = Normal.of(self._measured(state), self.size).reduced(self.size - first)
-        loose = ErrorSize(np.array([LOOSENED, 1.0, 1.0]) * sizes.images.common, sizes.images.changing)
+        sizes = self.expected_sizes()
+        loose = ErrorSize(np.array([LOOSENED, 1.0, 1.0]), np.ones(3))
         sizes = replace(sizes, images=loose)
-        kinds: list[Callable[[Sizes], Grid]] = [turns, changes]
+        kinds: list[Callable[[Sizes], Grid]] = [turns, turn_changes, scale_changes]
         for number, (sensor, expected) in enumerate(zip(self.sensors, self.expected, strict=True)):
             kinds.append(partial(wanders, number=number, sensor=sensor, expected=expected))
         for kind in kinds:
