@@ -38,7 +38,7 @@ class CrossingSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    blurs_mm: tuple[float, ...] = Field((3.0, 1.5, 0.7, 0.45), min_length=1)
+    blurs_mm: tuple[float, ...] = Field((2.0, 0.9, 0.45), min_length=1)
     samples: int = Field(12_000, ge=1_000, le=200_000)
     effective_samples: float = Field(500.0, gt=0)
     tissue_sigma: float = Field(0.03, gt=0, le=0.5)
