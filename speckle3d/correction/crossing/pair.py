@@ -109,7 +109,7 @@ class _Matched:
     def of(cls, first: CrossingSweep, second: CrossingSweep, settings: CrossingSettings) -> _Matched:
         sweeps, textures = [], []
         for each in (first, second):
-            straight = straightened(turned(each))
+            straight = straightened(turned(each), settings.nearest_mm)
             texture = prefiltered(straight.volume, straight.spacing_mm)
             sweeps.append((straight, straight.mirrored()))
             textures.append((texture, np.ascontiguousarray(texture[::-1])))

@@ -168,8 +168,14 @@ class StraightSweep:
         return after * before.inv() * self.frames
 
 
-def straightened(sweep: CrossingSweep) -> StraightSweep:
+def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
     """Put a sweep's frames on the planes of its smooth path.
+
+    Parameters
+    ----------
+    sweep : CrossingSweep
+    nearest_mm : float
+        Depth above which nothing is looked at.
 
     Raises
     ------
@@ -209,6 +215,8 @@ def straightened(sweep: CrossingSweep) -> StraightSweep:
     )
     moved = np.stack([_moved(images[f], away[f], pixels) for f in good])
     volume = _onto_planes(moved, travel[good], at)
+    depth = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
+    volume[:, :, depth < nearest_mm] = np.nan
     path = Path(at - at[middle], planes.as_matrix())
     return StraightSweep(path, volume, pixels, frames, travel - at[middle])
 
@@ -248,7 +256,10 @@ def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Fl
     away = np.abs(travel[None, :] - at[:, None])
     order = np.sort(away, axis=1)
     reach = np.maximum(_EACH_MM, 0.5 * order[:, min(1, order.shape[1] - 1)])
-    weight = np.exp(-0.5 * (away / reach[:, None]) ** 2).astype(np.float32)
+    # Frames crowd where the hand dwells: each counts for the travel it stands for, or it would draw the
+    # images of the planes about it.
+    crowd = np.exp(-0.5 * ((travel[None, :] - travel[:, None]) / _EACH_MM) ** 2).sum(axis=1)
+    weight = (np.exp(-0.5 * (away / reach[:, None]) ** 2) / crowd).astype(np.float32)
     weight[weight < 0.02 * weight.max(axis=1, keepdims=True)] = 0.0
     there = np.isfinite(images).reshape(len(images), -1)
     flat = np.where(there, images.reshape(len(images), -1), np.float32(0.0))
