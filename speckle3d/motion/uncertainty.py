@@ -9,16 +9,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
 from speckle3d.motion.planes import PairPlane
-
-SHARED = np.array([3.2, 3.8, 1.4, 1.4, 1.4, 4.5])
-"""Deviations of (x, y, z, tilt, yaw, roll) over what the graph has them if pairs were independent: pairs
-that share a frame share its speckle, and in-plane shifts their interpolation's error. Measured on simulated
-phantoms, as the other figures here."""
-STRUCTURE = np.array([19.0, 0.0, 0.0, 0.0, 0.0, 8.0])
-"""Growth of these with the share of echoes that stay: structure that runs across hides motion along it."""
-SCALE_CHANGE_MM, TURN_CHANGE_MM = 2.0, 15.0
-"""Travel over which the error of the scale changes, with the tissue, and a hand's tilt and yaw wander."""
 
 
 def pose_covariance(
@@ -61,6 +53,24 @@ def pose_covariance(
         covariance += rate**2 * along[:, :, None] * along[:, None, :]
         covariance[:, angle, angle] += rate**2 * TURN_CHANGE_MM * travel
     return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
+
+
+def with_common_scale(
+    covariance: FloatArray, poses: RigidTransform, centre_mm: FloatArray, sigma: float
+) -> FloatArray:
+    """Covariance of poses to which an error comes that stretches the whole sweep by one factor.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, 6, 6)
+        As from `pose_covariance`.
+    sigma : float
+        Relative standard deviation of the factor.
+    """
+    centres = poses.apply(centre_mm)
+    along = np.zeros((len(covariance), 6, 6))
+    along[:, 2, 2] = (sigma * (centres[:, 2] - centres[0, 2])) ** 2
+    return covariance + along
 
 
 NEAR_MM = 0.1

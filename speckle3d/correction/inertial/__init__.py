@@ -1,0 +1,8 @@
+"""Length from an accelerometer and a gyroscope on the probe: image steps tied to m/s^2."""
+
+from __future__ import annotations
+
+from speckle3d.correction.inertial.scale import correct_inertial
+from speckle3d.correction.inertial.settings import ASSUMPTION, InertialSettings
+
+__all__ = ["ASSUMPTION", "InertialSettings", "correct_inertial"]
