@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
@@ -94,15 +94,16 @@ def correct(
 def _inertial(tracked: Tracked, sweep: Sweep, config: Config) -> ScaledPoses:
     sensor = sweep.orientation
     assert isinstance(sensor, OrientationSensor)
-    return correct_inertial(
-        tracked.image,
-        tracked.covariance,
-        tracked.scale_sigma,
-        sensor,
-        sweep.frame_time_s,
-        sweep.grid.centre_mm,
-        config.inertial,
-    )
+    with naming(f"{sweep.name}: drift mode inertial"):
+        return correct_inertial(
+            tracked.image,
+            tracked.covariance,
+            tracked.scale_sigma,
+            sensor,
+            sweep.frame_time_s,
+            sweep.grid.centre_mm,
+            config.inertial,
+        )
 
 
 def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair | None) -> FusedPoses:
@@ -113,16 +114,17 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
     with suppress(InsufficientDataError, MismatchError):
         require_modes(sweep, ["inertial"])
         evidence += _inertial(tracked, sweep, config).evidence
-    return fuse(
-        tracked.edges,
-        tracked.image,
-        tracked.covariance,
-        tracked.scale_sigma,
-        tracked.slopes.deviation_per_mm,
-        sweep.grid.centre_mm,
-        sweep.frame_time_s,
-        sweep.orientation,
-        sweep.tracker,
-        evidence,
-        config.fused,
-    )
+    with naming(f"{sweep.name}: drift mode fused"):
+        return fuse(
+            tracked.edges,
+            tracked.image,
+            tracked.covariance,
+            tracked.scale_sigma,
+            tracked.slopes.deviation_per_mm,
+            sweep.grid.centre_mm,
+            sweep.frame_time_s,
+            sweep.orientation,
+            sweep.tracker,
+            evidence,
+            config.fused,
+        )

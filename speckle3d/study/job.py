@@ -246,12 +246,11 @@ def _corrected(
             continue
         try:
             corrections |= correct(tracked, sweep, [mode], config, crossed)
-        except MismatchError as error:
-            left_out[mode] = str(error)
-        except InsufficientDataError as error:
-            if mode in PUBLISHED:
+        except (MismatchError, InsufficientDataError) as error:
+            if mode in PUBLISHED and isinstance(error, InsufficientDataError):
                 raise
-            left_out[mode] = str(error)
+            where = f"{sweep.name}: drift mode {mode}"
+            left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
     return corrections, left_out
 
 

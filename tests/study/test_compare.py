@@ -150,8 +150,8 @@ def test_a_file_that_changed_under_the_study_is_its_reason(sweeps, tmp_path):
 def test_a_bug_in_one_sweep_is_its_reason_without_temporary_names_and_leaves_nothing(
     sweeps, tmp_path, monkeypatch
 ):
-    def full(path, *arguments):
-        raise ZeroDivisionError(f"in the middle of {arguments[2] / '.part-0123abcd-reconstruction.h5'}")
+    def full(request, directory, *others):
+        raise ZeroDivisionError(f"in the middle of {directory / '.part-0123abcd-reconstruction.h5'}")
 
     monkeypatch.setattr("speckle3d.study.sweepjob.write_results", full)
     # Words are set one space apart; a path with two must not hide its temporary name.

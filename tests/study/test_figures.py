@@ -4,10 +4,10 @@ from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.reconstruction import MODES as RECONSTRUCTED
 from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.scoring.lengths import accumulated
 from speckle3d.scoring.references import Reference, sweep_curves
-from speckle3d.core.reconstruction import MODES as RECONSTRUCTED
 from speckle3d.study.figures import (
     colour_of,
     curve_panels,

@@ -30,6 +30,8 @@ _STARTS = 4
 """Candidates refined."""
 _CELL = (2.0 * np.sqrt(np.pi)) ** 3
 """Volume that counts as one comparison under a Gaussian blur of unit standard deviation."""
+_FEWEST, _PER_CELL = 3000, 12.0
+"""Points looked up: at least so many, and so many for each such volume."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class _Matched:
     def of(cls, first: CrossingSweep, second: CrossingSweep, settings: CrossingSettings) -> _Matched:
         sweeps, textures = [], []
         for each in (first, second):
-            straight = straightened(turned(each))
+            straight = straightened(turned(each), settings.nearest_mm)
             texture = prefiltered(straight.volume, straight.spacing_mm)
             sweeps.append((straight, straight.mirrored()))
             textures.append((texture, np.ascontiguousarray(texture[::-1])))
@@ -126,18 +128,22 @@ class _Matched:
             Textured.of(
                 self.sweeps[k][flip],
                 at_blur(self.textures[k][flip], blur_mm, self.sweeps[k][flip].spacing_mm),
-                self.settings.samples,
+                int(min(self.settings.samples, max(_FEWEST, _PER_CELL * self.cells(blur_mm)))),
             )
             for k, flip in enumerate(mirrored)
         ]
 
     def independent(self, blur_mm: float) -> float:
-        """How many comparisons the overlap is worth at a blur."""
+        """How many comparisons the sweeps are worth at a blur."""
+        return min(self.settings.effective_samples, self.cells(blur_mm))
+
+    def cells(self, blur_mm: float) -> float:
+        """How many cells of a blur fit into the smaller sweep."""
         volume = min(
             float(np.isfinite(t[0]).sum() * s[0].spacing_mm.prod())
             for s, t in zip(self.sweeps, self.textures, strict=True)
         )
-        return min(self.settings.effective_samples, volume / (_CELL * blur_mm**3))
+        return float(volume / (_CELL * blur_mm**3))
 
     def found(self) -> tuple[tuple[Candidate, Refined], float]:
         """The best candidate refined, and by how much its log likelihood exceeds that of another place."""
@@ -283,7 +289,7 @@ def _pose_covariance(
     straight: StraightSweep, bends: FloatArray, own: FloatArray, poses: RigidTransform
 ) -> FloatArray:
     """Covariance of every frame's pose about its centre, along the first frame's axes, (n, 6, 6)."""
-    twists = straight.path.twists(bends)
+    twists = straight.path.twists(bends, straight.path.bent(bends))
     near = np.clip(np.searchsorted(straight.path.travel_mm, straight.frame_travel_mm), 0, len(twists) - 1)
     moved = twists[near] - twists[near[:1]]
     centres = straight.corrected(bends).translation

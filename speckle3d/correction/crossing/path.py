@@ -34,7 +34,6 @@ _WIDEST_GAP_MM = 1.5
 """Travel without a frame that is interpolated: about an elevational beam width."""
 _EACH_MM = 0.2
 """Least standard deviation of the weight of frames about a plane."""
-_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -89,20 +88,38 @@ class Path:
         middle = len(chain) // 2
         return np.asarray(self.planes[middle] @ np.linalg.inv(chain[middle]) @ chain)
 
-    def twists(self, bends: FloatArray) -> FloatArray:
-        """How each plane moves with each bend, shape (k, 6, 7): shift at the path's origin, turn."""
-        found = np.empty((len(self.planes), 6, len(BENDS)))
-        back = np.linalg.inv(self.bent(bends))
-        for k in range(len(BENDS)):
-            step = np.zeros(len(BENDS))
-            # Bends per mm are a sweep's length more effective than scales.
-            step[k] = _STEP if k < 3 else _STEP / self.length_mm
-            moved = (self.bent(bends + step) - self.bent(bends - step)) @ back / (2.0 * step[k])
-            found[:, :3, k] = moved[:, :3, 3]
-            found[:, 3, k] = 0.5 * (moved[:, 2, 1] - moved[:, 1, 2])
-            found[:, 4, k] = 0.5 * (moved[:, 0, 2] - moved[:, 2, 0])
-            found[:, 5, k] = 0.5 * (moved[:, 1, 0] - moved[:, 0, 1])
-        return found
+    def twists(self, bends: FloatArray, bent: FloatArray) -> FloatArray:
+        """How each plane moves with each bend, shape (k, 6, 7): shift at the path's origin, turn.
+
+        Parameters
+        ----------
+        bent : ndarray, shape (k, 4, 4)
+            As returned by `bent` for the same bends.
+        """
+        along = self._steps[:, 2, 3] * np.exp(self.log_scale(bends))
+        before, after = bent[:-1], bent[1:]
+        # Each step moves all later planes rigidly: along z of the plane before it, about x and y after it.
+        moves = np.zeros((len(along), 6, 3))
+        moves[:, :3, 0] = before[:, :3, 2]
+        for axis in (0, 1):
+            turn = after[:, :3, axis]
+            moves[:, 3:, 1 + axis] = turn
+            moves[:, :3, 1 + axis] = np.cross(after[:, :3, 3], turn)
+        moves *= along[:, None, None]
+        tilt, yaw = (self._basis[:, :2] @ bends[k : k + 2] for k in (3, 5))
+        # More travel is more turn, too.
+        moves[:, :, 0] += tilt[:, None] * moves[:, :, 1] + yaw[:, None] * moves[:, :, 2]
+        each = np.concatenate(
+            [
+                moves[:, :, :1] * self._basis[:, None, :],
+                moves[:, :, 1:2] * self._basis[:, None, :2],
+                moves[:, :, 2:3] * self._basis[:, None, :2],
+            ],
+            axis=2,
+        )
+        found = np.zeros((len(bent), 6, len(BENDS)))
+        np.cumsum(each, axis=0, out=found[1:])
+        return np.asarray(found - found[len(bent) // 2])
 
 
 @dataclass(frozen=True)
@@ -151,8 +168,14 @@ class StraightSweep:
         return after * before.inv() * self.frames
 
 
-def straightened(sweep: CrossingSweep) -> StraightSweep:
+def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
     """Put a sweep's frames on the planes of its smooth path.
+
+    Parameters
+    ----------
+    sweep : CrossingSweep
+    nearest_mm : float
+        Depth above which nothing is looked at.
 
     Raises
     ------
@@ -174,7 +197,7 @@ def straightened(sweep: CrossingSweep) -> StraightSweep:
             f"{sweep.name}: expected a sweep along the elevational axis, got {high - low:.1f} mm of travel; "
             "sweep across the tissue, 24 mm or more"
         )
-    at: FloatArray = low + np.arange(1 + int((high - low) / SPACING_MM)) * SPACING_MM
+    at = np.asarray(low + np.arange(1 + int((high - low) / SPACING_MM)) * SPACING_MM, dtype=np.float64)
     middle = len(at) // 2
     smooth = _Smooth(travel[good], centred[good])
     to_path = smooth.at(at[middle : middle + 1])[0].inv()
@@ -192,6 +215,8 @@ def straightened(sweep: CrossingSweep) -> StraightSweep:
     )
     moved = np.stack([_moved(images[f], away[f], pixels) for f in good])
     volume = _onto_planes(moved, travel[good], at)
+    depth = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
+    volume[:, :, depth < nearest_mm] = np.nan
     path = Path(at - at[middle], planes.as_matrix())
     return StraightSweep(path, volume, pixels, frames, travel - at[middle])
 
@@ -231,7 +256,10 @@ def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Fl
     away = np.abs(travel[None, :] - at[:, None])
     order = np.sort(away, axis=1)
     reach = np.maximum(_EACH_MM, 0.5 * order[:, min(1, order.shape[1] - 1)])
-    weight = np.exp(-0.5 * (away / reach[:, None]) ** 2).astype(np.float32)
+    # Frames crowd where the hand dwells: each counts for the travel it stands for, or it would draw the
+    # images of the planes about it.
+    crowd = np.exp(-0.5 * ((travel[None, :] - travel[:, None]) / _EACH_MM) ** 2).sum(axis=1)
+    weight = (np.exp(-0.5 * (away / reach[:, None]) ** 2) / crowd).astype(np.float32)
     weight[weight < 0.02 * weight.max(axis=1, keepdims=True)] = 0.0
     there = np.isfinite(images).reshape(len(images), -1)
     flat = np.where(there, images.reshape(len(images), -1), np.float32(0.0))

@@ -106,7 +106,8 @@ def refined(
         whole = matrix + stiffness
         moved = False
         while damping < 1e6:
-            step: FloatArray = -np.linalg.solve(whole + damping * np.diag(np.diag(whole)), gradient + pull)
+            damped = whole + damping * np.diag(np.diag(whole))
+            step = np.asarray(-np.linalg.solve(damped, gradient + pull), dtype=np.float64)
             trial = placing.stepped(step)
             tried = compared(pair, trial)
             if _cost(tried, ways, weight, prior.pull(trial)[2]) < _cost(ways, tried, weight, strain):

@@ -122,9 +122,11 @@ class OneWay:
 def compared(pair: Sequence[Textured], placing: Placing, slopes: bool = True) -> tuple[OneWay, OneWay]:
     """Look up either sweep's points in the other."""
     bent = [one.path.bent(bends) for one, bends in zip(pair, placing.bends, strict=True)]
-    twists = (
-        [one.path.twists(bends) for one, bends in zip(pair, placing.bends, strict=True)] if slopes else None
-    )
+    twists = None
+    if slopes:
+        twists = [
+            one.path.twists(b, planes) for one, b, planes in zip(pair, placing.bends, bent, strict=True)
+        ]
     first_from = [np.eye(4), placing.first_from_second.as_matrix()]
     return _looked_up(pair, bent, twists, first_from, 0), _looked_up(pair, bent, twists, first_from, 1)
 

@@ -27,7 +27,8 @@ from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
-from speckle3d.correction.fused.solution import Problem, Solution, Wander
+from speckle3d.correction.fused.sizes import Wander
+from speckle3d.correction.fused.solution import Problem, Solution
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.trust import ORIENTATION, TRACKER
 
@@ -124,7 +125,7 @@ def fuse(
     yaw, tilt = turn_sigma_per_mm
     centre = RigidTransform.from_translation(centre_mm)
     start = centre.inv() * (image[0].inv() * image) * centre
-    images = ImageEvidence(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
+    images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
     limits = SensorLimits(
         settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, 1e-9
     )
@@ -177,7 +178,7 @@ def _along(poses: RigidTransform) -> FloatArray:
 
 def _sizes(problem: Problem, solution: Solution) -> dict[str, float]:
     sizes: dict[str, float] = {}
-    for sensor, wander in zip(problem.sensors, solution.wander, strict=True):
+    for sensor, wander in zip(problem.sensors, solution.sizes.wander, strict=True):
         degrees, millimetres = float(np.degrees(sensor.jitter[0])), float(sensor.jitter[1])
         if sensor.components == 6:
             sizes |= {"tracker_jitter_mm": millimetres, "tracker_jitter_deg": degrees}
@@ -186,4 +187,8 @@ def _sizes(problem: Problem, solution: Solution) -> dict[str, float]:
             inclination, _, heading = np.degrees(wander.sigma)
             sizes |= {"orientation_jitter_deg": degrees}
             sizes |= {"inclination_wander_deg": float(inclination), "heading_wander_deg": float(heading)}
+    if problem.sensors:
+        common, changing = solution.sizes.images.common, solution.sizes.images.changing
+        sizes |= {"image_turn_factor": float(common[1]), "image_turn_change_factor": float(changing[1])}
+        sizes |= {"image_scale_change_factor": float(changing[0])}
     return sizes

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import SuperLU, splu
 
 from speckle3d.core.arrays import FloatArray, IntArray
@@ -84,18 +85,23 @@ class Normal:
         return (matrix + matrix.T) / 2, self.gradient[rest:] - across[:, -1]
 
 
-def evidence(matrix: FloatArray, gradient: FloatArray, prior: FloatArray) -> float:
-    """Logarithm of the likelihood of a Gaussian prior's size, up to what all sizes share.
+def evidence(matrix: FloatArray, gradient: FloatArray, prior: Sequence[Block], first: int) -> float:
+    """Logarithm of the restricted likelihood of the sizes in Gaussian priors, up to what all sizes share.
 
     Parameters
     ----------
     matrix, gradient : ndarray, shape (p, p) and (p,)
-        Normal equations without that prior, linearised where the variables it is about are zero.
-    prior : ndarray, shape (p, p)
-        Its inverse covariance; zero for other variables.
+        Normal equations of the last p variables without the priors.
+    prior : sequence of Block
+        Together as many equations as there are variables in them.
+    first : int
+        Column of the first of the p variables.
     """
-    root = np.linalg.cholesky(matrix + prior)
-    pulled = np.linalg.solve(root, gradient)
-    about = np.flatnonzero(np.diag(prior) > 0)
-    _, of_prior = np.linalg.slogdet(prior[np.ix_(about, about)])
-    return float(0.5 * (pulled @ pulled) - np.log(np.diag(root)).sum() + 0.5 * of_prior)
+    size = first + gradient.size
+    jacobian = sparse.vstack([block.jacobian(size) for block in prior], format="csc")[:, first:]
+    residual = np.concatenate([block.residual.ravel() for block in prior])
+    root = np.linalg.cholesky(matrix + (jacobian.T @ jacobian).toarray())
+    pulled = solve_triangular(root, gradient + jacobian.T @ residual, lower=True)
+    own = splu(jacobian[:, np.flatnonzero(np.diff(jacobian.indptr))])
+    of_prior = np.log(np.abs(own.L.diagonal() * own.U.diagonal())).sum()
+    return float(0.5 * (pulled @ pulled - residual @ residual) - np.log(np.diag(root)).sum() + of_prior)

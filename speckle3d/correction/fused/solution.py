@@ -2,40 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.correction.fused.images import ImageEvidence, pose_columns
+from speckle3d.correction.fused.images import SLOW, ErrorSize, ImageErrors, ImageEvidence, pose_columns
 from speckle3d.correction.fused.problem import Block, Normal, evidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorState
+from speckle3d.correction.fused.sizes import (
+    Grid,
+    Sizes,
+    Wander,
+    scale_changes,
+    steady,
+    turn_changes,
+    turns,
+    wanders,
+)
 from speckle3d.correction.scale import ScaleEvidence
 
 ROUNDS = 15
-SETTLED = 1e-6
+SIZED = (1, 3)
+"""Rounds after which sizes of errors are found."""
+SETTLED = 1e-5
 """Step, mm and rad, at which the iteration ends."""
 KNOWN_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
-WANDER = (0.05, 0.25, 0.5, 1.0, 2.0, 4.0)
-"""Sizes tried of a tracker's wandering error over its jitter; the first stands for none."""
-WANDER_TIMES_S = (1.0, 5.0, 20.0)
-STEADY = 0.5
-"""Probability, before anything is measured, that a tracker does not wander."""
-FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Sizes tried of an orientation sensor's wandering error over the expected."""
-FACTOR_SPREAD = 0.7
-"""Standard deviation of the logarithm of that factor among sensors: twice, or half."""
-
-
-@dataclass(frozen=True)
-class Wander:
-    """Size, shape (components,), and time of a sensor's wandering error."""
-
-    sigma: FloatArray
-    time_s: float
+LOOSENED = 3.0
+"""Factor of the scale that the images' steps may all have wrong while other errors are sized: a sensor that is
+right about a wrong scale does not wander."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +42,23 @@ class State:
     """All variables: poses about the image's centre, errors of the images, sensors."""
 
     poses: RigidTransform
-    distortion: FloatArray
-    common: FloatArray
+    errors: ImageErrors
     sensors: tuple[SensorState, ...]
 
-    def moved(self, step: FloatArray, sizes: Sequence[int]) -> State:
+    def moved(self, step: FloatArray, sensors: Sequence[SensorEvidence]) -> State:
         """The state after a step of all variables, in the order of the problem's columns."""
-        n = len(self.poses)
-        motion = np.concatenate([np.zeros((1, 6)), step[: 6 * (n - 1)].reshape(-1, 6)])
-        change = np.concatenate([np.zeros((1, 3)), step[6 * (n - 1) : 9 * (n - 1)].reshape(-1, 3)])
-        own = np.split(step[9 * (n - 1) + 3 :], np.cumsum(sizes)[:-1]) if sizes else []
+        n, knots = len(self.poses), len(self.errors.changing) - 1
+        lengths = [6 * (n - 1), 3, 2 * SLOW, 3 * knots, *(sensor.size for sensor in sensors)]
+        motion, common, slow, changing, *own = np.split(step, np.cumsum(lengths)[:-1])
+        every = np.concatenate([np.zeros((1, 6)), motion.reshape(-1, 6)])
+        change = np.concatenate([np.zeros((1, 3)), changing.reshape(-1, 3)])
         return State(
-            self.poses * RigidTransform.from_exp_coords(motion),
-            self.distortion + change,
-            self.common + step[9 * (n - 1) : 9 * (n - 1) + 3],
+            self.poses * RigidTransform.from_exp_coords(every),
+            ImageErrors(
+                self.errors.common + common,
+                self.errors.slow + slow.reshape(-1, 2),
+                self.errors.changing + change,
+            ),
             tuple(sensor.moved(part) for sensor, part in zip(self.sensors, own, strict=True)),
         )
 
@@ -67,7 +69,7 @@ class Solution:
 
     state: State
     normal: Normal
-    wander: tuple[Wander, ...]
+    sizes: Sizes
     images: ImageEvidence
 
     def covariance(self, frames: IntArray) -> FloatArray:
@@ -135,53 +137,61 @@ class Problem:
     def start(self) -> State:
         """The images' own poses."""
         poses = self.images.start
-        still = np.zeros((len(poses), 3))
-        return State(poses, still, np.zeros(3), tuple(sensor.start(poses) for sensor in self.sensors))
+        errors = ImageErrors(np.zeros(3), np.zeros((SLOW, 2)), np.zeros((self.images.knots.size, 3)))
+        return State(poses, errors, tuple(sensor.start(poses) for sensor in self.sensors))
 
-    def solve(self, start: State | None = None) -> tuple[Solution, Problem]:
-        """Gauss-Newton, and between its rounds the sizes of the sensors' errors."""
-        state = start or self.start()
-        problem, wander = self, self._steady()
+    def expected_sizes(self) -> Sizes:
+        """Sizes of errors before they are found."""
+        wander = (
+            expected or steady(sensor) for sensor, expected in zip(self.sensors, self.expected, strict=True)
+        )
+        return Sizes(ErrorSize(np.ones(3), np.ones(3)), tuple(wander))
+
+    def solve(self) -> tuple[Solution, Problem]:
+        """Gauss-Newton, and between its rounds the sizes of errors; and the problem with jitters as found."""
+        problem, state, sizes = self, self.start(), self.expected_sizes()
         for number in range(ROUNDS):
-            normal = problem.normal(state, wander)
+            normal = problem.normal(state, sizes)
             step = -normal.factor().solve(normal.gradient)
-            state = state.moved(step, [sensor.size for sensor in self.sensors])
-            if number in (1, 3) and self.sensors:
+            state = state.moved(step, self.sensors)
+            if number in SIZED and self.sensors:
                 problem = problem._with_jitter(state)
-                wander = problem._sizes(state, wander)
-            elif np.abs(step[: 9 * (len(self.images) - 1)]).max() < SETTLED and number > 3:
+                sizes = problem._sizes(state)
+            elif np.abs(step[: 6 * (len(self.images) - 1)]).max() < SETTLED and number > max(SIZED):
                 break
-        return Solution(state, problem.normal(state, wander), wander, self.images), problem
+        return Solution(state, problem.normal(state, sizes), sizes, self.images), problem
 
-    def normal(self, state: State, wander: Sequence[Wander], without: int | None = None) -> Normal:
-        """Normal equations; `without` the wander of one sensor, by number."""
-        blocks = self.images.blocks(state.poses, state.distortion, state.common)
+    def normal(self, state: State, sizes: Sizes) -> Normal:
+        """Normal equations of all there is."""
+        return Normal.of([*self._measured(state), *self._priors(state, sizes)], self.size)
+
+    def _measured(self, state: State) -> list[Block]:
+        """Equations that do not depend on sizes."""
+        blocks = self.images.blocks(state.poses, state.errors)
         blocks += [self._scale_block(state, each) for each in self.evidence]
-        for number, (sensor, own) in enumerate(zip(self.sensors, state.sensors, strict=True)):
+        for sensor, own in zip(self.sensors, state.sensors, strict=True):
             blocks += [sensor.block(state.poses, own), sensor.limits_block(own)]
-            if number != without:
-                blocks.append(sensor.wander_block(own, wander[number].sigma, wander[number].time_s))
-        return Normal.of(blocks, self.size)
+        return blocks
+
+    def _priors(self, state: State, sizes: Sizes) -> list[Block]:
+        """Equations whose weights are the errors' sizes."""
+        blocks = self.images.prior_blocks(state.errors, sizes.images)
+        for sensor, own, wander in zip(self.sensors, state.sensors, sizes.wander, strict=True):
+            blocks.append(sensor.wander_block(own, wander.sigma, wander.time_s))
+        return blocks
 
     def _scale_block(self, state: State, evidence: ScaleEvidence) -> Block:
         """Equations of the mean scale and turn over the sweep, as one source has them."""
         frames, weight = self.images.parts
-        mean = weight @ state.distortion[frames] / self.images.path_mm
+        mean = weight @ self.images.distortion(state.errors)[frames] / self.images.path_mm
         scale = 1.0 + mean[0]
         size, axes = np.linalg.eigh(evidence.information)
         root = np.sqrt(np.maximum(size, 0.0))[:, None] * axes.T
         error = np.array([np.log(scale), *mean[1:] / scale]) - evidence.values
         slope = root @ np.eye(3) / scale / self.images.path_mm
-        columns = self.images.error_columns(frames)
-        parts = tuple((columns[[k]], slope[None] * weight[k]) for k in range(frames.size))
+        each = self.images.distortion_parts(frames, state.errors, weight[:, None, None] * slope)
+        parts = tuple((columns[[k]], slopes[[k]]) for columns, slopes in each for k in range(frames.size))
         return Block((root @ error)[None], parts)
-
-    def _steady(self) -> tuple[Wander, ...]:
-        """What the sensors are expected to wander by."""
-        return tuple(
-            expected or Wander(WANDER[0] * np.repeat(sensor.jitter, 3), WANDER_TIMES_S[-1])
-            for sensor, expected in zip(self.sensors, self.expected, strict=True)
-        )
 
     def _with_jitter(self, state: State) -> Problem:
         """The problem with jitters that are no less than what is left of the readings."""
@@ -193,39 +203,19 @@ class Problem:
             ),
         )
 
-    def _sizes(self, state: State, wander: Sequence[Wander]) -> tuple[Wander, ...]:
-        """Wandering errors' sizes: means over a grid by restricted likelihood."""
-        found = list(wander)
-        for number, expected in enumerate(self.expected):
-            sensor, own = self.sensors[number], state.sensors[number]
-            still = replace(own, wander=np.zeros_like(own.wander))
-            others = [*state.sensors[:number], still, *state.sensors[number + 1 :]]
-            normal = self.normal(replace(state, sensors=tuple(others)), found, without=number)
-            first = self.images.size
-            matrix, gradient = normal.reduced(self.size - first)
-            grid, prior = _candidates(sensor, expected)
-            likelihood = np.empty(len(grid))
-            for k, candidate in enumerate(grid):
-                block = sensor.wander_block(still, candidate.sigma, candidate.time_s)
-                jacobian = block.jacobian(self.size)[:, first:].toarray()
-                likelihood[k] = evidence(matrix, gradient, jacobian.T @ jacobian)
-            weight = prior * np.exp(likelihood - likelihood.max())
-            weight /= weight.sum()
-            variance = weight @ np.array([candidate.sigma**2 for candidate in grid])
-            time_s = float(np.exp(weight @ np.log([candidate.time_s for candidate in grid])))
-            found[number] = Wander(np.sqrt(variance), time_s)
-        return tuple(found)
-
-
-def _candidates(sensor: SensorEvidence, expected: Wander | None) -> tuple[list[Wander], FloatArray]:
-    """Sizes and times tried of a sensor's wandering error, and their probabilities beforehand."""
-    if expected is None:
-        jitter = np.repeat(sensor.jitter, 3)
-        sizes = [(size, time) for size in WANDER for time in WANDER_TIMES_S]
-        prior = np.array(
-            [STEADY if size == WANDER[0] else (1 - STEADY) / (len(WANDER) - 1) for size, _ in sizes]
-        )
-        return [Wander(size * jitter, time) for size, time in sizes], prior
-    both = [(a, b) for a in FACTORS for b in FACTORS]
-    prior = np.exp(-0.5 * (np.log(np.array(both)) ** 2).sum(axis=1) / FACTOR_SPREAD**2)
-    return [Wander(expected.sigma * [a, a, b], expected.time_s) for a, b in both], prior
+    def _sizes(self, state: State) -> Sizes:
+        """Sizes of errors, one kind after the other."""
+        first = 6 * (len(self.images) - 1)
+        matrix, gradient = Normal.of(self._measured(state), self.size).reduced(self.size - first)
+        sizes = self.expected_sizes()
+        loose = ErrorSize(np.array([LOOSENED, 1.0, 1.0]), np.ones(3))
+        sizes = replace(sizes, images=loose)
+        kinds: list[Callable[[Sizes], Grid]] = [turns, turn_changes, scale_changes]
+        for number, (sensor, expected) in enumerate(zip(self.sensors, self.expected, strict=True)):
+            kinds.append(partial(wanders, number=number, sensor=sensor, expected=expected))
+        for kind in kinds:
+            grid = kind(sizes)
+            likelihood = [evidence(matrix, gradient, self._priors(state, each), first) for each in grid.sizes]
+            sizes = grid.mean(np.array(likelihood))
+        tight = ErrorSize(sizes.images.common / [LOOSENED, 1.0, 1.0], sizes.images.changing)
+        return replace(sizes, images=tight)
