@@ -26,8 +26,8 @@ RETURN_MM = 1.0
 are apart."""
 RETURN_RAD = 0.03
 """How far a probe may be turned that comes back to a place: two degrees."""
-SLOW, SLOW_RAD = 3, 0.005
-"""Number of slow curves by which tilt and yaw are off, and the deviation of the slowest: 0.3 degrees. A hand
+SLOW, SLOW_RAD = 4, 0.01
+"""Number of slow curves by which tilt and yaw are off, and the deviation of the slowest: 0.6 degrees. A hand
 turns by as much in a sweep, which images hardly see."""
 LEAST_STEP_MM = 0.005
 """Steps count as at least so long in what errors may change over them: no step is exact."""
@@ -59,8 +59,8 @@ class ImageErrors:
     ----------
     common : ndarray, shape (3,)
         Logarithm of the scale; tilt and yaw per mm that the images lack.
-    slow : ndarray, shape (3, 2)
-        Weights of three slow curves in tilt and yaw, rad.
+    slow : ndarray, shape (4, 2)
+        Weights of slow curves in tilt and yaw, rad.
     changing : ndarray, shape (k + 1, 3)
         What is wrong beyond that at the knots: z, mm; tilt and yaw, rad. Zero at the first.
     """
@@ -289,7 +289,7 @@ class ImageEvidence:
 
     @cached_property
     def curves(self) -> FloatArray:
-        """Slow curves, zero at the first frame, shape (n, 3)."""
+        """Slow curves, zero at the first frame, shape (n, 4)."""
         part = np.linspace(0.0, np.pi, len(self))
         return np.asarray(1.0 - np.cos(np.outer(part, np.arange(1, SLOW + 1))))
 

@@ -15,7 +15,7 @@ WANDER = (0.05, 0.25, 0.5, 1.0, 2.0, 4.0)
 WANDER_TIMES_S = (1.0, 5.0, 20.0)
 STEADY = 0.5
 """Probability, before anything is measured, that a tracker does not wander."""
-FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+FACTORS = (0.25, 0.5, 1.0, 2.0)
 """Sizes tried of an orientation sensor's wandering error over the expected."""
 FACTOR_SPREAD = 0.5
 """Standard deviation of the logarithm of that factor among sensors: twice, or half."""
