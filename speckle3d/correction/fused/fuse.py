@@ -2,12 +2,13 @@
 
 Unknown are the pose of every frame, the errors that the images' steps share, and of every sensor its world,
 mounting, clock, millimetres and wandering error. The images' steps enter with their full covariance, grown
-because pairs of frames share speckle, and may all be wrong by one scale and one rate of tilt and of yaw, and by
-a little more that changes along the sweep. The sizes of the sensors' errors are found from the readings.
+because pairs of frames share speckle, and may all be wrong by one scale and one rate of tilt and of yaw,
+and by a little more that changes along the sweep. The sizes of the errors are found from the data.
 
 References
 ----------
-.. [1] M. Kaess and F. Dellaert, "Factor graphs for robot perception", Foundations and Trends in Robotics, 2017.
+.. [1] F. Dellaert and M. Kaess, "Factor graphs for robot perception", Foundations and Trends in Robotics 6,
+   2017.
 .. [2] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
    Biometrika 58, 1971 (restricted likelihood).
 """
@@ -25,6 +26,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.correction.fused.contradictions import Contradiction, contradictions, difference
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
 from speckle3d.correction.fused.sizes import Wander
@@ -142,33 +144,58 @@ def fuse(
         sensors += [(read, slow)] if read else []
     problem = Problem.of(images, sensors, evidence)
     solution, problem = problem.solve()
-    return _reported(solution, problem, centre)
+    contrary = contradictions(problem, solution, settings.contradiction_sigma)
+    return _reported(problem, solution, contrary, centre)
 
 
-def _reported(solution: Solution, problem: Problem, centre: RigidTransform) -> FusedPoses:
-    images = solution.images
-    poses = centre * solution.state.poses * centre.inv()
-    world = RigidTransform.identity()
-    if solution.state.sensors:
-        state = solution.state.sensors[0]
-        world = state.world * centre.inv()
-        if problem.sensors[0].components == 3:
-            world = RigidTransform.from_rotation(state.world.rotation)
+def _reported(
+    problem: Problem, solution: Solution, contrary: Sequence[Contradiction], centre: RigidTransform
+) -> FusedPoses:
+    images, state = solution.images, solution.state
     frames, weight = images.parts
-    path = float(weight @ _along(solution.state.poses)[frames])
-    joint = solution.covariance(frames)[2::6, 2::6]
+    path = float(weight @ _along(state.poses)[frames])
+    variance = float(weight @ solution.covariance(frames)[2::6, 2::6] @ weight)
+    covariance = solution.marginals()
+    for each in contrary:
+        # Either may be right: the claim reaches from the one to the other.
+        apart = np.zeros((len(images), 6))
+        apart[:, each.parts] = difference(images.start, state.poses)[:, each.parts]
+        covariance += apart[:, :, None] * apart[:, None, :]
+        variance += (path - images.path_mm) ** 2 if 2 in each.parts else 0.0
+    world = RigidTransform.identity()
+    if problem.sensors:
+        world = state.sensors[0].world * centre.inv()
+        if problem.sensors[0].components == 3:
+            world = RigidTransform.from_rotation(state.sensors[0].world.rotation)
     sizes = _sizes(problem, solution)
     return FusedPoses(
-        poses=world * poses,
-        covariance=solution.marginals(),
+        poses=world * centre * state.poses * centre.inv(),
+        covariance=covariance,
         log_scale=float(np.log(path / images.path_mm)),
-        log_scale_sigma=float(np.sqrt(weight @ joint @ weight)) / path,
+        log_scale_sigma=float(np.sqrt(variance)) / path,
         evidence=problem.evidence,
-        details=dict(sizes),
-        used=("images", *(s.name for s in problem.sensors), *(e.source for e in problem.evidence)),
-        contradictions=(),
+        details={"used": ", ".join(problem.names), **sizes, **_directions(problem, solution)},
+        used=problem.names,
+        contradictions=tuple(each.doubt for each in contrary),
         sizes=sizes,
     )
+
+
+def _directions(problem: Problem, solution: Solution) -> dict[str, float | str]:
+    """How the scales there and back compare, if the sweep comes back over what it has seen."""
+    images = solution.images
+    frames, _ = images.parts
+    if frames.size < 2 or not images.returns.any():
+        return {}
+    z_mm, seen = _along(solution.state.poses)[frames], images.along_mm[frames]
+    there, back = z_mm[0], z_mm[0] - z_mm[1]
+    slope = np.array([1.0 / there - 1.0 / back, 1.0 / back])
+    sigma = float(np.sqrt(slope @ solution.covariance(frames)[2::6, 2::6] @ slope))
+    ratio = float(there / back * (seen[0] - seen[1]) / seen[0])
+    told = [name for name in problem.names if name not in ("images", ORIENTATION)]
+    said = "set by " + " and ".join(told) if told else "unknown beyond what the images claim"
+    tied = f"forward and back are tied to each other; their common scale is {said}"
+    return {"directions": tied, "direction_ratio": ratio, "direction_ratio_sigma": sigma}
 
 
 def _along(poses: RigidTransform) -> FloatArray:

@@ -121,9 +121,9 @@ class ImageEvidence:
     ) -> ImageEvidence:
         """Evidence with the errors that many edges share, as far as a claimed covariance tells them.
 
-        Deviations of x, y and roll over those of independent edges are read off the claim, where the structure
-        of the tissue makes them larger; the others' are the same for all tissue. So is the scale that changes
-        along the sweep: the images' own, without what is added for curves of another probe.
+        Deviations of x, y and roll over those of independent edges are read off the claim, where the
+        structure of the tissue makes them larger; the others' are the same for all tissue. So is the scale
+        that changes along the sweep: without what is added for curves of another probe.
 
         Parameters
         ----------

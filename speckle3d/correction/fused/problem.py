@@ -25,8 +25,8 @@ class Block:
     residual : ndarray, shape (m, k)
         m groups of k equations.
     parts : tuple of (ndarray, ndarray)
-        Columns, shape (m, c), and derivatives of the residual by them, shape (m, k, c). A column below zero is
-        of a variable that is fixed.
+        Columns, shape (m, c), and derivatives of the residual by them, shape (m, k, c). A column below zero
+        is of a variable that is fixed.
     """
 
     residual: FloatArray

@@ -50,7 +50,7 @@ class Grid:
     prior: FloatArray
 
     def mean(self, likelihood: FloatArray) -> Sizes:
-        """Geometric means, given logarithms of the likelihoods of the alternatives."""
+        """Means given logarithms of the alternatives' likelihoods: of factors geometric, of wander its square's."""
         weight = self.prior * np.exp(likelihood - likelihood.max())
         weight /= weight.sum()
 
@@ -62,7 +62,7 @@ class Grid:
         )
         wander = tuple(
             Wander(
-                of([each.wander[k].sigma for each in self.sizes]),
+                np.sqrt(weight @ np.square([each.wander[k].sigma for each in self.sizes])),
                 float(np.exp(weight @ np.log([each.wander[k].time_s for each in self.sizes]))),
             )
             for k in range(len(self.sizes[0].wander))

@@ -26,15 +26,15 @@ from speckle3d.correction.fused.sizes import (
 from speckle3d.correction.scale import ScaleEvidence
 
 ROUNDS = 15
-SIZED = (1, 3)
-"""Rounds after which sizes of errors are found."""
+SIZED = (2, 1)
+"""Rounds before sizes of errors are found, and before they are found again."""
 SETTLED = 1e-5
 """Step, mm and rad, at which the iteration ends."""
 KNOWN_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
 LOOSENED = 3.0
-"""Factor of the scale that the images' steps may all have wrong while other errors are sized: a sensor that is
-right about a wrong scale does not wander."""
+"""Factor of the scale that the images' steps may all have wrong while other errors are sized: a sensor that
+is right about a wrong scale does not wander."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,12 @@ class Problem:
         """Number of variables."""
         return self.images.size + sum(sensor.size for sensor in self.sensors)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What takes part."""
+        others = (*(sensor.name for sensor in self.sensors), *(each.source for each in self.evidence))
+        return ("images", *others)
+
     def start(self) -> State:
         """The images' own poses."""
         poses = self.images.start
@@ -148,18 +154,29 @@ class Problem:
         return Sizes(ErrorSize(np.ones(3), np.ones(3)), tuple(wander))
 
     def solve(self) -> tuple[Solution, Problem]:
-        """Gauss-Newton, and between its rounds the sizes of errors; and the problem with jitters as found."""
+        """The best state, with sizes of errors as found; and the problem with jitters as found."""
         problem, state, sizes = self, self.start(), self.expected_sizes()
-        for number in range(ROUNDS):
-            normal = problem.normal(state, sizes)
-            step = -normal.factor().solve(normal.gradient)
-            state = state.moved(step, self.sensors)
-            if number in SIZED and self.sensors:
+        if self.sensors:
+            for rounds in SIZED:
+                for _ in range(rounds):
+                    state = problem._stepped(state, sizes)[0]
                 problem = problem._with_jitter(state)
                 sizes = problem._sizes(state)
-            elif np.abs(step[: 6 * (len(self.images) - 1)]).max() < SETTLED and number > max(SIZED):
+        return problem.settled(state, sizes), problem
+
+    def settled(self, state: State, sizes: Sizes) -> Solution:
+        """Gauss-Newton to the end."""
+        for _ in range(ROUNDS):
+            state, moved = self._stepped(state, sizes)
+            if moved < SETTLED:
                 break
-        return Solution(state, problem.normal(state, sizes), sizes, self.images), problem
+        return Solution(state, self.normal(state, sizes), sizes, self.images)
+
+    def _stepped(self, state: State, sizes: Sizes) -> tuple[State, float]:
+        """The state after one round, and the largest change of a pose, mm or rad."""
+        normal = self.normal(state, sizes)
+        step = -normal.factor().solve(normal.gradient)
+        return state.moved(step, self.sensors), float(np.abs(step[: 6 * (len(self.images) - 1)]).max())
 
     def normal(self, state: State, sizes: Sizes) -> Normal:
         """Normal equations of all there is."""
