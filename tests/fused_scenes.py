@@ -1,7 +1,7 @@
 """Hand sweeps, edges between their frames with the errors that images have, and sensors: poses only.
 
-The errors are not those that the fusion assumes: the scale changes smoothly along the sweep, pairs share errors
-of their frames, and turns are seen in part.
+The errors are not those that the fusion assumes: the scale changes smoothly along the sweep, pairs share
+errors of their frames.
 """
 
 from __future__ import annotations

@@ -29,10 +29,14 @@ from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.fused.contradictions import Contradiction, contradictions, difference
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
+from speckle3d.correction.fused.sides import on_sensed_sides
 from speckle3d.correction.fused.sizes import Wander
 from speckle3d.correction.fused.solution import Problem, Solution
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.trust import ORIENTATION, TRACKER
+
+LEAST_PATH_MM = 0.1
+"""Travel by the images that a scale is given of at least."""
 
 
 class FusedSettings(BaseModel):
@@ -127,25 +131,36 @@ def fuse(
     yaw, tilt = turn_sigma_per_mm
     centre = RigidTransform.from_translation(centre_mm)
     start = centre.inv() * (image[0].inv() * image) * centre
-    images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
     limits = SensorLimits(
         settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, 1e-9
     )
+    turned_over = False
     sensors: list[tuple[SensorEvidence, Wander | None]] = []
     if tracker is not None:
         own = replace(limits, stretch=settings.tracker_scale_sigma)
         read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, own)
-        sensors += [(read, None)] if read else []
+        if read:
+            sided, start = on_sensed_sides(edges, start, read)
+            turned_over = sided is not edges
+            edges, sensors = sided, [(read, None)]
     if orientation is not None:
         slow = Wander(
             np.array([settings.inclination_sigma_rad] * 2 + [settings.heading_sigma_rad]), settings.wander_s
         )
         read = read_sensor(orientation, ORIENTATION, start, centre_mm, frame_time_s, limits)
         sensors += [(read, slow)] if read else []
+    images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
     problem = Problem.of(images, sensors, evidence)
     solution, problem = problem.solve()
     contrary = contradictions(problem, solution, settings.contradiction_sigma)
-    return _reported(problem, solution, contrary, centre)
+    found = _reported(problem, solution, contrary, centre)
+    if turned_over:
+        frames, weight = images.parts
+        own = float(np.abs(weight @ _along(centre.inv() * (image[0].inv() * image) * centre)[frames]))
+        said = "turned over where the tracker saw the probe go the other way"
+        scale = found.log_scale + float(np.log(images.path_mm / max(own, LEAST_PATH_MM)))
+        found = replace(found, log_scale=scale, details=found.details | {"stretches": said})
+    return found
 
 
 def _reported(

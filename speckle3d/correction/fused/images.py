@@ -188,20 +188,22 @@ class ImageEvidence:
         """Some frames, and the variances of their poses had edges no errors in common, shape (k, 6)."""
         n = len(self)
         some = np.unique(np.linspace(1, n - 1, min(n - 1, COMPARED)).round().astype(int))
-        normal = Normal.of([self._alone(), self._held(self.start)], 6 * (n - 1))
+        normal = Normal.of(self.alone(), 6 * (n - 1))
         columns = pose_columns(some)
         unit = np.zeros((6 * (n - 1), columns.size))
         unit[columns.ravel(), np.arange(columns.size)] = 1.0
         variance = normal.factor().solve(unit)[columns.ravel(), np.arange(columns.size)]
         return some, variance.reshape(-1, 6)[:, TWIST]
 
-    def _alone(self) -> Block:
+    def alone(self) -> list[Block]:
+        """Equations of the edges at `start`, as if they had no errors in common."""
         first, second = self.edges.first, self.edges.second
         relative = self.start[first].inv() * self.start[second]
         error = (self.edges.poses.inv() * relative).as_exp_coords()
         w = self._independent
         parts = ((pose_columns(first), -w @ adjoint(relative.inv())), (pose_columns(second), w))
-        return Block(np.einsum("eij,ej->ei", w, error), parts).weighted(self._doubtful(error))
+        edges = Block(np.einsum("eij,ej->ei", w, error), parts).weighted(self._doubtful(error))
+        return [edges, self._held(self.start)]
 
     def _whitening(self, growth: FloatArray) -> FloatArray:
         """Whitening of edges' twists, shape (e, 6, 6)."""

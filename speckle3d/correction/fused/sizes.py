@@ -50,7 +50,7 @@ class Grid:
     prior: FloatArray
 
     def mean(self, likelihood: FloatArray) -> Sizes:
-        """Means given logarithms of the alternatives' likelihoods: of factors geometric, of wander its square's."""
+        """Means given logarithms of likelihoods: geometric of factors, of wander that of its square."""
         weight = self.prior * np.exp(likelihood - likelihood.max())
         weight /= weight.sum()
 
