@@ -16,7 +16,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -35,6 +35,8 @@ from speckle3d.correction.fused.solution import Problem, Solution
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.trust import ORIENTATION, TRACKER
 
+UNUSED = 1e-9
+"""Standard deviation of what a sensor does not have: an orientation sensor's millimetres."""
 LEAST_PATH_MM = 0.1
 """Travel by the images that a scale is given of at least."""
 
@@ -131,40 +133,49 @@ def fuse(
     yaw, tilt = turn_sigma_per_mm
     centre = RigidTransform.from_translation(centre_mm)
     start = centre.inv() * (image[0].inv() * image) * centre
-    limits = SensorLimits(
-        settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, 1e-9
-    )
-    turned_over = False
-    sensors: list[tuple[SensorEvidence, Wander | None]] = []
+    seen_mm = _along(start)
     if tracker is not None:
-        own = replace(limits, stretch=settings.tracker_scale_sigma)
-        read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, own)
-        if read:
-            sided, start = on_sensed_sides(edges, start, read)
-            turned_over = sided is not edges
-            edges, sensors = sided, [(read, None)]
-    if orientation is not None:
-        slow = Wander(
-            np.array([settings.inclination_sigma_rad] * 2 + [settings.heading_sigma_rad]), settings.wander_s
-        )
-        read = read_sensor(orientation, ORIENTATION, start, centre_mm, frame_time_s, limits)
-        sensors += [(read, slow)] if read else []
+        read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, _limits(settings, TRACKER))
+        edges, start = on_sensed_sides(edges, start, read) if read else (edges, start)
     images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
-    problem = Problem.of(images, sensors, evidence)
-    solution, problem = problem.solve()
+    sensors = _sensors(start, centre_mm, frame_time_s, orientation, tracker, settings)
+    solution, problem = Problem.of(images, sensors, evidence).solve()
     contrary = contradictions(problem, solution, settings.contradiction_sigma)
-    found = _reported(problem, solution, contrary, centre)
-    if turned_over:
-        frames, weight = images.parts
-        own = float(np.abs(weight @ _along(centre.inv() * (image[0].inv() * image) * centre)[frames]))
-        said = "turned over where the tracker saw the probe go the other way"
-        scale = found.log_scale + float(np.log(images.path_mm / max(own, LEAST_PATH_MM)))
-        found = replace(found, log_scale=scale, details=found.details | {"stretches": said})
+    return _reported(problem, solution, contrary, centre, seen_mm)
+
+
+def _limits(settings: FusedSettings, name: str) -> SensorLimits:
+    stretch = settings.tracker_scale_sigma if name == TRACKER else UNUSED
+    return SensorLimits(
+        settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, stretch
+    )
+
+
+def _sensors(
+    start: RigidTransform,
+    centre_mm: FloatArray,
+    frame_time_s: FloatArray,
+    orientation: OrientationSensor | None,
+    tracker: Tracker | None,
+    settings: FusedSettings,
+) -> list[tuple[SensorEvidence, Wander | None]]:
+    """The sensors that can be used, and what each is expected to wander by."""
+    inclination, heading = settings.inclination_sigma_rad, settings.heading_sigma_rad
+    slow = Wander(np.array([inclination, inclination, heading]), settings.wander_s)
+    found: list[tuple[SensorEvidence, Wander | None]] = []
+    for sensor, name, expected in ((tracker, TRACKER, None), (orientation, ORIENTATION, slow)):
+        if sensor is not None:
+            read = read_sensor(sensor, name, start, centre_mm, frame_time_s, _limits(settings, name))
+            found += [(read, expected)] if read else []
     return found
 
 
 def _reported(
-    problem: Problem, solution: Solution, contrary: Sequence[Contradiction], centre: RigidTransform
+    problem: Problem,
+    solution: Solution,
+    contrary: Sequence[Contradiction],
+    centre: RigidTransform,
+    seen_mm: FloatArray,
 ) -> FusedPoses:
     images, state = solution.images, solution.state
     frames, weight = images.parts
@@ -183,13 +194,16 @@ def _reported(
         if problem.sensors[0].components == 3:
             world = RigidTransform.from_rotation(state.sensors[0].world.rotation)
     sizes = _sizes(problem, solution)
+    details: dict[str, float | str] = {"used": ", ".join(problem.names), **sizes}
+    if not np.array_equal(seen_mm, images.along_mm):
+        details["stretches"] = "turned over where the tracker saw the probe go the other way"
     return FusedPoses(
         poses=world * centre * state.poses * centre.inv(),
         covariance=covariance,
-        log_scale=float(np.log(path / images.path_mm)),
+        log_scale=float(np.log(path / max(abs(float(weight @ seen_mm[frames])), LEAST_PATH_MM))),
         log_scale_sigma=float(np.sqrt(variance)) / path,
         evidence=problem.evidence,
-        details={"used": ", ".join(problem.names), **sizes, **_directions(problem, solution)},
+        details=details | _directions(problem, solution),
         used=problem.names,
         contradictions=tuple(each.doubt for each in contrary),
         sizes=sizes,
