@@ -1,4 +1,4 @@
-"""The fused problem in GTSAM: the same variables and errors, written with its poses, factors and marginals."""
+"""The fused problem in GTSAM: the same variables and errors, with its poses, factors and marginals."""
 
 from __future__ import annotations
 

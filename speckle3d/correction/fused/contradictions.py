@@ -9,10 +9,13 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
+from speckle3d.correction.fused.images import ErrorSize
 from speckle3d.correction.fused.sizes import Sizes
 from speckle3d.correction.fused.solution import Problem, Solution, State
 
 PARTS = ("x", "y", "z", "tilt", "yaw", "roll")
+MOST_CHANGE = 2.0
+"""Factor by which the images' scale may change more than claimed before a source contradicts it."""
 LEAST_SHARE = 0.05
 """Share of the images' variance that a difference is expected to have at least: a source that tells next to
 nothing shifts poses by next to nothing, and rounding must not count as evidence."""
@@ -61,7 +64,11 @@ def _restricted(problem: Problem, solution: Solution, sensor: int | None, eviden
         [(problem.sensors[k], problem.expected[k]) for k in some],
         [] if evidence is None else [problem.evidence[evidence]],
     )
-    sizes = Sizes(solution.sizes.images, tuple(solution.sizes.wander[k] for k in some))
+    found = solution.sizes.images
+    # A scale that changes more than the images claim is not to hide that they differ from the source.
+    changing = np.minimum(found.changing, [MOST_CHANGE, np.inf, np.inf])
+    images = found if some or evidence is not None else ErrorSize(found.common, changing)
+    sizes = Sizes(images, tuple(solution.sizes.wander[k] for k in some))
     sensors = tuple(solution.state.sensors[k] for k in some)
     state = replace(solution.state, sensors=sensors) if some else less.start()
     return less.settled(State(state.poses, state.errors, state.sensors), sizes)
