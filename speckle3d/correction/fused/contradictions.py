@@ -14,6 +14,8 @@ from speckle3d.correction.fused.sizes import Sizes
 from speckle3d.correction.fused.solution import Problem, Solution, State
 
 PARTS = ("x", "y", "z", "tilt", "yaw", "roll")
+COMPARED = 3
+"""Rounds for the poses that are compared, which start near."""
 MOST_CHANGE = 2.0
 """Factor by which the images' scale may change more than claimed before a source contradicts it."""
 LEAST_SHARE = 0.05
@@ -71,7 +73,7 @@ def _restricted(problem: Problem, solution: Solution, sensor: int | None, eviden
     sizes = Sizes(images, tuple(solution.sizes.wander[k] for k in some))
     sensors = tuple(solution.state.sensors[k] for k in some)
     state = replace(solution.state, sensors=sensors) if some else less.start()
-    return less.settled(State(state.poses, state.errors, state.sensors), sizes)
+    return less.settled(State(state.poses, state.errors, state.sensors), sizes, COMPARED)
 
 
 def _compared(alone: Solution, both: Solution, name: str, sigmas: float) -> Contradiction | None:

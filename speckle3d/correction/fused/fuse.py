@@ -62,7 +62,7 @@ class FusedSettings(BaseModel):
     heading_sigma_rad: float = Field(0.0087, gt=0, description="Slow error of its heading: half a degree.")
     wander_s: float = Field(40.0, gt=0, description="Time in which these errors change.")
     contradiction_sigma: float = Field(
-        5.0, gt=0, description="Deviations by which a sensor must differ from the images to contradict them."
+        6.0, gt=0, description="Deviations by which a sensor must differ from the images to contradict them."
     )
 
 

@@ -296,20 +296,28 @@ class ImageEvidence:
         return np.asarray(1.0 - np.cos(np.outer(part, np.arange(1, SLOW + 1))))
 
     def distortion_parts(
-        self, frames: IntArray, errors: ImageErrors, slope: FloatArray
+        self, frames: IntArray, weights: FloatArray, errors: ImageErrors, slope: FloatArray
     ) -> tuple[tuple[IntArray, FloatArray], ...]:
-        """Parts of equations whose derivatives by the distortion of some frames are `slope`, (m, k, 3)."""
-        before, share = self._knot[0][frames], self._knot[1][frames]
-        common = np.broadcast_to(self.common_columns, (frames.size, 3))
-        return (
-            (self.knot_columns(before), slope * (1 - share)[:, None, None]),
-            (self.knot_columns(before + 1), slope * share[:, None, None]),
-            (common, slope @ errors.per_mm_slope * self.along_mm[frames][:, None, None]),
-            (
-                np.broadcast_to(self.slow_columns, (frames.size, 2 * SLOW)),
-                np.einsum("fs,fkt->fkst", self.curves[frames], slope[:, :, 1:]).reshape(*slope.shape[:2], -1),
-            ),
-        )
+        """Parts of equations about weighted sums of some frames' distortion.
+
+        Parameters
+        ----------
+        frames : ndarray of int, shape (m, f)
+        weights : ndarray, shape (m, f)
+        slope : ndarray, shape (m, k, 3)
+            Derivatives of the equations by the sums.
+        """
+        parts = []
+        for frame, weight in zip(frames.T, weights.T, strict=True):
+            before, share = self._knot[0][frame], self._knot[1][frame]
+            parts.append((self.knot_columns(before), slope * (weight * (1 - share))[:, None, None]))
+            parts.append((self.knot_columns(before + 1), slope * (weight * share)[:, None, None]))
+        along = (weights * self.along_mm[frames]).sum(axis=1)
+        curves = np.einsum("mf,mfs->ms", weights, self.curves[frames])
+        turned = np.einsum("ms,mkt->mkst", curves, slope[:, :, 1:]).reshape(*slope.shape[:2], -1)
+        shared = np.concatenate([self.common_columns, self.slow_columns])
+        both = np.concatenate([slope @ errors.per_mm_slope * along[:, None, None], turned], axis=2)
+        return (*parts, (np.broadcast_to(shared, (len(frames), shared.size)), both))
 
     def _with_errors(self, poses: RigidTransform, errors: ImageErrors) -> Block:
         first, second = self.edges.first, self.edges.second
@@ -324,13 +332,13 @@ class ImageEvidence:
         on_path = slope * np.where(self.returns, 0.0, 1.0)[:, None, None]
         of_return = slope @ errors.per_mm_slope * (apart * self.returns)[:, None, None]
         common = np.broadcast_to(self.common_columns, (len(self.edges), 3))
+        ends = np.column_stack([first, second])
         return Block(
             np.einsum("eij,ej->ei", w, error),
             (
                 (pose_columns(first), -w @ adjoint(relative.inv())),
                 (pose_columns(second), w),
-                *self.distortion_parts(second, errors, on_path),
-                *self.distortion_parts(first, errors, -on_path),
+                *self.distortion_parts(ends, np.tile([-1.0, 1.0], (len(ends), 1)), errors, on_path),
                 (common, of_return),
             ),
         ).weighted(self._doubtful(error))
