@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
+from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
+from speckle3d.correction.fused.fuse import FusedSettings
+from speckle3d.correction.inertial.settings import InertialSettings
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import MatchingSettings
@@ -23,6 +26,7 @@ from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.planes import PlaneSettings
 
+Model = TypeVar("Model", bound=BaseModel)
 _MOST_BYTES = 2**20
 """A hundred times what every setting takes."""
 
@@ -50,6 +54,9 @@ class Config(BaseModel):
     trajectory: TrajectorySettings = TrajectorySettings()
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()
+    crossing: CrossingSettings = CrossingSettings()
+    inertial: InertialSettings = InertialSettings()
+    fused: FusedSettings = FusedSettings()
 
     def with_choices(self, consistent_subset: bool | None, drift_curves: str | None) -> Config:
         """Return a configuration with command-line choices in place of its own; None leaves one as it is."""
@@ -58,7 +65,7 @@ class Config(BaseModel):
             values["sensors"]["consistent_subset"] = consistent_subset
         if drift_curves is not None:
             values["drift"]["curves"] = drift_curves
-        return _validated(values, "configuration")
+        return _validated(values, "configuration", Config)
 
     def to_toml(self) -> str:
         """Write every setting as TOML text, which `config_from_toml` reads back."""
@@ -73,14 +80,17 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
     InvalidInputError
         Naming the setting that is unknown or out of range.
     """
+    return _validated(_parsed(text, where), where, Config)
+
+
+def _parsed(text: str, where: str) -> dict[str, Any]:
     try:
-        values = tomllib.loads(text)
+        return tomllib.loads(text)
     except RecursionError:
         raise InvalidInputError(f"{where}: expected TOML, got brackets within brackets without end") from None
     # Of TOML, and of numbers with thousands of digits.
     except ValueError as error:
         raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
-    return _validated(values, where)
 
 
 def first_fault(error: ValidationError) -> tuple[str, str]:
@@ -89,12 +99,12 @@ def first_fault(error: ValidationError) -> tuple[str, str]:
     return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {first['input']!r}"
 
 
-def _validated(values: dict[str, Any], where: str) -> Config:
+def _validated(values: dict[str, Any], where: str, model: type[Model]) -> Model:
     try:
-        return Config.model_validate(values)
+        return model.model_validate(values)
     except ValidationError as error:
         name, fault = first_fault(error)
-        raise InvalidInputError(f"{where}: {name}: {fault}") from error
+        raise InvalidInputError(f"{where}: {f'{name}: ' if name else ''}{fault}") from error
 
 
 def load_config(path: Path) -> Config:
@@ -107,6 +117,11 @@ def load_config(path: Path) -> Config:
     InvalidInputError
         Naming the setting that is unknown or out of range.
     """
+    return load_toml(Config, path)
+
+
+def load_toml(model: type[Model], path: Path) -> Model:
+    """Read settings of any model from a TOML file, as `load_config` does."""
     try:
         with open_regular(path) as stream:
             content = stream.read(_MOST_BYTES + 1)
@@ -115,4 +130,4 @@ def load_config(path: Path) -> Config:
         raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
     if len(content) > _MOST_BYTES:
         raise FileError(f"{path}: expected at most {_MOST_BYTES} bytes of TOML, got more")
-    return config_from_toml(text, str(path))
+    return _validated(_parsed(text, str(path)), str(path), model)

@@ -22,9 +22,6 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import correct_mode, require_modes, sensor_of
-from speckle3d.correction.trust import cleaned_readings, require_believed
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -46,7 +43,7 @@ from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import PairReader, SignedPair
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
-from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
+from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
@@ -67,7 +64,7 @@ class Tracked:
     image : RigidTransform, length n
         Poses from all patches.
     covariance : ndarray, shape (n, 6, 6)
-        Of `image`; see `speckle3d.motion.uncertainty`.
+        Of `image`; see `speckle3d.motion.uncertainty`. What the curves' mismatch does is in it.
     subset : RigidTransform, length n, or None
         Poses from the orientation-consistent patches.
     rejected_share : float
@@ -78,7 +75,10 @@ class Tracked:
         The frame pairs that the trajectory was solved from, in the sense of motion of `image`; their
         covariances are those of pairs independent of each other.
     scale_sigma : float
-        Relative standard deviation of the scale of distances, which all pairs share.
+        Relative standard deviation of the scale of distances, which all pairs share: that of the images' own
+        adaptation and `curves_sigma`, the root of the sum of squares.
+    curves_sigma : float
+        The part of it that is the curves' mismatch with this probe and tissue.
     direction : int
         Sign of the elevational motion, +1 or -1.
     direction_from : str
@@ -100,6 +100,7 @@ class Tracked:
     flags: IntArray
     edges: RelativePoses
     scale_sigma: float
+    curves_sigma: float
     direction: int
     direction_from: str
     coherence: Coherence | None
@@ -218,6 +219,12 @@ def track(
             sweep, trajectory.poses, covariance, found.table, pairs, matcher, curves, flags
         )
 
+    # Checks ask what contradicts images and curves as given: a mismatch shows in them and excuses nothing.
+    # Claimed errors include it.
+    mismatch = curves.mismatch(settings.curves.same_probe)
+    whole = with_common_scale(covariance, trajectory.poses, matcher.centre_mm, mismatch)
+    sigma = float(np.hypot(scale_sigma(coherence), mismatch))
+
     # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
         sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
@@ -230,16 +237,17 @@ def track(
         subset, used = _consistent(sensors.trusted, table, pairs, direction, reader, settings)
 
     if sink:
-        for rows in reader.rows(table, pairs, edges, used, direction, scale_sigma(coherence)):
+        for rows in reader.rows(table, pairs, edges, used, direction, sigma):
             sink(rows)
     return Tracked(
         image=_seen_from(direction, trajectory.poses),
-        covariance=covariance if direction > 0 else MIRROR @ covariance @ MIRROR,
+        covariance=whole if direction > 0 else MIRROR @ whole @ MIRROR,
         subset=None if subset is None else _seen_from(direction, subset),
         rejected_share=float("nan") if subset is None else _rejected_share(pairs, used),
         flags=_with_unjoined(flags, reader, pairs),
         edges=edges if direction > 0 else edges.mirrored(),
-        scale_sigma=scale_sigma(coherence),
+        scale_sigma=sigma,
+        curves_sigma=mismatch,
         direction=direction,
         direction_from=source,
         coherence=coherence,
@@ -365,53 +373,6 @@ def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:
     return poses if direction > 0 else mirrored(poses)
 
 
-def correct(
-    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
-) -> dict[str, DriftCorrection]:
-    """Correct the drift of the image-based poses in each of `modes`.
-
-    Parameters
-    ----------
-    tracked : Tracked
-    sweep : Sweep
-        From which `tracked` was made.
-    modes : sequence of str
-        Among ``"orientation"`` (three curves) and ``"pose"`` (six).
-    config : Config, optional
-
-    Returns
-    -------
-    dict of str to DriftCorrection
-        By mode; ``poses`` are ``world_from_image`` in the sensor's world.
-
-    Raises
-    ------
-    InvalidInputError
-        If a mode is unknown.
-    InsufficientDataError
-        If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
-    MismatchError
-        If the images, or its own readings, refute a mode's sensor; see `Tracked.doubts`.
-
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, equations 1 to 5.
-
-    Examples
-    --------
-    >>> import speckle3d as s3
-    >>> sweep = s3.load_sweep("data/phantom.h5")
-    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
-    >>> corrected = s3.correct(tracked, sweep, ["orientation", "pose"])
-    >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
-    [96, 96]
-    """
-    settings = config or Config()
-    require_modes(sweep, modes)
-    for mode in modes:
-        require_believed(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
-    if settings.sensors.examine:
-        sweep, _ = cleaned_readings(sweep)
-    # What wander the sensed orientation shows, cubics need not make up for.
-    start = tracked.subset if tracked.subset is not None else tracked.image
-    return {mode: correct_mode(mode, start, sweep, settings.drift) for mode in modes}
+def after(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Progress of one of several sweeps, `before` frames of `total` being done when it begins."""
+    return None if progress is None else lambda done, _: progress(before + done, total)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -15,6 +15,17 @@ PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equali
 """Numbers in a `CurveKey` beside those of the signal, in every file of curves."""
 EDGE_FRACTION = 0.1
 """Of `CurveKey.edge_fraction` in files that do not give it: all that versions before wrote by default."""
+
+Origin = Literal["phantom", "tracked", "data sheet", "crossing"]
+"""What curves' distances come from: exact steps, a tracker, diffraction, or a sweep that crosses another."""
+TISSUE_SIGMA = 0.015
+"""Relative error of all distances, standard deviation, from tissue that attenuates otherwise than what the
+curves were measured in: 0.3 dB/cm/MHz more make 2.3 to 3.4 % on simulated sweeps, and soft tissues differ
+by 0.15."""
+PROBE_SIGMA = 0.08
+"""The same from a probe that is not the one the curves were measured on, tissue included. Lenses of one model
+focus within 10 %, apertures are as high within 5 %, either way: 8 to 13 and 5 % of length at those bounds on
+simulated sweeps, taken as evenly spread between them (over the root of 3), and `TISSUE_SIGMA`."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +128,10 @@ class DecorrelationCurves:
         None if the phantom sweeps did not turn.
     speckle : SpeckleSize or None
         Of the phantom's images; None in files that older versions wrote.
+    scale_sigma : float
+        Relative standard deviation of the factor that is common to all distances on a sweep that the curves
+        are used for, by their origin; see `PROBE_SIGMA`.
+    origin : {"phantom", "tracked", "data sheet", "crossing"}
     """
 
     key: CurveKey
@@ -127,8 +142,14 @@ class DecorrelationCurves:
     pairs_used: int = 0
     tilt: TiltResponse | None = None
     speckle: SpeckleSize | None = None
+    scale_sigma: float = PROBE_SIGMA
+    origin: Origin = "phantom"
 
     def __post_init__(self) -> None:
+        if self.origin not in get_args(Origin):
+            raise InvalidInputError(f"origin: expected one of {get_args(Origin)}, got {self.origin!r}")
+        if not 0.0 <= self.scale_sigma < 1.0:
+            raise InvalidInputError(f"scale_sigma: expected a share from 0 to 1, got {self.scale_sigma}")
         if self.correlation.shape != (self.depth_mm.size, self.distance_mm.size):
             raise InvalidInputError(
                 f"correlation: expected shape ({self.depth_mm.size}, {self.distance_mm.size}), "
@@ -167,7 +188,19 @@ class DecorrelationCurves:
             self.pairs_used,
             None if self.tilt is None else self.tilt.at(np.asarray(depth_mm), self.depth_mm),
             None if self.speckle is None else self.speckle.at(np.asarray(depth_mm), self.depth_mm),
+            self.scale_sigma,
+            self.origin,
         )
+
+    def mismatch(self, same_probe: bool) -> float:
+        """Relative standard deviation of what the curves' mismatch does to all distances of a sweep.
+
+        Parameters
+        ----------
+        same_probe : bool
+            Whether a phantom's curves were measured with the very probe of the sweep.
+        """
+        return TISSUE_SIGMA if same_probe and self.origin == "phantom" else self.scale_sigma
 
 
 def _settings(key: CurveKey) -> dict[str, Any]:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import cast, get_args
+
 import numpy as np
 
 from speckle3d.core.curves import (
     EDGE_FRACTION,
     PATCH_NUMBERS,
+    PROBE_SIGMA,
     CurveKey,
     DecorrelationCurves,
+    Origin,
     SpeckleSize,
     TiltResponse,
 )
@@ -45,7 +49,8 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
         for group, part in (("tilt", curves.tilt), ("speckle", curves.speckle)):
             for name, values in vars(part).items() if part is not None else ():
                 file[f"{group}/{name}"] = values
-        file.attrs["pairs_used"] = curves.pairs_used
+        for name in ("pairs_used", "scale_sigma", "origin"):
+            file.attrs[name] = getattr(curves, name)
         write_attributes(file, curves.key, (*PATCH_NUMBERS, "correlation_of", "edge_fraction", "probe"))
         file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
         file.attrs.update(vars(curves.key.signal))
@@ -87,6 +92,8 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         probe = read_text(file, "probe") if "probe" in file.attrs else ""
         key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of, edge_fraction=edge, probe=probe)
         pairs = int(read_attribute(file, "pairs_used", 0))
+        sigma = read_attribute(file, "scale_sigma", PROBE_SIGMA)
+        origin = _origin(read_text(file, "origin")) if "origin" in file.attrs else "phantom"
         tilt = speckle = None
         if has_member(file, "tilt"):
             names = ("tilt/pivot_mm", "tilt/spread_mm")
@@ -94,7 +101,15 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         if has_member(file, "speckle"):
             names = ("speckle/lateral_mm", "speckle/axial_mm")
             speckle = SpeckleSize(*(read_checked(file, name, (depth.size,)) for name in names))
-        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, tilt, speckle)
+        parts = tilt, speckle, sigma, origin
+        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, *parts)
+
+
+def _origin(name: str) -> Origin:
+    for known in get_args(Origin):
+        if name == known:
+            return cast(Origin, known)
+    raise InvalidInputError(f"attribute origin: expected one of {get_args(Origin)}, got {name!r}")
 
 
 load_curves = read_curves

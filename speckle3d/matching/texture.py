@@ -11,6 +11,7 @@ import numpy as np
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import SpeckleSize
 from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
@@ -46,6 +47,51 @@ def speckle_size(sweep: Sweep, matcher: FrameMatcher, among: IntArray | None = N
     sizes = matcher.patches.rows_of(np.stack(found))
     lateral, axial = sizes.transpose(1, 2, 0, 3).reshape(*sizes.shape[1:3], -1)
     return SpeckleSize(_medians(lateral), _medians(axial))
+
+
+def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[FloatArray, FloatArray]:
+    """Power spectrum of the echoes about some depths, noise taken off, over some frames.
+
+    Parameters
+    ----------
+    depth_mm : ndarray, shape (y,)
+    height_mm : float
+        Height of the window about each depth.
+
+    Returns
+    -------
+    frequency_hz : ndarray, shape (f,)
+    power : ndarray, shape (y, f)
+
+    Raises
+    ------
+    InvalidInputError
+        If the sweep holds B-mode images, which have no spectrum, or the depths are not in them.
+    """
+    signal, grid = sweep.signal, sweep.grid
+    if not isinstance(signal, RFSettings):
+        raise InvalidInputError(f"{sweep.name}: expected RF, whose spectrum can be seen, got B-mode images")
+    count = min(round(height_mm / grid.sample_spacing_mm), grid.samples)
+    middle = np.rint((depth_mm - grid.first_sample_depth_mm) / grid.sample_spacing_mm).astype(int)
+    first = np.clip(middle - count // 2, 0, grid.samples - count)
+    if count < 16 or (np.abs(first + count // 2 - middle) > count).any():
+        raise InvalidInputError(
+            f"{sweep.name}: expected echoes from {depth_mm[0]:.1f} to {depth_mm[-1]:.1f} mm, got images of "
+            f"{grid.depth_mm:.1f} mm"
+        )
+    window = np.hanning(count).astype(np.float32)
+    power = np.zeros((depth_mm.size, count // 2))
+    for k in _spread(np.arange(len(sweep)), FRAMES):
+        frame = sweep.frames[k]
+        for row, start in enumerate(first):
+            spectrum = np.fft.fft(frame[:, start : start + count] * window, axis=1)[:, : count // 2]
+            # Bright structure counts no more than speckle: images are equalised before they are correlated.
+            energy = np.abs(spectrum) ** 2
+            power[row] += (energy / np.maximum(energy.sum(axis=1, keepdims=True), 1e-30)).mean(axis=0)
+    noise = np.quantile(power, _NOISE_QUANTILE, axis=1, keepdims=True)
+    return np.arange(count // 2) * signal.sampling_rate_hz / count, np.maximum(
+        power - noise, 1e-12 * power.max()
+    )
 
 
 def doubt_band(sweep: Sweep) -> tuple[Doubt, ...]:

@@ -37,6 +37,11 @@ class CurveSettings(BaseModel):
     largest_mm: float = Field(2.5, gt=0, description="Largest separation of two phantom frames that is used.")
     terms: int = Field(3, ge=1, le=5, description="Order of -ln(rho) as a polynomial in squared distance.")
     pairs: int = Field(3000, ge=10, description="About how many frame pairs of each phantom sweep are used.")
+    same_probe: bool = Field(
+        False,
+        description="The curves were measured on a phantom with the very probe that the sweep was made with, "
+        "not only with one of its model: claimed errors of length then leave out what probes differ by.",
+    )
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,24 @@ def pose_covariance(
     return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
 
 
+def with_common_scale(
+    covariance: FloatArray, poses: RigidTransform, centre_mm: FloatArray, sigma: float
+) -> FloatArray:
+    """Covariance of poses to which an error comes that stretches the whole sweep by one factor.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, 6, 6)
+        As from `pose_covariance`.
+    sigma : float
+        Relative standard deviation of the factor.
+    """
+    centres = poses.apply(centre_mm)
+    along = np.zeros((len(covariance), 6, 6))
+    along[:, 2, 2] = (sigma * (centres[:, 2] - centres[0, 2])) ** 2
+    return covariance + along
+
+
 NEAR_MM = 0.1
 """Frames nearer than this may turn as if they were this far apart: a hand trembles in place."""
 UNEVENNESS = 0.4

@@ -1,0 +1,247 @@
+"""Decorrelation curves from a probe's data sheet: the elevational field of a lens, two ways, broadband.
+
+The echo of fully developed speckle, moved by d along the elevational axis, keeps
+
+    rho(d) = |sum_f S(f) gamma_f(d)|^2,   gamma_f(d) = int B_f(z) B_f*(z - d) dz / int |B_f(z)|^2 dz,
+
+where B_f is the two-way field over elevation z at one depth and frequency, the square of the one-way field of
+the lens, and S the echo's own power spectrum at that depth, which attenuation pulls down. Off the focus it is
+the wavefront's curvature in B_f that makes gamma fall.
+
+The field is that of a line source seen along straight paths, without the Fresnel approximation, which fails
+in front of a 5 mm aperture at 5 mm. What lies across the image enters through the path alone: elements beside
+the axis are farther away, so that the wavefront is less curved near the probe.
+
+References
+----------
+.. [1] J. W. Goodman, "Introduction to Fourier Optics": field behind a lens.
+.. [2] R. F. Wagner et al., "Statistics of speckle in ultrasound B-scans", IEEE Trans. Sonics Ultrason. 30(3),
+   1983: the correlation of speckle is the autocorrelation of the point spread function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import fft
+from scipy.interpolate import CubicSpline
+
+from speckle3d.core.arrays import ComplexArray, FloatArray
+
+FREQUENCIES = 11
+"""Nodes over the band; twice as many change distances by less than 0.1 %."""
+SUB_DEPTHS = 4
+"""Depths in a patch over which the echo's correlation is averaged; twice as many: less than 0.3 %."""
+STEP_MM = 0.04
+_STRIPS_PER_WAVELENGTH = 4.0
+_OFF_AXIS = 0.2
+"""Mean square distance of an aperture's elements from its middle over half its width squared: 1/3 for equal
+weights, 0.13 for a raised cosine."""
+NEPER_PER_DB = float(np.log(10.0) / 20.0)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What shapes the elevational field.
+
+    Attributes
+    ----------
+    aperture_mm, focus_mm : float
+        Height of the elements, and where the lens focuses.
+    transmit_mm : float
+        Width of the transmit aperture, whose outer elements are farther away; 0 to leave that out.
+    speed_of_sound_m_s : float
+    """
+
+    aperture_mm: float
+    focus_mm: float
+    transmit_mm: float = 0.0
+    speed_of_sound_m_s: float = 1540.0
+
+
+def band_nodes(band_hz: tuple[float, float], edge_fraction: float) -> FloatArray:
+    """Frequencies at which the field is computed: the band and its edges, evenly."""
+    edge = edge_fraction * (band_hz[1] - band_hz[0])
+    return np.linspace(band_hz[0] - edge, band_hz[1] + edge, FREQUENCIES)
+
+
+def sheet_spectrum(
+    frequency_hz: FloatArray,
+    band_hz: tuple[float, float],
+    attenuation_db_cm_mhz: float,
+    backscatter_exponent: float,
+    depth_mm: FloatArray,
+) -> FloatArray:
+    """Power of the echo from depths of any shape, shape (..., f).
+
+    A Gaussian pulse, halved in amplitude there and back (-6 dB) at the band's ends, as a data sheet has it
+    for a reflector on the axis. Speckle comes from the whole beam, whose area falls with frequency squared,
+    and from scatterers that return more at high frequencies; both ways are attenuated.
+
+    Parameters
+    ----------
+    frequency_hz : ndarray, shape (f,)
+    backscatter_exponent : float
+        Of the power that scatterers return, as a function of frequency.
+    """
+    centre, half = np.mean(band_hz), (band_hz[1] - band_hz[0]) / 2.0
+    pulse = 2.0 ** -(((frequency_hz - centre) / half) ** 2)
+    scattered = (frequency_hz / centre) ** (backscatter_exponent - 2.0)
+    lost = 4.0 * attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * depth_mm[..., None] * frequency_hz
+    return np.asarray(pulse**2 * scattered * np.exp(-lost))
+
+
+def speckle_correlation(
+    lens: Lens, depth_mm: FloatArray, frequency_hz: FloatArray, power: FloatArray, distance_mm: FloatArray
+) -> FloatArray:
+    """Correlation of fully developed speckle, the squared magnitude of the echo's, shape (r, k).
+
+    Parameters
+    ----------
+    depth_mm : ndarray, shape (r, y)
+        Depths over each patch.
+    power : ndarray, shape (r, y, f)
+        Of the echo at the frequencies, in any unit: each depth counts the same, as images are equalised.
+    distance_mm : ndarray, shape (k,)
+    """
+    weight = power / power.sum(axis=-1, keepdims=True)
+    fields, z = _two_way_fields(lens, depth_mm.ravel(), frequency_hz)
+    size = 2 * z.size
+    spectra = np.abs(fft.fft(fields, size, axis=-1)) ** 2
+    energy = spectra.mean(axis=-1)
+    shares = weight.reshape(-1, weight.shape[-1]) / energy
+    kept = fft.ifft((shares[..., None] * spectra).sum(axis=1), axis=-1).real[:, : z.size]
+    mean = kept.reshape(*depth_mm.shape, -1).mean(axis=1)
+    inside = np.minimum(distance_mm, STEP_MM * (z.size - 1))
+    return np.asarray(CubicSpline(STEP_MM * np.arange(z.size), mean, axis=1)(inside) ** 2)
+
+
+def tilt_pivot(
+    lens: Lens, depth_mm: FloatArray, frequency_hz: FloatArray, power: FloatArray, tilt_rad: float = 0.004
+) -> FloatArray:
+    """Where speckle of each depth seems to turn about when the probe tilts, mm from the patch, shape (y,).
+
+    By the distance at which tilted speckle correlates best; see `speckle3d.core.curves.TiltResponse`.
+
+    Parameters
+    ----------
+    depth_mm : ndarray, shape (y,)
+    power : ndarray, shape (y, f)
+    """
+    fields, z = _two_way_fields(lens, depth_mm, frequency_hz)
+    two_way = 4e-3 * np.pi * frequency_hz / lens.speed_of_sound_m_s
+    turned = fields * np.exp(1j * two_way[:, None] * tilt_rad * z)
+    size = 2 * z.size
+    cross = fft.ifft(fft.fft(turned, size, axis=-1) * fft.fft(fields, size, axis=-1).conj(), axis=-1)
+    energy = (np.abs(fields) ** 2).sum(axis=-1)
+    kept = np.abs(((power / energy)[..., None] * cross).sum(axis=1))
+    best = kept.argmax(axis=1)
+    around = np.log(np.stack([kept[np.arange(best.size), (best + k) % size] for k in (-1, 0, 1)]))
+    vertex = (around[0] - around[2]) / (2.0 * (around[0] - 2.0 * around[1] + around[2]))
+    lag = np.where(best > z.size, best - size, best) + vertex
+    return np.asarray(lag * STEP_MM / tilt_rad)
+
+
+def _two_way_fields(
+    lens: Lens, depth_mm: FloatArray, frequency_hz: FloatArray
+) -> tuple[ComplexArray, FloatArray]:
+    """Two-way field at each depth and frequency over elevation, shape (y, f, z), and the elevations."""
+    wavenumber = 2e-3 * np.pi * frequency_hz / lens.speed_of_sound_m_s
+    shortest = 2.0 * np.pi / wavenumber[-1]
+    count = int(np.ceil(_STRIPS_PER_WAVELENGTH * lens.aperture_mm / shortest))
+    strip = lens.aperture_mm * ((np.arange(count) + 0.5) / count - 0.5)
+    reach = 0.8 * lens.aperture_mm + 1.5
+    steps = int(np.ceil(reach / STEP_MM))
+    z = STEP_MM * np.arange(steps + 1)
+    delay = lens.focus_mm - np.hypot(lens.focus_mm, strip)
+    across2 = (z[:, None] - strip) ** 2
+    off_mm = np.sqrt(_OFF_AXIS) * lens.transmit_mm / 2.0
+    fields = np.empty((depth_mm.size, frequency_hz.size, 2 * steps + 1), dtype=complex)
+    for n, y in enumerate(depth_mm):
+        received = _one_way(y, across2, delay, wavenumber)
+        sent = _one_way(np.hypot(y, off_mm), across2, delay, wavenumber) if off_mm else received
+        half = sent * received
+        fields[n] = np.concatenate([half[:, :0:-1], half], axis=1)
+    return fields, np.concatenate([-z[:0:-1], z])
+
+
+def _one_way(
+    distance_mm: float, across2: FloatArray, delay: FloatArray, wavenumber: FloatArray
+) -> ComplexArray:
+    """Field of the lens over elevation at evenly spaced wavenumbers, shape (f, z)."""
+    path = np.sqrt(distance_mm**2 + across2)
+    phase = np.exp(-1j * wavenumber[0] * (path + delay)) / path
+    turn = np.exp(-1j * (wavenumber[1] - wavenumber[0]) * (path + delay))
+    field = np.empty((wavenumber.size, across2.shape[0]), dtype=complex)
+    for k in range(wavenumber.size):
+        field[k] = phase.sum(axis=1)
+        phase *= turn
+    return field
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """A probe and tissue about which distances are varied.
+
+    Attributes
+    ----------
+    lens : Lens
+    band_hz : tuple of float
+        Of the pulse, at -6 dB.
+    attenuation_db_cm_mhz, backscatter_exponent : float
+    """
+
+    lens: Lens
+    band_hz: tuple[float, float]
+    attenuation_db_cm_mhz: float = 0.5
+    backscatter_exponent: float = 1.1
+
+    def log_width(self, depth_mm: FloatArray) -> FloatArray:
+        """Logarithm of the distance in mm that halves the correlation at each depth, shape (r,)."""
+        frequency = band_nodes(self.band_hz, 0.1)
+        power = sheet_spectrum(
+            frequency, self.band_hz, self.attenuation_db_cm_mhz, self.backscatter_exponent, depth_mm[:, None]
+        )
+        steps = int(_WIDEST * self.lens.aperture_mm / STEP_MM)
+        distance: FloatArray = STEP_MM / 2.0 * np.arange(steps, dtype=float)
+        rho = speckle_correlation(self.lens, depth_mm[:, None], frequency, power, distance)
+        return np.log([half_distance(distance, row) for row in rho])
+
+
+_WIDEST = 1.2
+SMALL = 0.02
+"""Change of parameters over which distances are compared; they are straight over five times that."""
+
+
+def half_distance(distance_mm: FloatArray, correlation: FloatArray) -> float:
+    """Distance at which a falling curve is first at one half."""
+    after = max(1, int(np.argmax(correlation < 0.5)))
+    high, low = correlation[after - 1], correlation[after]
+    part = (high - 0.5) / max(high - low, 1e-12)
+    return float(distance_mm[after - 1] + part * (distance_mm[after] - distance_mm[after - 1]))
+
+
+def sensitivity(nominal: Nominal, depth_mm: FloatArray) -> FloatArray:
+    """Derivatives of `Nominal.log_width`, shape (r, 4).
+
+    By the logarithm of focus, of aperture, by attenuation in dB/cm/MHz, and by the logarithm of frequency.
+    """
+    n, up = nominal, np.exp(SMALL)
+
+    def varied(
+        focus: float = 1.0, aperture: float = 1.0, more: float = 0.0, pitch: float = 1.0
+    ) -> FloatArray:
+        lens = replace(n.lens, focus_mm=n.lens.focus_mm * focus, aperture_mm=n.lens.aperture_mm * aperture)
+        band = n.band_hz[0] * pitch, n.band_hz[1] * pitch
+        return replace(
+            n, lens=lens, band_hz=band, attenuation_db_cm_mhz=n.attenuation_db_cm_mhz + more
+        ).log_width(depth_mm)
+
+    pairs = [
+        (varied(focus=up), varied(focus=1 / up)),
+        (varied(aperture=up), varied(aperture=1 / up)),
+        (varied(more=SMALL), varied(more=-SMALL)),
+        (varied(pitch=up), varied(pitch=1 / up)),
+    ]
+    return np.stack([(high - low) / (2.0 * SMALL) for high, low in pairs], axis=1)
