@@ -7,6 +7,8 @@ from .core.curves import DecorrelationCurves as DecorrelationCurves
 from .core.errors import Speckle3DError as Speckle3DError
 from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
+from .corrections import correct as correct
+from .crossing_sweeps import cross_sweeps as cross_sweeps
 from .imaging.volume import compound as compound
 from .io.calibrations import load_calibration as load_calibration
 from .io.calibrations import write_calibration as write_calibration
@@ -19,7 +21,6 @@ from .io.volumes import read_volume as read_volume
 from .io.volumes import write_volume as write_volume
 from .phantom_curves import calibrate_curves as calibrate_curves
 from .pipeline import Tracked as Tracked
-from .pipeline import correct as correct
 from .pipeline import track as track
 from .scoring.lengths import ModeError as ModeError
 from .scoring.lengths import compare_modes as compare_modes

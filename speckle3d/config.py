@@ -11,7 +11,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
+from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
+from speckle3d.correction.fused.fuse import FusedSettings
+from speckle3d.correction.inertial.settings import InertialSettings
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import MatchingSettings
@@ -51,6 +54,9 @@ class Config(BaseModel):
     trajectory: TrajectorySettings = TrajectorySettings()
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()
+    crossing: CrossingSettings = CrossingSettings()
+    inertial: InertialSettings = InertialSettings()
+    fused: FusedSettings = FusedSettings()
 
     def with_choices(self, consistent_subset: bool | None, drift_curves: str | None) -> Config:
         """Return a configuration with command-line choices in place of its own; None leaves one as it is."""

@@ -17,7 +17,7 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.texture import speckle_size
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
-from speckle3d.pipeline import Progress
+from speckle3d.pipeline import Progress, after
 
 
 def calibrate_curves(
@@ -52,13 +52,9 @@ def calibrate_curves(
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
         wanted = phantom_pairs(sweep, settings.curves)
-        matches = match_in_order(sweep, matcher, wanted, _shifted(progress, before, total))
+        matches = match_in_order(sweep, matcher, wanted, after(progress, before, total))
         samples.append(phantom_samples(sweep, matcher.patches, matches))
         sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
         before += len(sweep)
     curves = fit_curves(keys[0], samples, settings.curves)
     return replace(curves, speckle=phantom_speckle(curves.depth_mm, sizes))
-
-
-def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
-    return None if progress is None else lambda done, _: progress(before + done, total)

@@ -22,9 +22,6 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import correct_mode, require_modes, sensor_of
-from speckle3d.correction.trust import cleaned_readings, require_believed
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -409,53 +406,6 @@ def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:
     return poses if direction > 0 else mirrored(poses)
 
 
-def correct(
-    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config | None = None
-) -> dict[str, DriftCorrection]:
-    """Correct the drift of the image-based poses in each of `modes`.
-
-    Parameters
-    ----------
-    tracked : Tracked
-    sweep : Sweep
-        From which `tracked` was made.
-    modes : sequence of str
-        Among ``"orientation"`` (three curves) and ``"pose"`` (six).
-    config : Config, optional
-
-    Returns
-    -------
-    dict of str to DriftCorrection
-        By mode; ``poses`` are ``world_from_image`` in the sensor's world.
-
-    Raises
-    ------
-    InvalidInputError
-        If a mode is unknown.
-    InsufficientDataError
-        If a mode's sensor is missing, not calibrated to the image, or covers too little of the sweep.
-    MismatchError
-        If the images, or its own readings, refute a mode's sensor; see `Tracked.doubts`.
-
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, equations 1 to 5.
-
-    Examples
-    --------
-    >>> import speckle3d as s3
-    >>> sweep = s3.load_sweep("data/phantom.h5")
-    >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
-    >>> corrected = s3.correct(tracked, sweep, ["orientation", "pose"])
-    >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
-    [96, 96]
-    """
-    settings = config or Config()
-    require_modes(sweep, modes)
-    for mode in modes:
-        require_believed(tracked.doubts, sensor_of(sweep, mode), f"{sweep.name}: drift mode {mode}")
-    if settings.sensors.examine:
-        sweep, _ = cleaned_readings(sweep)
-    # What wander the sensed orientation shows, cubics need not make up for.
-    start = tracked.subset if tracked.subset is not None else tracked.image
-    return {mode: correct_mode(mode, start, sweep, settings.drift) for mode in modes}
+def after(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Progress of one of several sweeps, `before` frames of `total` being done when it begins."""
+    return None if progress is None else lambda done, _: progress(before + done, total)

@@ -23,6 +23,7 @@ from speckle3d.cli import (  # noqa: F401
     calibrate_images,
     calibrate_phantoms,
     compare,
+    expect,
     files,
     imu,
     imu_accuracy,

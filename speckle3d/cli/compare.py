@@ -35,7 +35,10 @@ def compare(
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the study.")],
     drift: Annotated[
         list[str] | None,
-        typer.Option(help="image+subset, orientation or pose; may be repeated. By default all possible."),
+        typer.Option(
+            help="image+subset, orientation, pose, fused, inertial, or crossed with SWEEP-crossing beside "
+            "each sweep; may be repeated. By default all but the last two that are possible."
+        ),
     ] = None,
     reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,
     curves_file: Annotated[

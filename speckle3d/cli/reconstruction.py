@@ -22,6 +22,7 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, MismatchError
 
 if TYPE_CHECKING:
+    from speckle3d.core.sweep import Sweep
     from speckle3d.study.job import JobResult
 
 ReconstructionFile = Annotated[
@@ -44,7 +45,23 @@ def reconstruct(
     ] = None,
     drift: Annotated[
         list[str] | None,
-        typer.Option(help="Correction mode: orientation, pose or image+subset; may be repeated."),
+        typer.Option(
+            help="Correction mode: orientation, pose, fused, inertial, crossed or image+subset; repeatable."
+        ),
+    ] = None,
+    crossing_file: Annotated[
+        Path | None,
+        typer.Option("--crossing", help="Second sweep over the same tissue, turned by 30 to 90 degrees."),
+    ] = None,
+    save_curves: Annotated[
+        Path | None, typer.Option(help="Write the curves as the crossing sweep corrects them.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="FIRST-LAST: reconstruct these frames of the recording only.")
+    ] = None,
+    crossing_frames: Annotated[
+        str | None,
+        typer.Option(help="FIRST-LAST: cross with these frames; of the same recording without --crossing."),
     ] = None,
     reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,
     consistent_subset: Annotated[
@@ -59,7 +76,7 @@ def reconstruct(
     as_json: Json = False,
 ) -> None:
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
-    from speckle3d.io.curves import read_curves
+    from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.study.job import run_job
 
@@ -70,10 +87,20 @@ def reconstruct(
     sweep = load_sweep(sweep_file)
     curves = read_curves(_find_curves(curves_file, sweep_file))
     mount(sweep, calibration or ())
+    crossing = _crossing(sweep, sweep_file, crossing_file, crossing_frames)
+    if crossing is not None and not {"crossed", "fused"}.intersection(modes):
+        modes.append("crossed")
+    if save_curves is not None:
+        if crossing is None:
+            raise InvalidInputError("--save-curves: expected a crossing sweep (--crossing SWEEP), got none")
+        require_own_place(save_curves, "curves", sweep_file, crossing[1], config_file)
+    sweep = _part(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(
-            sweep, sweep_file, curves, out, modes, reference, settings, progress, calibration or ()
+            sweep, sweep_file, curves, out, modes, reference, settings, progress, calibration or (), crossing
         )
+    if save_curves is not None and result.curves is not None:
+        write_curves(save_curves, result.curves)
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
         for line in result.summary.doubt_lines:
@@ -82,8 +109,35 @@ def reconstruct(
         emit(result.table)
     _tell(result)
     note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+    if save_curves is not None:
+        note(
+            f"curves corrected by the crossing sweep, for this probe: {save_curves}"
+            if result.curves is not None
+            else f"{save_curves}: not written, since the sweeps could not be crossed"
+        )
     for reason in result.summary.left_out.values():
         raise MismatchError(f"{reason}; the other modes' results are in {result.directory}")
+
+
+def _crossing(
+    sweep: Sweep, sweep_file: Path, crossing_file: Path | None, frames: str | None
+) -> tuple[Sweep, Path] | None:
+    """The crossing sweep and its file: another recording, or a part of the same one; None without either."""
+    from speckle3d.io.load import load_sweep
+
+    if crossing_file is None and frames is None:
+        return None
+    whole = sweep if crossing_file is None else load_sweep(crossing_file)
+    return _part(whole, frames, "--crossing-frames"), crossing_file or sweep_file
+
+
+def _part(sweep: Sweep, frames: str | None, option: str) -> Sweep:
+    if frames is None:
+        return sweep
+    first, dash, last = frames.partition("-")
+    if not (dash and first.isdecimal() and last.isdecimal()):
+        raise InvalidInputError(f"{option}: expected FIRST-LAST, two frame numbers, got {frames!r}")
+    return sweep.part(int(first), int(last) + 1)
 
 
 def _tell(result: JobResult) -> None:

@@ -79,6 +79,16 @@ def skew(vectors: FloatArray) -> FloatArray:
     return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
 
 
+def adjoint(poses: RigidTransform) -> FloatArray:
+    """Matrices that carry (rotation, translation) twists through poses, shape (e, 6, 6)."""
+    matrix = poses.as_matrix()
+    r = matrix[:, :3, :3]
+    carried = np.zeros((len(r), 6, 6))
+    carried[:, :3, :3] = carried[:, 3:, 3:] = r
+    carried[:, 3:, :3] = skew(matrix[:, :3, 3]) @ r
+    return carried
+
+
 def nearest_rotation(matrices: npt.ArrayLike) -> FloatArray:
     """Rotation matrices nearest to given ones in the sum of squared differences.
 

@@ -60,13 +60,22 @@ class CalibrationFile:
 
 
 @dataclass(frozen=True)
+class SourceFile:
+    """A further recording that took part: the crossing sweep."""
+
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True)
 class Provenance:
-    """Input file and package version that a reconstruction was made with."""
+    """Input files and package version that a reconstruction was made with."""
 
     input_path: str
     input_sha256: str
     package_version: str
     calibrations: tuple[CalibrationFile, ...] = ()
+    crossing: SourceFile | None = None
 
 
 @dataclass(frozen=True)

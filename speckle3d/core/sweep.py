@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, Protocol
 
 import numpy as np
@@ -33,6 +33,26 @@ class Frames(Protocol):
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """Read one frame, shape (vector, sample)."""
+
+
+@dataclass(frozen=True)
+class _FramesPart:
+    """Frames `first` to before `stop` of others, still read one at a time."""
+
+    frames: Frames
+    first: int
+    stop: int
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.stop - self.first, *self.frames.shape[1:]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self.frames.dtype
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        return self.frames[range(self.first, self.stop)[index]]
 
 
 @dataclass(frozen=True)
@@ -210,6 +230,25 @@ class Sweep:
 
     def __len__(self) -> int:
         return int(self.frames.shape[0])
+
+    def part(self, first: int, stop: int) -> Sweep:
+        """The frames from `first` to before `stop` as a sweep of their own, with all sensors' readings.
+
+        Raises
+        ------
+        InvalidInputError
+            If there are no such frames.
+        """
+        if not 0 <= first < stop <= len(self):
+            raise InvalidInputError(
+                f"{self.name}: expected a part among frames 0 to {len(self) - 1}, got {first} to {stop - 1}"
+            )
+        return replace(
+            self,
+            frames=_FramesPart(self.frames, first, stop),
+            frame_time_s=self.frame_time_s[first:stop],
+            truth=None if self.truth is None else self.truth[first:stop],
+        )
 
     @property
     def orientation_source(self) -> OrientationSensor | Tracker | None:

@@ -17,6 +17,7 @@ from speckle3d.core.reconstruction import (
     FramePairs,
     Provenance,
     Reconstruction,
+    SourceFile,
     Trust,
 )
 from speckle3d.core.sweep import ImageGrid
@@ -53,7 +54,7 @@ _GRID = dict.fromkeys(("vectors", "samples"), int) | dict.fromkeys(
     ("vector_pitch_mm", "sample_spacing_mm", "first_sample_depth_mm"), float
 )
 _PROVENANCE = dict.fromkeys(("input_path", "input_sha256", "package_version"), str)
-_CALIBRATION = dict.fromkeys(("path", "sha256"), str)
+_SOURCE = dict.fromkeys(("path", "sha256"), str)
 _CHUNK_BYTES = 2**18
 
 
@@ -125,7 +126,9 @@ class ReconstructionWriter(HDF5Writer):
             self._file["frame_flags"] = trust.flags
         write_attributes(self._file, provenance, _PROVENANCE)
         for used in provenance.calibrations:
-            write_attributes(self._file.require_group(f"calibrations/{used.sensor}"), used, _CALIBRATION)
+            write_attributes(self._file.require_group(f"calibrations/{used.sensor}"), used, _SOURCE)
+        if provenance.crossing is not None:
+            write_attributes(self._file.require_group("crossing"), provenance.crossing, _SOURCE)
         self._file["config_toml"] = config_toml
         self._finished = True
 
@@ -197,10 +200,13 @@ def _read_provenance(file: h5py.File) -> Provenance:
     # Older files have no such group.
     held = find_group(file, "calibrations") or {}
     calibrations = [
-        CalibrationFile(sensor, **read_attributes(require_group(held, sensor), _CALIBRATION))
-        for sensor in held
+        CalibrationFile(sensor, **read_attributes(require_group(held, sensor), _SOURCE)) for sensor in held
     ]
-    return Provenance(**read_attributes(file, _PROVENANCE), calibrations=tuple(calibrations))
+    crossed = find_group(file, "crossing")
+    crossing = None if crossed is None else SourceFile(**read_attributes(crossed, _SOURCE))
+    return Provenance(
+        **read_attributes(file, _PROVENANCE), calibrations=tuple(calibrations), crossing=crossing
+    )
 
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:

@@ -101,7 +101,8 @@ class PairReader:
                 if plane is not None:
                     planes[int(table.first[row])] = plane
             if planes:
-                signs.place(frame, list(planes), list(planes.values()))
+                unlike, apart_mm = self._unlike(table, frame)
+                signs.place(frame, list(planes), list(planes.values()), unlike, apart_mm)
             else:
                 signs.hold(frame)
         return signs.path
@@ -143,7 +144,7 @@ class PairReader:
                 f"expected frame pairs whose patches determine a plane, got none in {chosen.size} pairs of "
                 f"{patches} patches: is the image wide enough, and do the curves fit it?"
             )
-        signs = self._signs(found, PLAIN_ERROR if coherence is None else ADAPTED_ERROR)
+        signs = self._signs(table, sound, found, PLAIN_ERROR if coherence is None else ADAPTED_ERROR)
         return [replace(pair, sign=float(sign)) for pair, sign in zip(found, signs, strict=True)]
 
     def coherence(
@@ -292,14 +293,33 @@ class PairReader:
             near[best] = table.median[best] >= LEAST_CORRELATION
         return np.flatnonzero(near)
 
-    def _signs(self, pairs: Sequence[SignedPair], relative_error: float) -> FloatArray:
+    def _unlike(
+        self, table: CorrelationTable, frame: int, sound: BoolArray | None = None
+    ) -> tuple[IntArray, float]:
+        """Earlier frames that a frame was compared with and does not resemble, and how far it is from them.
+
+        Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
+        error of curves makes the one look like the other, and what stays of echoes only adds to it.
+        """
+        rows = np.arange(*np.searchsorted(table.second, [frame, frame + 1]))
+        far = table.median[rows] < self._settings.least_correlation
+        if sound is not None:
+            far &= sound[rows]
+        half = 0.5 * self._estimator.typical_distance(float(np.sqrt(self._settings.least_correlation)))
+        return table.first[rows[far]], half
+
+    def _signs(
+        self, table: CorrelationTable, sound: BoolArray, pairs: Sequence[SignedPair], relative_error: float
+    ) -> FloatArray:
         resolver = SignResolver(self._frames, relative_error)
         second = np.array([pair.second for pair in pairs])
         start = 0
         while start < len(pairs):
             stop = int(np.searchsorted(second, second[start], side="right"))
             some = pairs[start:stop]
-            resolver.place(int(second[start]), [p.first for p in some], [p.plane for p in some])
+            frame = int(second[start])
+            unlike = self._unlike(table, frame, sound)
+            resolver.place(frame, [p.first for p in some], [p.plane for p in some], *unlike)
             start = stop
         first = np.array([pair.first for pair in pairs])
         return pair_signs(resolver.path, first, second, [pair.plane for pair in pairs])

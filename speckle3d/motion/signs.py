@@ -28,6 +28,11 @@ PLACED = 2.0
 """Variance of an offset between frames over a pair's own: the earlier frame was placed by such pairs, too."""
 SAME_MM, SAME_SLOPE = 0.05, 0.005
 """Paths that end this close to each other at all frames still of use are one."""
+APART_SLOPE = 0.01
+"""Frames that turn more than this against each other may differ although their centres meet."""
+APART_COST = 4.0
+"""Squared deviations for a frame placed where it would resemble one that it does not resemble: less than
+`CAP`, because tissue that moved or a lost contact do that, too."""
 OPEN_FRAMES = 400
 """Paths may differ over this many frames, some twenty millimetres; before, the best one so far stands."""
 
@@ -58,8 +63,21 @@ class SignResolver:
         """Position and slope of every frame on the best path so far, shape (n, 2), mm."""
         return np.asarray(self._paths[np.argmin(self._cost)])
 
-    def place(self, frame: int, first: Sequence[int], planes: Sequence[PairPlane]) -> None:
-        """Place a frame by its planes against earlier frames, of which the latest settles the direction."""
+    def place(
+        self,
+        frame: int,
+        first: Sequence[int],
+        planes: Sequence[PairPlane],
+        unlike: IntArray | None = None,
+        apart_mm: float = 0.0,
+    ) -> None:
+        """Place a frame by its planes against earlier frames, of which the latest settles the direction.
+
+        Parameters
+        ----------
+        unlike : ndarray of int, shape (k,), optional
+            Earlier frames that it does not resemble, and so cannot be within `apart_mm` of.
+        """
         at = np.asarray(first)
         here = self._paths[:, at]
         moved = np.array([p.coefficients[:2] for p in planes])
@@ -68,6 +86,10 @@ class SignResolver:
         misfit = _misfit(candidates[:, :, None] - here[:, None], moved, weight)[0]
         step = candidates[:, :, 0] - here[:, [int(np.argmax(at))], 0]
         cost = np.minimum(misfit, CAP).sum(axis=2) + TURNING_COST * (step * self._trend[:, None] < 0)
+        if unlike is not None and unlike.size:
+            near = np.abs(candidates[:, :, None] - self._paths[:, None, unlike])
+            same = (near[..., 0] < apart_mm) & (near[..., 1] < APART_SLOPE)
+            cost = cost + APART_COST * same.sum(axis=2)
         if not self._paths.any():
             # The overall sign is open: of two mirror images one is enough.
             cost = np.where(candidates[:, :, 0] < 0, np.inf, cost)

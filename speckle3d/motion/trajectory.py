@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import rotation_from_fixed_angles, skew
+from speckle3d.core.geometry import adjoint, rotation_from_fixed_angles
 from speckle3d.core.relative import RelativePoses
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import TrajectorySettings
@@ -163,7 +163,7 @@ def _normal_equations(
     w = w * np.sqrt(np.minimum(1.0, huber / np.maximum(size, 1e-9)))[:, None, None]
     r = np.einsum("eij,ej->ei", w, error)
     j_second = w
-    j_first = -w @ _adjoint(relative.inv())
+    j_first = -w @ adjoint(relative.inv())
     edges, n = first.size, len(poses)
     rows = (6 * np.arange(edges)[:, None, None] + np.arange(6)[:, None]) + np.zeros((1, 1, 6), dtype=int)
     column = np.arange(6)[None, None, :] + np.zeros((1, 6, 1), dtype=int)
@@ -200,14 +200,3 @@ def _marginals(normal: sparse.csc_matrix, frames: int) -> FloatArray:
     at = np.concatenate([[0], known])
     every = [np.interp(np.arange(frames), at, column) for column in blocks.T]
     return np.stack(every, axis=1).reshape(frames, 6, 6)
-
-
-def _adjoint(pose: RigidTransform) -> FloatArray:
-    """Adjoint matrices for (rotation, translation) twists, shape (e, 6, 6)."""
-    matrix = pose.as_matrix()
-    r, t = matrix[:, :3, :3], matrix[:, :3, 3]
-    cross = skew(t)
-    adjoint = np.zeros((len(r), 6, 6))
-    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = r
-    adjoint[:, 3:, :3] = cross @ r
-    return adjoint

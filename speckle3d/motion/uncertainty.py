@@ -9,16 +9,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
 from speckle3d.motion.planes import PairPlane
-
-SHARED = np.array([3.2, 3.8, 1.4, 1.4, 1.4, 4.5])
-"""Deviations of (x, y, z, tilt, yaw, roll) over what the graph has them if pairs were independent: pairs
-that share a frame share its speckle, and in-plane shifts their interpolation's error. Measured on simulated
-phantoms, as the other figures here."""
-STRUCTURE = np.array([19.0, 0.0, 0.0, 0.0, 0.0, 8.0])
-"""Growth of these with the share of echoes that stay: structure that runs across hides motion along it."""
-SCALE_CHANGE_MM, TURN_CHANGE_MM = 2.0, 15.0
-"""Travel over which the error of the scale changes, with the tissue, and a hand's tilt and yaw wander."""
 
 
 def pose_covariance(

@@ -11,6 +11,7 @@ import numpy as np
 from speckle3d.report.data import Record
 from speckle3d.study.figures import colour_of, label_of
 from speckle3d.study.overall import (
+    FITTED_TO_TRACKER,
     QUANTITIES,
     beats,
     counted,
@@ -242,10 +243,11 @@ def summary_lines(
     if words := reference_words(references or {}):
         lines.append(f"{words[0].upper()}{words[1:]}.")
     if fitted_to_reference({row["mode"] for row in means}, references or {}):
-        pose = label_of("pose")
+        fitted = [label_of(row["mode"]) for row in means if row["mode"] in FITTED_TO_TRACKER]
+        named, (were, are) = " and ".join(fitted), (("was", "it is"), ("were", "they are"))[len(fitted) > 1]
         lines.append(
-            f"{pose[0].upper()}{pose[1:]} was fitted to the tracker that it is compared with: its errors say "
-            "how well it fits, not how right it is."
+            f"{named[0].upper()}{named[1:]} {were} fitted to the tracker that {are} compared with: the "
+            "errors say how well it fits, not how right it is."
         )
     if broken:
         lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below.")

@@ -19,12 +19,13 @@ import numpy as np
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.correction.modes import DRIFT_MODES
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.scoring.references import require_reference
 from speckle3d.study import sweepjob
 from speckle3d.study.folder import named, only_run
-from speckle3d.study.job import SUBSET
+from speckle3d.study.request import SUBSET
 from speckle3d.study.results import Study, SweepOutcome, require_own_study, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler
 from speckle3d.study.sweepjob import BlockOutcome, SweepJob
@@ -33,7 +34,7 @@ MATCHING_SHARE = 0.5
 """Share of a sweep's time that matching its blocks takes: half with frames of 127 x 3818 samples, less with
 small ones."""
 
-KNOWN_MODES = ("image", SUBSET, "orientation", "pose")
+KNOWN_MODES = ("image", SUBSET, *DRIFT_MODES)
 
 
 @dataclass
@@ -91,7 +92,8 @@ def compare_sweeps(
     Parameters
     ----------
     modes : sequence of str, optional
-        Beside `image`; by default all that each sweep has sensors for.
+        Beside `image`; by default all that each sweep has sensors for but "inertial". "crossed" takes
+        for the crossing sweep of ``SWEEP.h5`` the file ``SWEEP-crossing.h5`` beside it.
     curves : path, optional
         Decorrelation curves; by default curves.h5 beside each sweep.
     progress : callable, optional

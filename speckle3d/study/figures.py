@@ -33,11 +33,13 @@ _MODES = {
     "image+subset": ("image-based, consistent subset", "#E69F00"),
     "orientation": ("orientation correction", "#0072B2"),
     "pose": ("six DOF correction", "#009E73"),
-    "crossed": ("crossed-sweep correction", "#CC79A7"),
+    "crossed": ("crossing sweep", "#CC79A7"),
+    "inertial": ("inertial scale", "#56B4E9"),
+    "fused": ("all that is known, fused", "#882255"),
 }
-"""Label and colour of each mode, from Okabe and Ito's palette, told apart with any colour vision."""
+"""Label and colour of each mode, from Okabe and Ito's and Tol's palettes, told apart with any vision."""
 
-_SPARE_COLOURS = ("#56B4E9", "#F0E442", "#999999")
+_SPARE_COLOURS = ("#F0E442", "#999999", "#44AA99")
 _REFERENCE_COLOUR = "#000000"
 _UNSEEN = "#33415c"
 """Blue-grey of a reslice's pixels that no frame reached."""

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config, config_from_toml
-from speckle3d.core.arrays import Float16Array, Float32Array
+from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
@@ -146,7 +146,22 @@ def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Rec
         raise InvalidInputError(f"{path}: expected its sweep at {source}, got none; say where it is: --sweep")
     if sha256_of(source) != reconstruction.provenance.input_sha256:
         raise MismatchError(f"{source}: expected the sweep that {path} was made from, got another (SHA-256)")
-    return reconstruction, load_sweep(source)
+    return reconstruction, part_at(load_sweep(source), reconstruction.frame_time_s)
+
+
+def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:
+    """The part of a recording whose frames have these times: all of it, or what was reconstructed of it.
+
+    Raises
+    ------
+    MismatchError
+        If no frames in a row have these times.
+    """
+    first = int(np.searchsorted(sweep.frame_time_s, time_s[0]))
+    held = sweep.frame_time_s[first : first + len(time_s)]
+    if not np.array_equal(held, time_s):
+        raise MismatchError(f"{sweep.name}: expected frames at the times that were reconstructed, got others")
+    return sweep if len(held) == len(sweep) else sweep.part(first, first + len(held))
 
 
 class Strip:

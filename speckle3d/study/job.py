@@ -3,43 +3,42 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.modes import require_modes, sensor_of
-from speckle3d.correction.trust import believed, cleaned_readings, name_of, require_believed
+from speckle3d.correction.crossing.pair import CrossedPair
+from speckle3d.correction.fused.fuse import FusedPoses
+from speckle3d.correction.modes import PUBLISHED
+from speckle3d.correction.trust import believed, require_believed
+from speckle3d.corrections import Correction, correct
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike, sha256_of
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.matching.quality import describe
-from speckle3d.motion.direction import sensed_orientation
-from speckle3d.pipeline import Progress, Tracked, correct, track
+from speckle3d.pipeline import Progress, Tracked, after, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
-from speckle3d.scoring.references import Reference, SweepCurves, find_reference, sweep_curves
+from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
+from speckle3d.study.crossed import Companion
+from speckle3d.study.details import claims_of, details_of, doubted_modes
 from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_plane
+from speckle3d.study.request import SUBSET, Request, require_possible
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
-
-SUBSET = "image+subset"
-"""Mode of the images alone with the patches that contradict the sensed orientation left out."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +57,8 @@ class JobResult:
         What was written.
     seconds : float
         It took.
+    curves : DecorrelationCurves or None
+        Corrected by the crossing sweep; None without one, or if it was refused.
     """
 
     directory: Path
@@ -65,6 +66,7 @@ class JobResult:
     table: str
     files: tuple[Path, ...]
     seconds: float
+    curves: DecorrelationCurves | None = None
 
 
 RESULTS = FileSet("reconstruction.h5", ("summary.json", "table.txt", "table.csv", "drift.png", "reslice.png"))
@@ -81,7 +83,7 @@ def run_job(
     config: Config | None = None,
     progress: Progress | None = None,
     calibrations: Sequence[PathLike] = (),
-    blocks: BlockFiles | None = None,
+    crossing: tuple[Sweep, Path] | None = None,
 ) -> JobResult:
     """Reconstruct a sweep and put everything that belongs to it into `directory`.
 
@@ -98,7 +100,7 @@ def run_job(
     directory : path
         Made if need be.
     drift : sequence of str
-        Modes beside `image`: "image+subset", "orientation", "pose".
+        Modes beside `image`: "image+subset", "orientation", "pose", "crossed", "inertial", "fused".
     reference : {"tracker", "truth"}, optional
         What to compare with; by default the truth if stored, else the tracker, else nothing.
     config : Config, optional
@@ -106,8 +108,8 @@ def run_job(
         Called with the number of frames done and of all.
     calibrations : sequence of path
         Calibration files, at most one for each sensor, in place of what the sweep says of its sensors.
-    blocks : BlockFiles, optional
-        Blocks of the sweep that have been matched already.
+    crossing : tuple of Sweep and path, optional
+        A second sweep over the same tissue and its file, for the modes "crossed" and "fused".
 
     Returns
     -------
@@ -117,83 +119,81 @@ def run_job(
     ------
     InvalidInputError, InsufficientDataError
         If the sweep lacks what a mode or the reference needs, or the folder holds other files of these
-        names. A mode whose sensor the images or its own readings refute is left out of the results
-        instead; `Summary.left_out` says why.
+        names. A mode whose sensor the images or its own readings refute, or whose data do not determine the
+        length, is left out of the results instead; `Summary.left_out` says why.
     FileError
         If the folder cannot be written, or another run is at work in it.
     """
     require_own_results(directory)
+    request = Request(
+        sweep, source, curves, tuple(drift), reference, config or Config(), tuple(calibrations), crossing
+    )
     with RESULTS.replaced(directory) as part:
-        made = write_results(
-            sweep, source, curves, part, drift, reference, config, progress, calibrations, blocks
-        )
+        made = write_results(request, part, progress)
     return replace(made, directory=directory, files=tuple(directory / each.name for each in made.files))
 
 
 def write_results(
-    sweep: Sweep,
-    source: Path,
-    curves: DecorrelationCurves,
-    directory: Path,
-    drift: Sequence[str] = (),
-    reference: str | None = None,
-    config: Config | None = None,
-    progress: Progress | None = None,
-    calibrations: Sequence[PathLike] = (),
-    blocks: BlockFiles | None = None,
+    request: Request, directory: Path, progress: Progress | None = None, blocks: BlockFiles | None = None
 ) -> JobResult:
-    """Reconstruct a sweep into a folder that is there and that nobody reads yet; otherwise as `run_job`."""
-    settings = config or Config()
+    """Reconstruct a sweep into a folder that is there and that nobody reads yet; otherwise as `run_job`.
+
+    Parameters
+    ----------
+    blocks : BlockFiles, optional
+        Blocks of the sweep that have been matched already; not of one that is crossed.
+    """
+    settings, modes, source = request.config, request.modes, request.source
     began = time.perf_counter()
-    sweep, mounted = apply_calibrations(sweep, calibrations)
-    compared = require_possible(sweep, drift, reference, settings)
-    fitted = [mode for mode in drift if mode != SUBSET]
+    sweep, mounted = apply_calibrations(request.sweep, request.calibrations)
+    crossing = None
+    if request.crossing is not None:
+        crossing, _ = apply_calibrations(request.crossing[0], request.calibrations)
+    compared = require_possible(sweep, modes, request.reference, settings, crossing is not None)
     strip = Strip(sweep, settings)
+    side = None if crossing is None else Companion(sweep, crossing, request.curves, settings)
     path = directory / RESULTS.primary
     with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
         held = None if blocks is None else partial(blocks.read, strip=strip)
-        tracked = track(sweep, curves, settings, progress, writer.append_pairs, strip.keep, held)
-        corrections, left_out = _corrected(tracked, sweep, fitted, settings)
+        sink = strip.keep if side is None else side.beside(strip.keep)
+        shown = progress if side is None else after(progress, 0, side.frames)
+        tracked = track(sweep, request.curves, settings, shown, writer.append_pairs, sink, held)
+        crossed, refusal = None, ""
+        if side is not None:
+            crossed, refusal = side.cross(tracked, progress)
+        corrections, left_out = _corrected(tracked, sweep, modes, settings, crossed, refusal)
         poses = {"image": tracked.image}
-        if tracked.subset is not None and SUBSET in drift:
+        if tracked.subset is not None and SUBSET in modes:
             poses[SUBSET] = tracked.subset
-        elif SUBSET in drift:
+        elif SUBSET in modes:
             left_out[SUBSET] = _refusal_of_subset(sweep, tracked)
         poses |= {mode: c.poses for mode, c in corrections.items()}
-        provenance = Provenance(written_path(source), sha256_of(source), version("speckle3d"), mounted)
+        provenance = Provenance(
+            written_path(source), sha256_of(source), version("speckle3d"), mounted, request.crossing_file
+        )
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
-    if reference is None and compared is not None and compared.name == "tracker":
+    if request.reference is None and compared is not None and compared.name == "tracker":
         compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
     name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
-    rows = _errors(sweep, poses, moved, compared)
-    details = _details(tracked, corrections, moved, provenance)
-    doubted = _doubted(sweep, poses, tracked)
-    summary = Summary(sweep.name, name, len(sweep), share, rows, details, tracked.doubts, doubted, left_out)
+    summary = Summary(
+        sweep.name,
+        name,
+        len(sweep),
+        share,
+        _errors(sweep, poses, moved, compared),
+        details_of(tracked, corrections, moved, provenance),
+        (*tracked.doubts, *_contradictions(corrections)),
+        doubted_modes(sweep, tracked, poses, corrections),
+        left_out,
+        claims_of(tracked, sweep.grid.centre_mm, corrections),
+    )
     files = [path, *write_summary(directory, summary)]
     files += [save_figure(figure_drift(moved, _title(summary)), directory / "drift.png")]
     files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
     table, seconds = summary_text(summary), time.perf_counter() - began
-    return JobResult(directory, summary, table, tuple(files), seconds)
-
-
-def require_possible(
-    sweep: Sweep, drift: Sequence[str], reference: str | None, config: Config
-) -> Reference | None:
-    """Check that a sweep has what is asked of it, before any work is done; returns the reference.
-
-    Raises
-    ------
-    InvalidInputError, InsufficientDataError
-        If it does not have it, naming the mode or the reference.
-    """
-    require_modes(sweep, [mode for mode in drift if mode != SUBSET])
-    if SUBSET in drift and sensed_orientation(sweep, config.sensors) is None:
-        raise InsufficientDataError(
-            f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
-            "sensors.consistent_subset, got none"
-        )
-    return find_reference(cleaned_readings(sweep)[0] if config.sensors.examine else sweep, reference)
+    curves = None if side is None or crossed is None else side.curves(tracked, crossed)
+    return JobResult(directory, summary, table, tuple(files), seconds, curves)
 
 
 def require_own_results(directory: Path) -> None:
@@ -221,28 +221,43 @@ def _is_reconstruction(path: Path) -> bool:
         return False
 
 
-def available_modes(sweep: Sweep, config: Config) -> list[str]:
-    """Modes beside `image` for which the sweep has sensors, calibrated to the image."""
-    found = []
-    for mode in (SUBSET, "orientation", "pose"):
-        with suppress(InsufficientDataError):
-            require_possible(sweep, [mode], None, config)
-            found.append(mode)
-    return found
-
-
 def _corrected(
-    tracked: Tracked, sweep: Sweep, modes: Sequence[str], config: Config
-) -> tuple[dict[str, DriftCorrection], dict[str, str]]:
-    """Corrections by mode, and why modes whose sensors are refuted are left out."""
-    corrections: dict[str, DriftCorrection] = {}
+    tracked: Tracked,
+    sweep: Sweep,
+    modes: Sequence[str],
+    config: Config,
+    crossed: CrossedPair | None,
+    refusal: str,
+) -> tuple[dict[str, Correction], dict[str, str]]:
+    """Corrections by mode, and why modes are left out.
+
+    Parameters
+    ----------
+    refusal : str
+        Why the sweeps could not be crossed; empty if they were, or need not be.
+    """
+    corrections: dict[str, Correction] = {}
     left_out: dict[str, str] = {}
     for mode in modes:
+        if mode == SUBSET:
+            continue
+        if mode == "crossed" and crossed is None:
+            left_out[mode] = refusal
+            continue
         try:
-            corrections |= correct(tracked, sweep, [mode], config)
-        except MismatchError as error:
-            left_out[mode] = str(error)
+            corrections |= correct(tracked, sweep, [mode], config, crossed)
+        except (MismatchError, InsufficientDataError) as error:
+            if mode in PUBLISHED and isinstance(error, InsufficientDataError):
+                raise
+            where = f"{sweep.name}: drift mode {mode}"
+            left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
     return corrections, left_out
+
+
+def _contradictions(corrections: Mapping[str, Correction]) -> tuple[Doubt, ...]:
+    """What fusing found of the sensors that checks before had not."""
+    fused = [each for each in corrections.values() if isinstance(each, FusedPoses)]
+    return tuple(doubt for each in fused for doubt in each.contradictions)
 
 
 def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:
@@ -254,18 +269,6 @@ def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:
     return (
         f"{sweep.name}: mode {SUBSET}: expected readings over every frame, got gaps where some are left out"
     )
-
-
-def _doubted(sweep: Sweep, modes: Collection[str], tracked: Tracked) -> dict[str, str]:
-    """What is suspected of the sensor that each mode rests on; images are under all of them."""
-    found = {}
-    for mode in modes:
-        sensor = None if mode == "image" else sensor_of(sweep, mode)
-        about = {"images", "curves", "" if sensor is None else name_of(sensor)}
-        suspected = dict.fromkeys(doubt.suspect for doubt in tracked.doubts if doubt.about in about)
-        if suspected:
-            found[mode] = ", ".join(suspected)
-    return found
 
 
 def _title(summary: Summary) -> str:
@@ -282,51 +285,6 @@ def _errors(
         return [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
     true, ends = reference.world_from_image, 1 if reference.name == "truth" else END_FRAMES
     return compare_modes(poses, true, sweep.grid.centre_mm, reference.covered, ends)
-
-
-def _details(
-    tracked: Tracked, corrections: dict[str, DriftCorrection], moved: SweepCurves, provenance: Provenance
-) -> dict[str, Any]:
-    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
-    return {
-        "provenance": provenance,
-        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
-        "pairs": tracked.pairs,
-        "flagged_frames": describe(tracked.flags),
-        "rejected_patch_share": tracked.rejected_share,
-        "direction": tracked.direction,
-        "direction_from": tracked.direction_from,
-        "coherence": _coherence_details(tracked),
-        "seconds_by_stage": tracked.times.seconds,
-        "corrections": {mode: _fit_details(c) for mode, c in corrections.items()},
-    }
-
-
-def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
-    found = tracked.coherence
-    if found is None:
-        return None
-    return {
-        "mean_share": float(found.share.mean()),
-        "mean_gain": float(found.gain.mean()),
-        "mean_stretch": float(found.stretch.mean()),
-        "length_over_phantom_reading": float(found.scale.mean()),
-        "scale_sigma": found.scale_sigma,
-    }
-
-
-def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
-    fit = correction.fit
-    return {
-        "curves": correction.settings.curves,
-        "coverage": correction.coverage,
-        "rms": fit.rms,
-        "condition_number": fit.condition_number,
-        "evaluations": fit.evaluations,
-        "converged": fit.converged,
-        "parameters": dict(zip(fit.names, fit.parameters.tolist(), strict=True)),
-        "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
-    }
 
 
 def _draw_reslices(

@@ -216,9 +216,13 @@ def reference_words(references: Mapping[str, str]) -> str:
     return f"references differ: {which}; the means mix errors against both"
 
 
+FITTED_TO_TRACKER = frozenset({"pose", "fused"})
+"""Modes that use the tracker where there is one."""
+
+
 def fitted_to_reference(modes: Collection[str], references: Mapping[str, str]) -> bool:
     """Whether a mode was fitted to the very tracker that it is compared with."""
-    return "pose" in modes and "tracker" in references.values()
+    return bool(FITTED_TO_TRACKER.intersection(modes)) and "tracker" in references.values()
 
 
 def _by_mode(quantity: Quantity, rows: Sequence[Row], drift: Sequence[Row]) -> dict[str, FloatArray]:

@@ -24,7 +24,7 @@ from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.overall import over_sweeps, overall_text, shared_means
+from speckle3d.study.overall import FITTED_TO_TRACKER, over_sweeps, overall_text, shared_means
 
 FORMAT = "speckle3d.study"
 VERSION = 1
@@ -70,6 +70,8 @@ class Summary:
         Modes that rest on a sensor in doubt, and what is suspected.
     left_out : mapping of str to str
         Modes that were asked for and refused, and why.
+    claims : mapping of str to float
+        Relative standard deviation of the length that a mode claims, where it claims one.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -83,6 +85,7 @@ class Summary:
     doubts: Sequence[Doubt] = ()
     doubted: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
+    claims: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def doubt_lines(self) -> list[str]:
@@ -234,7 +237,9 @@ def rows_of(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
 def remark_on(summary: Summary, row: ModeError) -> str:
     """What a reader of a row must know beside its numbers; empty for nothing."""
     words = []
-    if row.mode == "pose" and summary.reference == "tracker":
+    if row.mode in summary.claims:
+        words.append(f"length +- {100 * summary.claims[row.mode]:.1f} %")
+    if row.mode in FITTED_TO_TRACKER and summary.reference == "tracker":
         words.append("fitted to this tracker")
     if row.mode in summary.doubted:
         words.append(f"in doubt: {summary.doubted[row.mode]}")
@@ -301,7 +306,7 @@ def _read_summary(folder: Path, name: str) -> Summary:
     rows: list[list[Any]] = [[math.nan if row[n] is None else row[n] for n in names] for row in held["rows"]]
     summary = held["reference"], held["frames"], held["coverage"]
     doubts = [Doubt(**each) for each in held.get("doubts", ())]
-    told = {key: held.get(key, {}) for key in ("doubted", "left_out")}
+    told = {key: held.get(key, {}) for key in ("doubted", "left_out", "claims")}
     return Summary(name, *summary, [ModeError(*values) for values in rows], doubts=doubts, **told)
 
 

@@ -32,7 +32,8 @@ from speckle3d.scoring.displacements import drift_rows
 from speckle3d.scoring.references import find_reference
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip
-from speckle3d.study.job import available_modes, require_possible, write_results
+from speckle3d.study.job import write_results
+from speckle3d.study.request import Request, available_modes, require_possible
 from speckle3d.study.results import SweepOutcome, json_text
 
 DONE = "job.json"
@@ -55,6 +56,8 @@ class SweepJob:
     stamp : tuple of int
         Size and time of change of the input from before it was hashed; while they are the same, so are its
         bytes.
+    crossing : path, optional
+        The crossing sweep, if mode `crossed` is asked for.
     """
 
     name: str
@@ -69,6 +72,7 @@ class SweepJob:
     key: str
     frames: int
     stamp: tuple[int, int]
+    crossing: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,9 @@ def plan_sweep(
         sniff(path)  # names a file that is not there
         stamp = _stamp(path)
         frames, sha256 = len(load_sweep(path)), sha256_of(path)
-        used = [sha256_of(each) for each in (found, *calibrations, *companion_files(path))]
+        crossing = crossing_of(path) if "crossed" in (modes or ()) else None
+        beside = () if crossing is None else (crossing, *companion_files(crossing))
+        used = [sha256_of(each) for each in (found, *calibrations, *companion_files(path), *beside)]
     except Exception as error:  # noqa: BLE001 - one row that says why
         return SweepOutcome(name, path, "failed", _reason(error))
     parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
@@ -128,12 +134,33 @@ def plan_sweep(
     folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
     mounted = tuple(each.resolve() for each in calibrations)
     return SweepJob(
-        name, path, folder, found, settings_toml, modes, reference, mounted, sha256, key, frames, stamp
+        name,
+        path,
+        folder,
+        found,
+        settings_toml,
+        modes,
+        reference,
+        mounted,
+        sha256,
+        key,
+        frames,
+        stamp,
+        crossing,
     )
 
 
+def crossing_of(path: Path) -> Path | None:
+    """The crossing sweep of ``SWEEP.h5``: ``SWEEP-crossing.h5`` beside it, and the other way round."""
+    stem = path.stem.removesuffix("-crossing") if path.stem.endswith("-crossing") else f"{path.stem}-crossing"
+    beside = path.with_name(f"{stem}{path.suffix}")
+    return beside if beside.is_file() else None
+
+
 def plan_blocks(job: SweepJob) -> list[BlockJob]:
-    """Blocks to match before a long sweep's own job; none of a sweep that is one block, or finished."""
+    """Blocks to match before a long sweep's own job; none of one that is one block, crossed or finished."""
+    if job.crossing is not None:
+        return []  # blocks keep a strip of every image, and crossing needs all of it
     blocks = blocks_of(job.frames, config_from_toml(job.settings_toml).trajectory.block_frames)
     return [BlockJob(job, block) for block in blocks] if len(blocks) > 1 and finished(job) is None else []
 
@@ -198,9 +225,11 @@ def _reconstruct(job: SweepJob, part: Path, files: BlockFiles) -> None:
     mounted, _ = apply_calibrations(sweep, job.calibrations)
     curves, modes = read_curves(job.curves), _modes(job, mounted, settings)
     make_folder(part)
-    write_results(
-        sweep, job.path, curves, part, modes, job.reference, settings, None, job.calibrations, files
+    crossing = None if job.crossing is None else (load_sweep(job.crossing), job.crossing)
+    request = Request(
+        sweep, job.path, curves, tuple(modes), job.reference, settings, job.calibrations, crossing
     )
+    write_results(request, part, None, files if crossing is None else None)
     reference = find_reference(mounted, job.reference)
     rows = []
     if reference is not None:

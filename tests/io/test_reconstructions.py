@@ -6,7 +6,7 @@ import pytest
 import sweep_examples
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
+from speckle3d.core.reconstruction import FramePairs, Provenance, SourceFile, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
 
@@ -195,3 +195,10 @@ def test_a_truncated_file_is_a_file_error(path, kept):
     path.write_bytes(whole[: int(kept * len(whole))])
     with pytest.raises(FileError, match=r"r\.h5: "):
         read_reconstruction(path)
+
+
+def test_the_crossing_sweep_is_on_record(tmp_path):
+    crossed = replace(PROVENANCE, crossing=SourceFile("crossing.h5", "cd" * 32))
+    with ReconstructionWriter(tmp_path / "r.h5", TIMES, GRID) as writer:
+        writer.finish(POSES, crossed, CONFIG, TRUST)
+    assert read_reconstruction(tmp_path / "r.h5").provenance == crossed

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
 
-MODES = ["image", "image+subset", "orientation", "pose"]
+MODES = ["image", "image+subset", "orientation", "pose", "fused"]
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_means_over_sweeps_are_in_the_study_and_in_the_table(study):
     assert mean["sweeps"] == 2
     assert mean["mean"] == pytest.approx(np.mean([r["FDR"] for r in found["drift"] if r["mode"] == "pose"]))
     pairs = [(r["mode"], r["against"]) for r in found["paired"] if r["quantity"] == "length_error_percent"]
-    assert len(pairs) == len(set(pairs)) == 6
+    assert len(pairs) == len(set(pairs)) == 10
     # Two sweeps cannot tell modes apart.
     assert {r["better"] for r in found["paired"]} == {None}
     assert "2 sweeps" in (study.directory / "table.txt").read_text()
@@ -103,7 +103,7 @@ def test_a_second_start_does_nothing_again_but_what_changed(study, sweeps, tmp_p
     other = Config().with_choices(consistent_subset=False, drift_curves=None)
     changed = compare_sweeps(sweeps[:1], tmp_path / "again", config=other)
     assert not changed.outcomes[0].skipped
-    assert held(tmp_path / "again")["modes"] == ["image", "orientation", "pose"]
+    assert held(tmp_path / "again")["modes"] == ["image", "orientation", "pose", "fused"]
 
 
 @pytest.mark.slow
@@ -150,8 +150,8 @@ def test_a_file_that_changed_under_the_study_is_its_reason(sweeps, tmp_path):
 def test_a_bug_in_one_sweep_is_its_reason_without_temporary_names_and_leaves_nothing(
     sweeps, tmp_path, monkeypatch
 ):
-    def full(path, *arguments):
-        raise ZeroDivisionError(f"in the middle of {arguments[2] / '.part-0123abcd-reconstruction.h5'}")
+    def full(request, directory, *others):
+        raise ZeroDivisionError(f"in the middle of {directory / '.part-0123abcd-reconstruction.h5'}")
 
     monkeypatch.setattr("speckle3d.study.sweepjob.write_results", full)
     # Words are set one space apart; a path with two must not hide its temporary name.

@@ -16,7 +16,8 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.matching.blocks import blocks_of
 from speckle3d.study.compare import MATCHING_SHARE, StudyProgress, compare_sweeps
-from speckle3d.study.job import SUBSET, run_job
+from speckle3d.study.job import run_job
+from speckle3d.study.request import SUBSET
 from speckle3d.study.results import SweepOutcome
 from speckle3d.study.schedulers import InProcess, OnCluster, local_cluster
 from speckle3d.study.sweepjob import BlockOutcome, plan_blocks, plan_sweep, run_block, run_sweep

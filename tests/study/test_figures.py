@@ -4,6 +4,7 @@ from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.reconstruction import MODES as RECONSTRUCTED
 from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.scoring.lengths import accumulated
 from speckle3d.scoring.references import Reference, sweep_curves
@@ -134,9 +135,9 @@ def test_neither_pyplot_nor_a_window_system_is_touched(python):
 
 
 def test_modes_have_colours_of_their_own_and_unknown_ones_too():
-    modes = ["image", "image+subset", "orientation", "pose", "crossed", "inertial", "fused"]
+    modes = [*RECONSTRUCTED, "bent", "stretched"]
     assert len({colour_of(mode, modes) for mode in modes}) == len(modes)
-    assert label_of("fused") == "fused"
+    assert label_of("bent") == "bent"
 
 
 def test_titles_are_wrapped_to_narrow_panels():

@@ -1,0 +1,83 @@
+"""Reduced images of a sweep: small enough to keep all, fine enough to find places again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from speckle3d.core.arrays import Float16Array, Float32Array
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import ImageGrid
+
+PIXEL_MM = 0.35
+"""About the finest blur at which sweeps are compared: finer pixels show only speckle that the other sweep's
+beam, thick in another direction, does not show alike."""
+
+
+class ImageStack:
+    """Log-compressed images of a sweep, pooled to pixels of about a third of a millimetre.
+
+    An image sink of `speckle3d.track`: pass `keep` as ``images``.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+        Of the speckle intensity images that `keep` gets.
+    pixel_mm : float
+        Pooled pixels are at most about so wide, but never finer than the vectors.
+
+    Attributes
+    ----------
+    grid : ImageGrid
+        Of the pooled images.
+    left_mm : float
+        Where the first pooled vector's centre lies in the whole image.
+    """
+
+    def __init__(self, grid: ImageGrid, pixel_mm: float = PIXEL_MM) -> None:
+        across = max(1, min(grid.vectors, round(pixel_mm / grid.vector_pitch_mm)))
+        deep = max(1, min(grid.samples, round(pixel_mm / grid.sample_spacing_mm)))
+        self._pool = across, deep
+        self.grid = ImageGrid(
+            grid.vectors // across,
+            grid.samples // deep,
+            grid.vector_pitch_mm * across,
+            grid.sample_spacing_mm * deep,
+            grid.first_sample_depth_mm + (deep - 1) / 2 * grid.sample_spacing_mm,
+        )
+        self.left_mm = (across - 1) / 2 * grid.vector_pitch_mm
+        self._images: dict[int, Float16Array] = {}
+
+    def keep(self, index: int, intensity: Float32Array) -> None:
+        """Keep one frame of speckle intensity, shape (vector, sample)."""
+        across, deep = self._pool
+        wide, high = self.grid.vectors, self.grid.samples
+        part = intensity[: wide * across, : high * deep]
+        pooled = part.reshape(wide, across, high, deep).mean(axis=(1, 3), dtype=np.float32)
+        self._images[index] = (10 * np.log10(np.maximum(pooled, 1e-12))).astype(np.float16)
+
+    def kept(self, first: int, stop: int) -> Float16Array:
+        """Images of some frames as they are kept, shape (frame, vector, sample), dB."""
+        return np.stack([self._images[index] for index in range(first, stop)])
+
+    def take(self, first: int, images: Float16Array) -> None:
+        """Keep images of the frames from `first` on that were pooled elsewhere."""
+        self._images.update(enumerate(images, start=first))
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def images(self, frames: int) -> Float32Array:
+        """Return all images, shape (frames, vector, sample), dB.
+
+        Raises
+        ------
+        InsufficientDataError
+            If one of the frames was not kept.
+        """
+        missing = [index for index in range(frames) if index not in self._images]
+        if missing:
+            raise InsufficientDataError(
+                f"expected an image of each of {frames} frames, got none of frame {missing[0]}: track the "
+                "sweep with the stack as its image sink"
+            )
+        return self.kept(0, frames).astype(np.float32)

@@ -1,0 +1,194 @@
+"""Mode ``fused``: images, orientation sensor, tracker and evidence of the scale in one least-squares problem.
+
+Unknown are the pose of every frame, the errors that the images' steps share, and of every sensor its world,
+mounting, clock, millimetres and wandering error. The images' steps enter with their full covariance, grown
+because pairs of frames share speckle, and may all be wrong by one scale and one rate of tilt and of yaw, and by
+a little more that changes along the sweep. The sizes of the sensors' errors are found from the readings.
+
+References
+----------
+.. [1] M. Kaess and F. Dellaert, "Factor graphs for robot perception", Foundations and Trends in Robotics, 2017.
+.. [2] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
+   Biometrika 58, 1971 (restricted likelihood).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.relative import RelativePoses
+from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.correction.fused.images import ImageEvidence
+from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
+from speckle3d.correction.fused.sizes import Wander
+from speckle3d.correction.fused.solution import Problem, Solution
+from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
+from speckle3d.correction.trust import ORIENTATION, TRACKER
+
+
+class FusedSettings(BaseModel):
+    """What is assumed of the sensors beside their readings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mounting_sigma_rad: float = Field(
+        0.006,
+        gt=0,
+        description="How well it is known how the image is turned on a sensor: a third of a degree.",
+    )
+    mounting_sigma_mm: float = Field(0.5, gt=0, description="How well its place on a tracker is known.")
+    clock_sigma_s: float = Field(0.005, gt=0, description="How well the sensors' clocks are known.")
+    tracker_scale_sigma: float = Field(
+        0.004, gt=0, description="Relative error of a tracker's millimetres: distortion of its field."
+    )
+    inclination_sigma_rad: float = Field(
+        0.0026, gt=0, description="Slow error of an orientation sensor's inclination: 0.15 degrees."
+    )
+    heading_sigma_rad: float = Field(0.0087, gt=0, description="Slow error of its heading: half a degree.")
+    wander_s: float = Field(40.0, gt=0, description="Time in which these errors change.")
+    contradiction_sigma: float = Field(
+        5.0, gt=0, description="Deviations by which a sensor must differ from the images to contradict them."
+    )
+
+
+@dataclass(frozen=True)
+class FusedPoses(ScaledPoses):
+    """Poses from all that is known of a sweep.
+
+    Attributes
+    ----------
+    used : tuple of str
+        "images" and what else took part: "orientation sensor", "tracker", "crossing", "inertial".
+    contradictions : tuple of Doubt
+        Sensors that differ from the images by more than the errors of both; poses then allow for either.
+    sizes : dict of str to float
+        Standard deviations found of the sensors' errors: ``tracker_jitter_mm``, ``tracker_jitter_deg``,
+        ``tracker_wander_mm``, ``orientation_jitter_deg``, ``inclination_wander_deg``, ``heading_wander_deg``.
+    """
+
+    used: tuple[str, ...] = ()
+    contradictions: tuple[Doubt, ...] = ()
+    sizes: dict[str, float] | None = None
+
+
+def fuse(
+    edges: RelativePoses,
+    image: RigidTransform,
+    image_covariance: FloatArray,
+    scale_sigma: float,
+    turn_sigma_per_mm: FloatArray,
+    centre_mm: FloatArray,
+    frame_time_s: FloatArray,
+    orientation: OrientationSensor | None = None,
+    tracker: Tracker | None = None,
+    evidence: Sequence[ScaleEvidence] = (),
+    settings: FusedSettings | None = None,
+) -> FusedPoses:
+    """Find poses from all that is known of a sweep.
+
+    Parameters
+    ----------
+    edges : RelativePoses
+        Frame pairs, with covariances as if pairs were independent of each other.
+    image : RigidTransform, length n
+        Image-based poses that were solved from `edges`.
+    image_covariance : ndarray, shape (n, 6, 6)
+        Claimed for `image`: of (x, y, z, tilt, yaw, roll), mm and rad.
+    scale_sigma : float
+        Relative standard deviation of the scale that all edges share, mismatch of the curves included.
+    turn_sigma_per_mm : ndarray, shape (2,)
+        Standard deviations of yaw and of tilt per mm that the images lack.
+    centre_mm : ndarray, shape (3,)
+        The image's centre.
+    frame_time_s : ndarray, shape (n,)
+    orientation : OrientationSensor, optional
+    tracker : Tracker, optional
+        Sensors without a mounting, or with too few readings over the frames, are left out.
+    evidence : sequence of ScaleEvidence
+        What a crossing sweep or an accelerometer says of the scale.
+    settings : FusedSettings, optional
+
+    Returns
+    -------
+    FusedPoses
+        In the world of the tracker, or else of the orientation sensor with its origin at the first frame's
+        image origin, or else of the first frame.
+    """
+    settings = settings or FusedSettings()
+    yaw, tilt = turn_sigma_per_mm
+    centre = RigidTransform.from_translation(centre_mm)
+    start = centre.inv() * (image[0].inv() * image) * centre
+    images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
+    limits = SensorLimits(
+        settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, 1e-9
+    )
+    sensors: list[tuple[SensorEvidence, Wander | None]] = []
+    if tracker is not None:
+        own = replace(limits, stretch=settings.tracker_scale_sigma)
+        read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, own)
+        sensors += [(read, None)] if read else []
+    if orientation is not None:
+        slow = Wander(
+            np.array([settings.inclination_sigma_rad] * 2 + [settings.heading_sigma_rad]), settings.wander_s
+        )
+        read = read_sensor(orientation, ORIENTATION, start, centre_mm, frame_time_s, limits)
+        sensors += [(read, slow)] if read else []
+    problem = Problem.of(images, sensors, evidence)
+    solution, problem = problem.solve()
+    return _reported(solution, problem, centre)
+
+
+def _reported(solution: Solution, problem: Problem, centre: RigidTransform) -> FusedPoses:
+    images = solution.images
+    poses = centre * solution.state.poses * centre.inv()
+    world = RigidTransform.identity()
+    if solution.state.sensors:
+        state = solution.state.sensors[0]
+        world = state.world * centre.inv()
+        if problem.sensors[0].components == 3:
+            world = RigidTransform.from_rotation(state.world.rotation)
+    frames, weight = images.parts
+    path = float(weight @ _along(solution.state.poses)[frames])
+    joint = solution.covariance(frames)[2::6, 2::6]
+    sizes = _sizes(problem, solution)
+    return FusedPoses(
+        poses=world * poses,
+        covariance=solution.marginals(),
+        log_scale=float(np.log(path / images.path_mm)),
+        log_scale_sigma=float(np.sqrt(weight @ joint @ weight)) / path,
+        evidence=problem.evidence,
+        details=dict(sizes),
+        used=("images", *(s.name for s in problem.sensors), *(e.source for e in problem.evidence)),
+        contradictions=(),
+        sizes=sizes,
+    )
+
+
+def _along(poses: RigidTransform) -> FloatArray:
+    steps = (poses[:-1].inv() * poses[1:]).translation[:, 2]
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _sizes(problem: Problem, solution: Solution) -> dict[str, float]:
+    sizes: dict[str, float] = {}
+    for sensor, wander in zip(problem.sensors, solution.sizes.wander, strict=True):
+        degrees, millimetres = float(np.degrees(sensor.jitter[0])), float(sensor.jitter[1])
+        if sensor.components == 6:
+            sizes |= {"tracker_jitter_mm": millimetres, "tracker_jitter_deg": degrees}
+            sizes |= {"tracker_wander_mm": float(wander.sigma[3])}
+        else:
+            inclination, _, heading = np.degrees(wander.sigma)
+            sizes |= {"orientation_jitter_deg": degrees}
+            sizes |= {"inclination_wander_deg": float(inclination), "heading_wander_deg": float(heading)}
+    if problem.sensors:
+        common, changing = solution.sizes.images.common, solution.sizes.images.changing
+        sizes |= {"image_turn_factor": float(common[1]), "image_turn_change_factor": float(changing[1])}
+        sizes |= {"image_scale_change_factor": float(changing[0])}
+    return sizes

@@ -1,0 +1,90 @@
+"""Two sweeps over the same tissue, tracked and crossed: each gives the other its length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from speckle3d.config import Config
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.sweep import Sweep
+from speckle3d.correction.crossing.pair import CrossedPair, crossed
+from speckle3d.correction.crossing.stack import ImageStack
+from speckle3d.correction.crossing.sweep import CrossingSweep
+from speckle3d.correction.trust import believed
+from speckle3d.matching.intensity import IntensityExtractor
+from speckle3d.motion.corrected_curves import corrected_curves
+from speckle3d.motion.direction import sensed_orientation
+from speckle3d.pipeline import Progress, Tracked, after, track
+
+
+def cross_sweeps(
+    first: Sweep,
+    second: Sweep,
+    curves: DecorrelationCurves,
+    config: Config | None = None,
+    progress: Progress | None = None,
+) -> CrossedPair:
+    """Track two sweeps of one probe over the same tissue, and find the length of both where they cross.
+
+    The geometry within images is exact: a second sweep, turned by 30 to 90 degrees about the beam, lays it
+    along the first one's elevational axis.
+
+    Parameters
+    ----------
+    first, second : Sweep
+        Of the same probe and settings. Two parts of one recording are two sweeps, too: see `Sweep.part`.
+    curves : DecorrelationCurves
+        Of the probe, or of another like it: their error is found, too.
+    config : Config, optional
+    progress : callable, optional
+        Called with frames done and frames in all, of both.
+
+    Raises
+    ------
+    MismatchError, InsufficientDataError
+        As `track`; or if the sweeps do not cross, overlap too little, show too little, or do not match.
+    """
+    settings = config or Config()
+    total, done = len(first) + len(second), 0
+    sides = []
+    for sweep in (first, second):
+        stack = stack_for(sweep, settings)
+        tracked = track(sweep, curves, settings, after(progress, done, total), images=stack.keep)
+        sides.append(crossing_side(sweep, tracked, stack, settings))
+        done += len(sweep)
+    return crossed(sides[0], sides[1], settings.crossing)
+
+
+def stack_for(sweep: Sweep, config: Config) -> ImageStack:
+    """Where the reduced images of a sweep are to be kept while it is tracked."""
+    return ImageStack(IntensityExtractor.for_sweep(sweep, config.intensity).grid)
+
+
+def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Config) -> CrossingSweep:
+    """One sweep of a crossing pair, as far as it is known before it is crossed."""
+    return CrossingSweep(
+        sweep.name,
+        stack,
+        tracked.image,
+        sweep.grid.centre_mm,
+        tracked.scale_sigma,
+        float(tracked.slopes.deviation_per_mm.max()),
+        sensed_orientation(believed(sweep, tracked.doubts), config.sensors),
+        tracked.flags,
+    )
+
+
+def curves_from(
+    tracked: Sequence[Tracked], pair: CrossedPair, curves: DecorrelationCurves
+) -> DecorrelationCurves:
+    """Correct the curves that a crossing pair was read with by what the crossing says of its lengths.
+
+    Parameters
+    ----------
+    tracked : sequence of Tracked
+        The first and the second sweep.
+    """
+    sides = pair.first, pair.second
+    return corrected_curves(
+        curves, tracked, [side.log_scale for side in sides], [side.log_scale_sigma for side in sides]
+    )

@@ -1,0 +1,112 @@
+"""What a summary says of a reconstruction beside its errors: fits, claims, doubts."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.sweep import Sweep
+from speckle3d.correction.drift import DriftCorrection
+from speckle3d.correction.fused.fuse import FusedPoses
+from speckle3d.correction.modes import sensor_of
+from speckle3d.correction.trust import name_of
+from speckle3d.corrections import Correction
+from speckle3d.matching.quality import describe
+from speckle3d.pipeline import Tracked
+from speckle3d.scoring.references import SweepCurves
+
+
+def doubted_modes(
+    sweep: Sweep, tracked: Tracked, modes: Collection[str], corrections: Mapping[str, Correction]
+) -> dict[str, str]:
+    """What is suspected of the sensor that each mode rests on; images are under all of them."""
+    found = {}
+    for mode in modes:
+        sensor = None if mode == "image" else sensor_of(sweep, mode)
+        about = {"images", "curves", "" if sensor is None else name_of(sensor)}
+        correction = corrections.get(mode)
+        more = correction.contradictions if isinstance(correction, FusedPoses) else ()
+        doubts = [*(doubt for doubt in tracked.doubts if doubt.about in about), *more]
+        suspected = dict.fromkeys(doubt.suspect for doubt in doubts)
+        if suspected:
+            found[mode] = ", ".join(suspected)
+    return found
+
+
+def details_of(
+    tracked: Tracked, corrections: Mapping[str, Correction], moved: SweepCurves, provenance: Provenance
+) -> dict[str, Any]:
+    """Everything worth keeping of a reconstruction beside its errors, by name."""
+    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
+    return {
+        "provenance": provenance,
+        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
+        "pairs": tracked.pairs,
+        "flagged_frames": describe(tracked.flags),
+        "rejected_patch_share": tracked.rejected_share,
+        "direction": tracked.direction,
+        "direction_from": tracked.direction_from,
+        "coherence": _coherence_details(tracked),
+        "seconds_by_stage": tracked.times.seconds,
+        "corrections": {mode: _correction_details(c) for mode, c in corrections.items()},
+    }
+
+
+def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
+    found = tracked.coherence
+    if found is None:
+        return None
+    return {
+        "mean_share": float(found.share.mean()),
+        "mean_gain": float(found.gain.mean()),
+        "mean_stretch": float(found.stretch.mean()),
+        "length_over_phantom_reading": float(found.scale.mean()),
+        "scale_sigma": found.scale_sigma,
+    }
+
+
+def claims_of(
+    tracked: Tracked, centre_mm: FloatArray, corrections: Mapping[str, Correction]
+) -> dict[str, float]:
+    """Relative standard deviation of the length that each mode claims, where it claims one."""
+    centre = tracked.image.apply(centre_mm)[:, 2]
+    farthest = int(np.argmax(np.abs(centre - centre[0])))
+    travelled = max(abs(float(centre[farthest] - centre[0])), 1e-9)
+    claims = {"image": float(np.sqrt(tracked.covariance[farthest, 2, 2])) / travelled}
+    for mode, correction in corrections.items():
+        if isinstance(correction, DriftCorrection):
+            # Cubics about the image's centre leave the length, and its error, as the images have them.
+            if mode == "orientation":
+                claims[mode] = claims["image"]
+        else:
+            claims[mode] = correction.log_scale_sigma
+    return claims
+
+
+def _correction_details(correction: Correction) -> dict[str, Any]:
+    if isinstance(correction, DriftCorrection):
+        return _fit_details(correction)
+    return {
+        "length_over_images": correction.scale,
+        "relative_sigma": correction.log_scale_sigma,
+        "rests_on": [each.source for each in correction.evidence],
+        **correction.details,
+    }
+
+
+def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
+    fit = correction.fit
+    return {
+        "curves": correction.settings.curves,
+        "coverage": correction.coverage,
+        "rms": fit.rms,
+        "condition_number": fit.condition_number,
+        "evaluations": fit.evaluations,
+        "converged": fit.converged,
+        "parameters": dict(zip(fit.names, fit.parameters.tolist(), strict=True)),
+        "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
+    }

@@ -1,0 +1,73 @@
+"""Modes that set the length: crossing sweeps, inertia, all that is known."""
+
+import json
+
+import pytest
+
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.sweeps import read_sweep
+
+CURVES = "curves.h5"
+
+
+@pytest.fixture(scope="module")
+def parts(bench, tmp_path_factory):
+    """Both halves of the small sweep as a pair that does not cross, and the first frames reconstructed."""
+    return bench / "sweep.h5", tmp_path_factory.mktemp("parts")
+
+
+def test_sweeps_that_do_not_cross_leave_the_mode_out_and_keep_the_others(run, parts):
+    sweep, folder = parts
+    saved = folder / "saved.h5"
+    code, out, err = run(
+        *("reconstruct", sweep, "--frames", "0-11", "--crossing-frames", "12-23", "-o", folder / "crossed"),
+        *("--drift", "fused", "--drift", "crossed", "--save-curves", saved, "--json"),
+    )
+    assert code == 2, err
+    (held,) = json.loads(out)["sweeps"]
+    assert held["frames"] == 12
+    assert {row["mode"] for row in held["rows"]} == {"image", "fused"}
+    assert list(held["left_out"]) == ["crossed"]
+    assert held["claims"]["image"] > held["claims"]["fused"] > 0
+    last = err.strip().splitlines()[-1]
+    assert "drift mode crossed: " in last
+    assert "expected" in last
+    assert f"{saved}: not written" in err
+    assert not saved.exists()
+    found = read_reconstruction(folder / "crossed" / "reconstruction.h5")
+    assert list(found.poses) == ["image", "fused"]
+    assert found.provenance.crossing.path.endswith("sweep.h5")
+    assert found.frame_time_s.tolist() == read_sweep(sweep).frame_time_s[:12].tolist()
+
+
+def test_a_volume_of_a_part_is_made_of_its_frames(run, parts):
+    sweep, folder = parts
+    code, _, err = run("reconstruct", sweep, "--frames", "6-23", "-o", folder / "part")
+    assert code == 0, err
+    code, _, err = run(
+        *("volume", folder / "part" / "reconstruction.h5", "-o", folder / "part.nrrd", "--voxel-mm", "0.5")
+    )
+    assert code == 0, err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--frames", "5"), "--frames: expected FIRST-LAST, two frame numbers, got '5'"),
+        (("--frames", "5-99"), "expected a part among frames 0 to 23, got 5 to 99"),
+        (("--crossing-frames", "a-b"), "--crossing-frames: expected FIRST-LAST"),
+        (("--save-curves", "x.h5"), "--save-curves: expected a crossing sweep"),
+        (("--drift", "crossed"), "drift mode crossed: expected a crossing sweep (--crossing SWEEP)"),
+    ],
+)
+def test_what_makes_no_pair_is_refused(refused, bench, tmp_path, options, words):
+    assert words in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "out", *options)
+
+
+def test_inertia_without_a_wobble_is_left_out_or_claims_little(run, parts):
+    """The hand of a sweep of one second gives the accelerometer little: no length may be claimed from it."""
+    sweep, folder = parts
+    code, out, err = run("reconstruct", sweep, "-o", folder / "inertial", "--drift", "inertial", "--json")
+    (held,) = json.loads(out)["sweeps"]
+    assert code == 2, err
+    assert "drift mode inertial: " in held["left_out"]["inertial"]
