@@ -56,18 +56,18 @@ def test_finds_which_sweep_went_the_other_way():
 
 @pytest.mark.slow
 def test_a_sensor_tells_the_turns():
-    pair = made(seed=5, sensed=True)
+    pair = made(seed=1, sensed=True)
     found = crossed(pair.first, pair.second)
     for side, truth in zip((found.first, found.second), pair.truth, strict=True):
         length, tilt = errors(side.poses, truth)
         assert abs(length) < 2.0
-        # The sensor's own inclination wanders by 0.15 degrees at either end.
+        # The sensor's own inclination wanders by 0.15 degrees at either end: three deviations.
         assert abs(tilt) < 0.6
 
 
 @pytest.mark.slow
 def test_refuses_other_tissue():
-    one, other = made(seed=4), made(seed=5, sensed=True)
+    one, other = made(seed=4), made(seed=1, sensed=True)
     with pytest.raises((MismatchError, InsufficientDataError), match="first and second: expected"):
         crossed(one.first, replace(other.second, sensed=None))
 
