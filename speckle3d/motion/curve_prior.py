@@ -49,8 +49,8 @@ BELONGING = np.log(2.0)
 BENT = 2.0
 """Standard deviations of the sum of squares by which rows disagree, from which another lens is looked for."""
 LEAST_LEFT = 0.7
-"""Part of a mismatch that is still claimed, however sure the bend seems: of a length 12 % off 8 % were left on
-one phantom where the fit's own deviation was 4 %."""
+"""Part of a mismatch that is still claimed, however sure the bend seems: of a length 12 % off 8 % were left
+on one phantom where the fit's own deviation was 4 %."""
 _STARTS, _START_F_NUMBER = (0.3, 0.5, 0.8, 1.3), 4.0
 _DEPTHS = 7
 FREQUENCY_SIGMA = 0.08
