@@ -374,9 +374,13 @@ class InertialProblem:
             + g * (r.up[:, 2] - r.up[:, 1] * (self._value @ parts[1]) + r.up[:, 0] * (self._value @ parts[2]))
             + values[_FORCE]
         )
+        inward = 1e-3 * (np.multiply.outer(rate[:, 2], lever[:2]) - 2.0 * lever[2] * rate[:, :2])
+        turning = [sparse.diags(column) @ self._rate for column in inward.T]
         by_tilt = 1e-3 * lever[1] * self._acceleration - sparse.diags(g * r.up[:, 1]) @ self._value
         by_yaw = -1e-3 * lever[0] * self._acceleration + sparse.diags(g * r.up[:, 0]) @ self._value
         columns: dict[int, FloatArray] = {_LEVER.start + k: arms[:, k] for k in range(3)}
         columns[_FORCE] = np.ones(r.time_s.size)
-        rows = self._with_globals(self._interleaved(1e-3 * self._acceleration, by_tilt, by_yaw), columns)
+        rows = self._with_globals(
+            self._interleaved(1e-3 * self._acceleration, by_tilt + turning[0], by_yaw + turning[1]), columns
+        )
         return sparse.csr_matrix(rows / r.force_sigma), (model - r.force_m_s2) / r.force_sigma

@@ -32,9 +32,12 @@ from speckle3d.correction.inertial.settings import ASSUMPTION, InertialSettings
 from speckle3d.correction.inertial.signs import SettledSigns, settled_signs
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 
+_REMEDY = "wobble the probe by half a millimetre, two or three times a second"
 _FEWEST_FRAMES = 30
 _STEP_MM, _STEP_SHARE = 0.005, 0.02
 """Error of an image step: a constant and a share of it, in proportion; their size is found from the data."""
+_EXPECTED_COUNT = 20.0
+"""How many independent steps the error expected of them counts for against what is left of them."""
 _CLOCK_RANGE = 2.0
 """Clock offsets are tried up to so many times their standard deviation."""
 _CERTAIN = 25.0
@@ -220,7 +223,7 @@ def _signs(blind: InertialProblem, nearby: Solution | None, s: InertialSettings)
     if share > 1.0 - _MOST_TURNED:
         raise MismatchError(
             f"inertial scale: expected the probe to move as the images go, got an accelerometer that has it "
-            f"the other way for {share:.0%} of the path; set sensors.direction, or check its mounting"
+            f"the other way for {share:.0%} of the path; check sensors.direction, its clock and mounting"
         )
     return signs
 
@@ -235,13 +238,17 @@ def _solved(
         found = problem.solve(start)
     else:
         found = problem.solve(nearby)
+    ratio = 1.0
     for _ in range(_NOISE_ROUNDS):
-        left = found.image_residuals / np.sqrt(np.maximum(1.0 - found.leverage, 0.05))
-        factor = robust_sigma(left, 0.05)
-        problem = problem.told(replace(problem.steps, sigma_mm=problem.steps.sigma_mm * factor))
+        free = np.maximum(1.0 - found.leverage, 0.05)
+        left, count = ratio * robust_sigma(found.image_residuals / np.sqrt(free)), float(free.sum())
+        # Where the fit follows nearly every step, what is left of them tells little.
+        new = float(np.sqrt((_EXPECTED_COUNT + count * left**2) / (_EXPECTED_COUNT + count)))
+        problem = problem.told(replace(problem.steps, sigma_mm=problem.steps.sigma_mm * (new / ratio)))
         found = problem.solve(found)
-        if abs(np.log(factor)) < 0.05:
+        if abs(np.log(new / ratio)) < 0.05:
             break
+        ratio = new
     return problem, found
 
 
@@ -261,8 +268,8 @@ def _scale_error(problem: InertialProblem, found: Solution, s: InertialSettings)
 def _require_fit(problem: InertialProblem, found: Solution, misfit: float) -> None:
     if not _MISFIT[0] < misfit < _MISFIT[1]:
         raise MismatchError(
-            f"inertial scale: expected accelerometer, gyroscope and orientation to agree (chi^2 of {_MISFIT[0]:g} "
-            f"to {_MISFIT[1]:g}), got {misfit:.3g}; is the sensor fixed to the probe and its mounting right?"
+            f"inertial scale: expected readings that agree with each other (chi^2 of {_MISFIT[0]:g} to "
+            f"{_MISFIT[1]:g}), got {misfit:.3g}; is the sensor fixed to the probe and its mounting right?"
         )
     ratio = float(np.median(problem.steps.sigma_mm / expected_error(problem.steps.steps_mm)))
     if ratio > _MOST_STEP_ERROR:
@@ -273,8 +280,8 @@ def _require_fit(problem: InertialProblem, found: Solution, misfit: float) -> No
     clock, error = float(found.values[2]), float(np.sqrt(found.covariance[2, 2]))
     if error > _CLOCK_SETTLED_S:
         raise InsufficientDataError(
-            f"inertial scale: expected motion that settles the sensor's clock to {1e3 * _CLOCK_SETTLED_S:g} ms, "
-            f"got {1e3 * error:.1f} ms; wobble the probe by half a millimetre, two or three times a second"
+            f"inertial scale: expected motion that settles the clock to {1e3 * _CLOCK_SETTLED_S:g} ms, got "
+            f"{1e3 * error:.1f} ms; {_REMEDY}"
         )
     limit = _CLOCK_LIMIT * float(problem.prior.sigma[2])
     if abs(clock) > limit:
@@ -288,7 +295,7 @@ def _require_told(found: Solution, sigma: float, scale_sigma: float, s: Inertial
     if not np.isfinite(sigma) or sigma > s.largest_sigma:
         raise InsufficientDataError(
             f"inertial scale: expected motion that tells the length to {100 * s.largest_sigma:g} %, got "
-            f"{100 * sigma:.2g} %; wobble the probe by half a millimetre, two or three times a second"
+            f"{100 * sigma:.2g} %; {_REMEDY}"
         )
     off = abs(float(found.values[0]))
     scale_sigma = max(scale_sigma, _CURVES_SIGMA)
@@ -359,7 +366,7 @@ def _details(
     s: InertialSettings,
 ) -> dict[str, float | str]:
     deviation = np.sqrt(np.diag(found.covariance))
-    named = dict(zip(GLOBALS, zip(found.values, deviation, strict=True), strict=True))
+    named = dict(zip(GLOBALS, zip(found.values.tolist(), deviation.tolist(), strict=True), strict=True))
     return {
         "scale": float(np.exp(found.values[0])),
         "scale_sigma": sigma,
@@ -367,8 +374,8 @@ def _details(
         "chi_squared": misfit,
         "clock_ms": 1e3 * named["clock_s"][0],
         "clock_sigma_ms": 1e3 * named["clock_s"][1],
-        "lever_y_mm": named["lever_y_mm"][0],
-        "lever_y_sigma_mm": named["lever_y_mm"][1],
+        "lever_mm": float(np.linalg.norm(found.values[3:6])),
+        "lever_sigma_mm": named["lever_y_mm"][1],
         "image_step_error_mm": float(np.median(problem.steps.sigma_mm)),
         "turned_steps": float(signs.turned.sum()),
         "assumption": ASSUMPTION,

@@ -47,7 +47,7 @@ class InertialCase:
     @property
     def length_mm(self) -> float:
         """True elevational length."""
-        return float(_along(self.truth))
+        return along(self.truth)
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,9 @@ def drawn(setup: Setup, seed: int) -> InertialCase:
     return InertialCase(image, covariance, sensor, times, truth, log_scale, f"{setup}-{seed}")
 
 
-def _along(poses: RigidTransform) -> float:
-    steps = (poses[:-1].inv() * poses[1:]).apply(CENTRE_MM) - CENTRE_MM
+def along(poses: RigidTransform, centre_mm: np.ndarray = CENTRE_MM) -> float:
+    """Elevational length: the sum of the signed steps of the image's centre, mm."""
+    steps = (poses[:-1].inv() * poses[1:]).apply(centre_mm) - centre_mm
     return float(steps[:, 2].sum())
 
 
