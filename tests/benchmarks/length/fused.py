@@ -1,39 +1,51 @@
-"""Mode `fused` on short tissue and phantom sweeps with each sensor, its claims, and GTSAM beside it."""
+"""Mode `fused`: whether claims hold, time and GTSAM beside it; by itself, on short RF sweeps with each sensor.
 
+``python tests/benchmarks/length/fused.py [--first-seed N] [--count N] [--cache DIR]``
+"""
+
+import argparse
 import sys
 import time
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import numpy as np
 from cache import DEFAULT
 from fused_scenes import CENTRE_MM, errors, scene
+from rows import Row, show
+from scenes import FIRST_SEED, borrowed_curves, short
 from scipy.spatial.transform import RigidTransform
 
-from length.rows import Row, show
-from length.scenes import FIRST_SEED, borrowed_curves, short
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.correction.fused import fuse
+from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
-from speckle3d.pipeline import correct, track
+from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes
 
 CURVES = Path(__file__).resolve().parents[3] / "data" / "curves.h5"
 MISMATCH = 0.06
 """Relative standard deviation of the scale that borrowed curves add."""
+PATHS = 48
 LONG = {"frames": 300, "length_mm": 24.0}
 
 
-def measure(first_seed: int = FIRST_SEED, count: int = 6, folder: Path = DEFAULT) -> list[Row]:
-    """Errors of single modes and of `fused` on RF sweeps; coverage and time on poses."""
+def measure(share: float = 1.0, first_seed: int = FIRST_SEED) -> list[Row]:
+    """Coverage over simulated paths, and time."""
+    return [_coverage(range(first_seed, first_seed + max(8, round(PATHS * share)))), _speed(first_seed)]
+
+
+def on_sweeps(first_seed: int, count: int, folder: Path) -> list[Row]:
+    """Errors of single modes and of `fused` on RF sweeps of 3.6 to 6 mm."""
     seeds = range(first_seed, first_seed + count)
-    rows = [
+    return [
         *_on_sweeps(seeds, folder, read_curves(CURVES), 0.0, "curves right"),
         *_on_sweeps(seeds, folder, borrowed_curves(22.0, 0.8, folder), MISMATCH, "curves borrowed"),
     ]
-    return [*rows, _coverage(range(first_seed, first_seed + 8 * count)), _speed(first_seed)]
 
 
 def _on_sweeps(
@@ -134,5 +146,14 @@ def _against_gtsam(seed: int, twin: type) -> str:
     return f"60 frames, sizes given: {own:.2f} s, GTSAM {theirs / own:.0f} times that, {same:.4f} mm apart"
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--count", type=int, default=6)
+    parser.add_argument("--cache", type=Path, default=DEFAULT)
+    options = parser.parse_args()
+    show([*on_sweeps(options.first_seed, options.count, options.cache), *measure(1.0, options.first_seed)])
+
+
 if __name__ == "__main__":
-    show(measure(int(sys.argv[1]) if len(sys.argv) > 1 else FIRST_SEED, 4 if len(sys.argv) > 1 else 6))
+    main()
