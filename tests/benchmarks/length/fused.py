@@ -1,4 +1,4 @@
-"""Mode `fused`: whether claims hold, time and GTSAM beside it; by itself, on short RF sweeps with each sensor.
+"""Mode `fused`: whether claims hold, time, GTSAM beside it; by itself, also short RF sweeps.
 
 ``python tests/benchmarks/length/fused.py [--first-seed N] [--count N] [--cache DIR]``
 """
