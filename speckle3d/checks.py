@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError, MismatchError
@@ -20,7 +20,7 @@ from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import speckle_size
 from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.curve_doubts import doubt_curves, doubt_speed
+from speckle3d.motion.curve_doubts import DepthFactors, doubt_curves, doubt_speed
 from speckle3d.motion.estimate import PairReader, SignedPair
 from speckle3d.motion.plausibility import far_apart, folded, severed, standing, undetermined
 
@@ -30,17 +30,14 @@ def doubts_of_curves(
     curves: DecorrelationCurves,
     matcher: FrameMatcher,
     reader: PairReader,
-    table: CorrelationTable,
-    sound: BoolArray,
+    factors: DepthFactors,
     flags: IntArray,
     pairs: Sequence[SignedPair],
     coherence: Coherence | None,
     path: FloatArray,
-    config: Config,
 ) -> tuple[Doubt, ...]:
     """What a sweep's own speckle says against the curves; raises if it refutes them."""
     size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
-    factors = reader.depth_factors(table, path, sound, config.coherence)
     found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
     return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.checks import doubts_of_curves, doubts_of_path, doubts_of_standing, examined_sensors
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import TISSUE_SIGMA, DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
 from speckle3d.core.geometry import mirrored
@@ -38,7 +38,8 @@ from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import doubt_band
 from speckle3d.motion.coherence import Coherence, scale_sigma
-from speckle3d.motion.curve_doubts import doubt_depths, doubt_widths
+from speckle3d.motion.curve_doubts import DepthFactors, doubt_depths, doubt_widths
+from speckle3d.motion.curve_prior import RowsSeen, rows_seen, straightened
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import PairReader, SignedPair
 from speckle3d.motion.plausibility import interleaved
@@ -51,8 +52,8 @@ PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 MOST_LOST = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
-PLANES = "distances and planes"
-"""Name of the stage in `StageTimes`."""
+PLANES, STRAIGHTENING = "distances and planes", "curves"
+"""Names of stages in `StageTimes`."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,10 @@ class Tracked:
         What settled the sign.
     coherence : Coherence or None
         How the patches' echoes depart from a phantom's; None if not adapted to.
+    curves : DecorrelationCurves
+        With which the images were read: those given, straightened by what depths disagree on.
+    rows : RowsSeen
+        Distances that rows of patches still want, over those of all.
     slopes : SlopeEvidence
         What the images' own yaw and tilt are worth.
     times : StageTimes
@@ -104,6 +109,8 @@ class Tracked:
     direction: int
     direction_from: str
     coherence: Coherence | None
+    curves: DecorrelationCurves
+    rows: RowsSeen
     slopes: SlopeEvidence
     times: StageTimes
     doubts: tuple[Doubt, ...] = ()
@@ -188,9 +195,19 @@ def track(
         _require_placed(sweep, flags)
         # What stands still would be blamed on the curves.
         doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
-        doubts += doubts_of_curves(
-            sweep, curves, matcher, reader, found.table, sound, flags, pairs, coherence, path, settings
-        )
+        factors = reader.depth_factors(found.table, path, sound, settings.coherence)
+        doubts += doubts_of_curves(sweep, curves, matcher, reader, factors, flags, pairs, coherence, path)
+
+    # -> curves of the lens that the depths of the images agree on, and everything read with them
+    mismatch, given = curves.mismatch(settings.curves.same_probe), curves
+    if settings.curves.straighten and mismatch > TISSUE_SIGMA and curves.origin in ("phantom", "data sheet"):
+        with times.of(STRAIGHTENING):
+            curves, mismatch = straightened(curves, _rows_seen(factors, coherence, matcher), mismatch)
+        if curves is not given:
+            reader = reader.with_curves(curves)
+            pairs, coherence, path = _measured(found.table, flags, reader, settings, times, path)
+            with times.of(STRAIGHTENING):
+                factors = reader.depth_factors(found.table, path, sound, settings.coherence)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -221,7 +238,6 @@ def track(
 
     # Checks ask what contradicts images and curves as given: a mismatch shows in them and excuses nothing.
     # Claimed errors include it.
-    mismatch = curves.mismatch(settings.curves.same_probe)
     whole = with_common_scale(covariance, trajectory.poses, matcher.centre_mm, mismatch)
     sigma = float(np.hypot(scale_sigma(coherence), mismatch))
 
@@ -251,6 +267,8 @@ def track(
         direction=direction,
         direction_from=source,
         coherence=coherence,
+        curves=curves,
+        rows=_rows_seen(factors, coherence, matcher),
         slopes=slopes,
         times=times,
         doubts=(*doubts, *sensors.doubts),
@@ -309,20 +327,28 @@ def _require_placed(sweep: Sweep, flags: IntArray) -> None:
 
 
 def _measured(
-    table: CorrelationTable, flags: IntArray, reader: PairReader, config: Config, times: StageTimes
+    table: CorrelationTable,
+    flags: IntArray,
+    reader: PairReader,
+    config: Config,
+    times: StageTimes,
+    known: FloatArray | None = None,
 ) -> tuple[list[SignedPair], Coherence | None, FloatArray]:
     """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
 
-    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
+    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn; once
+    from a path that is known already.
     """
     sound = _sound(table, flags)
-    with times.of(PLANES):
-        path = reader.rough_path(table)
+    path = known
+    if path is None:
+        with times.of(PLANES):
+            path = reader.rough_path(table)
     if not config.coherence.adapt:
         with times.of(PLANES):
             pairs = reader.measure(table, path, sound, None)
         return pairs, None, reader.path(table, pairs, None)
-    for known_scale in (False, True):
+    for known_scale in (False, True) if known is None else (True,):
         with times.of("coherence"):
             coherence, path = reader.coherence(table, path, sound, config.coherence, known_scale)
         with times.of(PLANES):
@@ -336,6 +362,13 @@ def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     sound: BoolArray = ~bad[table.first] & ~bad[table.second]
     return sound
+
+
+def _rows_seen(factors: DepthFactors, coherence: Coherence | None, matcher: FrameMatcher) -> RowsSeen:
+    """What rows of patches say of the curves."""
+    if coherence is None:
+        return rows_seen(factors)
+    return rows_seen(factors, matcher.patches.rows_of(coherence.share.mean(axis=0)).mean(axis=-1))
 
 
 def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:

@@ -363,3 +363,19 @@ def lzf_length(packed):
     except IndexError:
         return -1
     return len(unpacked)
+
+
+def look_up_on_planes(points_mm, volume, planes, pixels):
+    """Twin of `speckle3d.kernels.crossing.look_up`: values alone, every point against every plane."""
+    found = np.full(len(points_mm), np.nan)
+    for n, point in enumerate(points_mm):
+        local = planes[:, :, :3] @ point + planes[:, :, 3]
+        between = np.flatnonzero((local[:-1, 2] >= 0) & (local[1:, 2] < 0))
+        if between.size == 0:
+            continue
+        k = int(between[0])
+        share = local[k, 2] / (local[k, 2] - local[k + 1, 2])
+        x, y = ((1 - share) * local[k] + share * local[k + 1])[:2]
+        at = [[k + share], [(x - pixels[2]) / pixels[0]], [(y - pixels[3]) / pixels[1]]]
+        found[n] = ndimage.map_coordinates(volume.astype(float), at, order=1, mode="constant", cval=np.nan)[0]
+    return found

@@ -41,6 +41,12 @@ def calibrate_curves(
         Path | None,
         typer.Option(help="With --probe: sweep whose signal, depths and echoes to calculate for."),
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rough curves to correct by the sweeps' tracker; then they may be over tissue, too."
+        ),
+    ] = None,
     config_file: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -50,13 +56,18 @@ def calibrate_curves(
     """
     from speckle3d.io.curves import write_curves
 
-    require_own_place(out, "curves", *(sweeps or []), config_file, probe, like)
+    require_own_place(out, "curves", *(sweeps or []), config_file, probe, like, start)
     settings = load_settings(config_file)
     if (probe is None) == (not sweeps):
         raise InvalidInputError("expected sweeps to measure curves on, or --probe, got both or neither")
     if like is not None and probe is None:
         raise InvalidInputError("--like: expected --probe with it, got none")
-    curves = _of_sheet(probe, like, settings) if probe is not None else _measured(sweeps or [], settings)
+    if start is not None and probe is not None:
+        raise InvalidInputError("--start: expected sweeps with a tracker beside it, got --probe")
+    if probe is not None:
+        curves = _of_sheet(probe, like, settings)
+    else:
+        curves = _measured(sweeps or [], start, settings)
     write_curves(out, curves)
     _show(curves, as_json)
 
@@ -73,12 +84,19 @@ def _of_sheet(probe: Path, like: Path | None, settings: Config) -> Decorrelation
         return data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
 
 
-def _measured(paths: list[Path], settings: Config) -> DecorrelationCurves:
+def _measured(paths: list[Path], start: Path | None, settings: Config) -> DecorrelationCurves:
+    from speckle3d.io.curves import read_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.phantom_curves import calibrate_curves as measure
+    from speckle3d.tracked_curves import jitters, tracked_curves
 
-    with progress_bar("correlating phantom frames") as progress:
-        return measure([load_sweep(path) for path in paths], settings, progress)
+    sweeps = [load_sweep(path) for path in paths]
+    with progress_bar("correlating frames") as progress:
+        if start is not None:
+            return tracked_curves(sweeps, read_curves(start), settings, progress)
+        if all(jitters(sweep) for sweep in sweeps):
+            return tracked_curves(sweeps, None, settings, progress)
+        return measure(sweeps, settings, progress)
 
 
 def _show(curves: DecorrelationCurves, as_json: bool) -> None:

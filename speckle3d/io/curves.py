@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import cast, get_args
 
 import numpy as np
@@ -12,6 +13,7 @@ from speckle3d.core.curves import (
     PROBE_SIGMA,
     CurveKey,
     DecorrelationCurves,
+    NominalProbe,
     Origin,
     SpeckleSize,
     TiltResponse,
@@ -22,6 +24,7 @@ from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
+    find_group,
     has_member,
     opened,
     read_attribute,
@@ -52,6 +55,8 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
         for name in ("pairs_used", "scale_sigma", "origin"):
             file.attrs[name] = getattr(curves, name)
         write_attributes(file, curves.key, (*PATCH_NUMBERS, "correlation_of", "edge_fraction", "probe"))
+        if curves.nominal is not None:
+            file.create_group("nominal").attrs.update(vars(curves.nominal))
         file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
         file.attrs.update(vars(curves.key.signal))
 
@@ -101,7 +106,11 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         if has_member(file, "speckle"):
             names = ("speckle/lateral_mm", "speckle/axial_mm")
             speckle = SpeckleSize(*(read_checked(file, name, (depth.size,)) for name in names))
-        parts = tilt, speckle, sigma, origin
+        nominal = None
+        if (group := find_group(file, "nominal")) is not None:
+            kinds = dict.fromkeys((field.name for field in fields(NominalProbe)), float)
+            nominal = NominalProbe(**read_attributes(group, kinds))
+        parts = tilt, speckle, sigma, origin, nominal
         return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, *parts)
 
 

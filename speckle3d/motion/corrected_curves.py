@@ -8,16 +8,27 @@ from typing import Protocol
 
 import numpy as np
 
-from speckle3d.core.curves import TISSUE_SIGMA, DecorrelationCurves, TiltResponse
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.curves import TISSUE_SIGMA, DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.motion.curve_prior import RowsSeen, learn_correction
+from speckle3d.motion.diffraction import half_distance
+
+ANY_COMMON = 0.2
+"""Standard deviation of what all distances may be wrong by alike, beside what another lens does: the lengths
+that are known shall decide it."""
 
 
 class Read(Protocol):
     """A sweep that was read with curves, such as `speckle3d.pipeline.Tracked`."""
 
     @property
-    def scale_sigma(self) -> float:
-        """Relative standard deviation of the scale of its distances."""
+    def curves(self) -> DecorrelationCurves:
+        """With which it was read."""
+
+    @property
+    def rows(self) -> RowsSeen:
+        """Distances that its rows of patches still want, over those of all."""
 
 
 def corrected_curves(
@@ -31,12 +42,15 @@ def corrected_curves(
     Parameters
     ----------
     curves : DecorrelationCurves
-        That the sweeps were read with.
+        That the sweeps were read with, as given to `speckle3d.pipeline.track`.
     tracked : sequence of Read
         The sweeps, each as `speckle3d.pipeline.track` has it.
     log_scale, log_scale_sigma : sequence of float
         Of each sweep: the logarithm of its true elevational length over the images', from a crossing sweep,
         an inertial sensor or a tracker, and its standard deviation.
+
+    Factors by depth follow what another lens does; what all depths have in common follows the lengths known.
+    Tissue whose structure reads short is corrected with it: curves learnt over tissue are right over tissue.
 
     Returns
     -------
@@ -58,13 +72,25 @@ def corrected_curves(
         raise InsufficientDataError(
             "corrected curves: expected finite log scales with deviations above zero, got others"
         )
-    weight = 1.0 / sigma**2
-    factor = float(np.exp(np.average(scale, weights=weight)))
-    tilt = curves.tilt and TiltResponse(factor * curves.tilt.pivot_mm, factor**2 * curves.tilt.spread_mm)
+    seen = [
+        replace(
+            each.rows,
+            logarithm=each.rows.logarithm - _widened(each.curves, curves, each.rows.depth_mm),
+            log_scale=float(true),
+            log_scale_sigma=float(deviation),
+        )
+        for each, true, deviation in zip(tracked, scale, sigma, strict=True)
+    ]
+    found = learn_correction(curves, seen, ANY_COMMON)
     return replace(
-        curves,
-        distance_mm=factor * curves.distance_mm,
-        tilt=tilt,
-        scale_sigma=float(np.hypot(weight.sum() ** -0.5, TISSUE_SIGMA)),
-        origin="crossing",
+        found.applied(curves), scale_sigma=float(np.hypot(found.sigma, TISSUE_SIGMA)), origin="crossing"
     )
+
+
+def _widened(used: DecorrelationCurves, given: DecorrelationCurves, depth_mm: FloatArray) -> FloatArray:
+    """Logarithm of the distances of one set of curves over another's, at some depths."""
+    wide, narrow = (
+        [half_distance(each.distance_mm, row) for row in each.at(depth_mm).correlation]
+        for each in (used, given)
+    )
+    return np.asarray(np.log(wide) - np.log(narrow))

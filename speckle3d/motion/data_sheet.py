@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, TiltResponse
+from speckle3d.core.curves import STRUCTURE_SIGMA, CurveKey, DecorrelationCurves, NominalProbe, TiltResponse
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
@@ -49,12 +49,14 @@ class ProbeSheet(BaseModel):
     backscatter_exponent: float = Field(
         1.1, ge=-1, le=4, description="Of scattered power over frequency: soft tissue 0.6 to 1.6."
     )
-    transmit_aperture_mm: float = Field(
-        0.0, ge=0, le=60, description="Width of the transmit aperture; 0: not known. Matters near the probe."
+    transmit_aperture_mm: float | None = Field(
+        None,
+        ge=0,
+        le=60,
+        description="Width of the transmit aperture, which matters near the probe; by default what the "
+        "f-number asks for at the lens's focus.",
     )
-    f_number: float = Field(
-        2.0, gt=0.5, le=20, description="Of the receive aperture, for the speckle's size."
-    )
+    f_number: float = Field(2.0, gt=0.5, le=20, description="Of the apertures.")
     focus_tolerance: float = Field(0.15, ge=0, lt=0.5, description="Either way, as a share.")
     aperture_tolerance: float = Field(0.10, ge=0, lt=0.5, description="Either way, as a share.")
     frequency_tolerance: float = Field(
@@ -80,12 +82,10 @@ class ProbeSheet(BaseModel):
     @property
     def lens(self) -> Lens:
         """What shapes the elevational field."""
-        return Lens(
-            self.elevation_aperture_mm,
-            self.elevation_focus_mm,
-            self.transmit_aperture_mm,
-            self.speed_of_sound_m_s,
-        )
+        transmit = self.transmit_aperture_mm
+        if transmit is None:
+            transmit = self.elevation_focus_mm / self.f_number
+        return Lens(self.elevation_aperture_mm, self.elevation_focus_mm, transmit, self.speed_of_sound_m_s)
 
     @property
     def signal(self) -> RFSettings:
@@ -185,6 +185,13 @@ def sheet_curves(
         tilt=tilt,
         scale_sigma=sheet_sigma(sheet, rows, seen is not None),
         origin="data sheet",
+        nominal=NominalProbe(
+            sheet.elevation_aperture_mm,
+            sheet.elevation_focus_mm,
+            sheet.lens.transmit_mm,
+            *_band(sheet),
+            sheet.attenuation_db_cm_mhz,
+        ),
     )
 
 
@@ -205,7 +212,7 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
         ]
     )
     common = sensitivity(nominal, depth_mm).mean(axis=0)
-    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2))
+    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2 + STRUCTURE_SIGMA**2))
 
 
 def _band(sheet: ProbeSheet) -> tuple[float, float]:

@@ -199,7 +199,7 @@ class Nominal:
 
     def log_width(self, depth_mm: FloatArray) -> FloatArray:
         """Logarithm of the distance in mm that halves the correlation at each depth, shape (r,)."""
-        frequency = band_nodes(self.band_hz, 0.1)
+        frequency = band_nodes(self.band_hz, 0.1)[::2]
         power = sheet_spectrum(
             frequency, self.band_hz, self.attenuation_db_cm_mhz, self.backscatter_exponent, depth_mm[:, None]
         )

@@ -81,6 +81,10 @@ class PairReader:
         self._estimator = DistanceEstimator(curves, patches)
         self.fitter = PlaneFitter(self._estimator, patches.centre_mm - centre_mm[:2], planes)
 
+    def with_curves(self, curves: DecorrelationCurves) -> PairReader:
+        """Return a reader of the same sweep with other curves."""
+        return PairReader(curves, self._patches, self._centre, self._frames, self._planes, self._settings)
+
     def rough_path(self, table: CorrelationTable) -> FloatArray:
         """Place each frame after the earlier ones it resembles, by a phantom's curves.
 

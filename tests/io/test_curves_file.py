@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import speckle
 
-from speckle3d.core.curves import SpeckleSize, TiltResponse
+from speckle3d.core.curves import PROBE_SIGMA, NominalProbe, SpeckleSize, TiltResponse
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.curves import read_curves, write_curves
 
@@ -47,13 +48,28 @@ def test_curves_come_back(tmp_path, signal, whole, of):
             np.testing.assert_array_equal(found, kept)
 
 
+def test_origin_and_error_come_back(tmp_path):
+    nominal = NominalProbe(5.0, 20.0, 10.0, 5e6, 10e6, 0.5)
+    write_curves(tmp_path / "c.h5", replace(made(), scale_sigma=0.03, origin="data sheet", nominal=nominal))
+    got = read_curves(tmp_path / "c.h5")
+    assert (got.scale_sigma, got.origin, got.nominal) == (0.03, "data sheet", nominal)
+
+
+def test_an_unknown_origin_is_named(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["origin"] = "a dream"
+    with pytest.raises(InvalidInputError, match=r"attribute origin: expected one of .*, got 'a dream'"):
+        read_curves(path)
+
+
 def test_files_of_earlier_versions_are_read(path):
     with h5py.File(path, "r+") as file:
-        for name in ("correlation_of", "edge_fraction", "probe"):
+        for name in ("correlation_of", "edge_fraction", "probe", "scale_sigma", "origin"):
             del file.attrs[name]
         del file["tilt"], file["speckle"]
     got = read_curves(path)
     assert (got.key.correlation_of, got.key.edge_fraction, got.key.probe) == ("intensity", 0.1, "")
+    assert (got.scale_sigma, got.origin, got.nominal) == (PROBE_SIGMA, "phantom", None)
     assert got.tilt is None
     assert got.speckle is None
 

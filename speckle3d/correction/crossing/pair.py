@@ -200,8 +200,20 @@ class _Matched:
                 f"{names}: expected {self.settings.least_overlap_mm:.0f} mm of each sweep to be seen by the "
                 f"other, got {overlap:.0f}; let longer sweeps cross in their middles"
             )
+        if margin < self.settings.least_margin:
+            raise MismatchError(
+                f"{names}: expected one way of laying the sweeps together, got another that fits almost as "
+                f"well (log likelihood {margin:.0f} less); sweep where vessels or edges tell places apart"
+            )
         terms = np.concatenate([terms_of(pair[k].path, k) for k in (0, 1)])
         joint = terms @ whole @ terms.T
+        sigma = float(np.sqrt(joint[[0, 3], [0, 3]].max()))
+        if sigma > self.settings.largest_sigma:
+            raise InsufficientDataError(
+                f"{names}: expected parts of the tissue to agree on the length to "
+                f"{100 * self.settings.largest_sigma:.1f} %, got {100 * sigma:.1f} %: too little texture, or "
+                "tissue that moved between the sweeps; sweep again, pressing alike and lightly"
+            )
         scaled = [self._scaled(k, mirrored[k], end, whole) for k in (0, 1)]
         to_world = [
             s.poses[0]

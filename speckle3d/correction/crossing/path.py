@@ -7,6 +7,7 @@ leave no trace, and a place is found by its neighbouring planes alone.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -215,8 +216,9 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
     )
     moved = np.stack([_moved(images[f], away[f], pixels) for f in good])
     volume = _onto_planes(moved, travel[good], at)
-    depth = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
-    volume[:, :, depth < nearest_mm] = np.nan
+    skipped = max(0, math.ceil((nearest_mm - grid.first_sample_depth_mm) / grid.sample_spacing_mm))
+    volume = np.ascontiguousarray(volume[:, :, min(skipped, volume.shape[2] - 2) :])
+    pixels[3] += min(skipped, grid.samples - 2) * grid.sample_spacing_mm
     path = Path(at - at[middle], planes.as_matrix())
     return StraightSweep(path, volume, pixels, frames, travel - at[middle])
 
@@ -253,14 +255,20 @@ def _moved(image: Float32Array, plane_from_frame: RigidTransform, pixels: FloatA
 
 
 def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Float32Array:
-    away = np.abs(travel[None, :] - at[:, None])
+    off = travel[None, :] - at[:, None]
+    away = np.abs(off)
     order = np.sort(away, axis=1)
     reach = np.maximum(_EACH_MM, 0.5 * order[:, min(1, order.shape[1] - 1)])
     # Frames crowd where the hand dwells: each counts for the travel it stands for, or it would draw the
     # images of the planes about it.
     crowd = np.exp(-0.5 * ((travel[None, :] - travel[:, None]) / _EACH_MM) ** 2).sum(axis=1)
-    weight = (np.exp(-0.5 * (away / reach[:, None]) ** 2) / crowd).astype(np.float32)
+    weight = np.exp(-0.5 * (away / reach[:, None]) ** 2) / crowd
     weight[weight < 0.02 * weight.max(axis=1, keepdims=True)] = 0.0
+    # Local straight lines: what a plane shows is centred on it.
+    first, second = ((weight * off**k).sum(axis=1, keepdims=True) for k in (1, 2))
+    total = weight.sum(axis=1, keepdims=True)
+    stiff = 0.01 * reach[:, None] ** 2 * total
+    weight = (weight * (1.0 - first / (second + stiff) * off)).astype(np.float32)
     there = np.isfinite(images).reshape(len(images), -1)
     flat = np.where(there, images.reshape(len(images), -1), np.float32(0.0))
     share = weight @ there.astype(np.float32)

@@ -35,6 +35,8 @@ class CrossingSettings(BaseModel):
     least_angle_deg, least_overlap_mm, least_similarity : float
         Below these a pair is refused: angle between the sweeps, length along either that the other sees,
         and correlation of the images.
+    least_margin : float
+        Logarithm by which the best way of laying the sweeps together must be likelier than any other.
     largest_sigma : float
         Relative standard deviation of the length above which a pair is refused.
     """
@@ -49,8 +51,9 @@ class CrossingSettings(BaseModel):
     depth_shift_mm: float = Field(6.0, ge=0, le=30)
     least_angle_deg: float = Field(30.0, ge=10, le=90)
     least_overlap_mm: float = Field(18.0, gt=0)
-    least_similarity: float = Field(0.3, ge=0, le=1)
-    largest_sigma: float = Field(0.05, gt=0)
+    least_similarity: float = Field(0.5, ge=0, le=1)
+    least_margin: float = Field(10.0, ge=0)
+    largest_sigma: float = Field(0.02, gt=0)
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,13 @@
 
 Unknown are the pose of every frame, the errors that the images' steps share, and of every sensor its world,
 mounting, clock, millimetres and wandering error. The images' steps enter with their full covariance, grown
-because pairs of frames share speckle, and may all be wrong by one scale and one rate of tilt and of yaw, and by
-a little more that changes along the sweep. The sizes of the sensors' errors are found from the readings.
+because pairs of frames share speckle, and may all be wrong by one scale and one rate of tilt and of yaw,
+and by a little more that changes along the sweep. The sizes of the errors are found from the data.
 
 References
 ----------
-.. [1] M. Kaess and F. Dellaert, "Factor graphs for robot perception", Foundations and Trends in Robotics, 2017.
+.. [1] F. Dellaert and M. Kaess, "Factor graphs for robot perception", Foundations and Trends in Robotics 6,
+   2017.
 .. [2] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
    Biometrika 58, 1971 (restricted likelihood).
 """
@@ -15,7 +16,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -25,12 +26,19 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.correction.fused.contradictions import Contradiction, contradictions, difference
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
+from speckle3d.correction.fused.sides import on_sensed_sides
 from speckle3d.correction.fused.sizes import Wander
 from speckle3d.correction.fused.solution import Problem, Solution
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
 from speckle3d.correction.trust import ORIENTATION, TRACKER
+
+UNUSED = 1e-9
+"""Standard deviation of what a sensor does not have: an orientation sensor's millimetres."""
+LEAST_PATH_MM = 0.1
+"""Travel by the images that a scale is given of at least."""
 
 
 class FusedSettings(BaseModel):
@@ -54,7 +62,7 @@ class FusedSettings(BaseModel):
     heading_sigma_rad: float = Field(0.0087, gt=0, description="Slow error of its heading: half a degree.")
     wander_s: float = Field(40.0, gt=0, description="Time in which these errors change.")
     contradiction_sigma: float = Field(
-        5.0, gt=0, description="Deviations by which a sensor must differ from the images to contradict them."
+        6.0, gt=0, description="Deviations by which a sensor must differ from the images to contradict them."
     )
 
 
@@ -125,50 +133,98 @@ def fuse(
     yaw, tilt = turn_sigma_per_mm
     centre = RigidTransform.from_translation(centre_mm)
     start = centre.inv() * (image[0].inv() * image) * centre
-    images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
-    limits = SensorLimits(
-        settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, 1e-9
-    )
-    sensors: list[tuple[SensorEvidence, Wander | None]] = []
+    seen_mm = _along(start)
     if tracker is not None:
-        own = replace(limits, stretch=settings.tracker_scale_sigma)
-        read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, own)
-        sensors += [(read, None)] if read else []
-    if orientation is not None:
-        slow = Wander(
-            np.array([settings.inclination_sigma_rad] * 2 + [settings.heading_sigma_rad]), settings.wander_s
-        )
-        read = read_sensor(orientation, ORIENTATION, start, centre_mm, frame_time_s, limits)
-        sensors += [(read, slow)] if read else []
-    problem = Problem.of(images, sensors, evidence)
-    solution, problem = problem.solve()
-    return _reported(solution, problem, centre)
+        read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, _limits(settings, TRACKER))
+        edges, start = on_sensed_sides(edges, start, read) if read else (edges, start)
+    images = ImageEvidence.of(edges, start, image_covariance, scale_sigma, np.array([tilt, yaw]))
+    sensors = _sensors(start, centre_mm, frame_time_s, orientation, tracker, settings)
+    solution, problem = Problem.of(images, sensors, evidence).solve()
+    contrary = contradictions(problem, solution, settings.contradiction_sigma)
+    return _reported(problem, solution, contrary, centre, seen_mm)
 
 
-def _reported(solution: Solution, problem: Problem, centre: RigidTransform) -> FusedPoses:
-    images = solution.images
-    poses = centre * solution.state.poses * centre.inv()
-    world = RigidTransform.identity()
-    if solution.state.sensors:
-        state = solution.state.sensors[0]
-        world = state.world * centre.inv()
-        if problem.sensors[0].components == 3:
-            world = RigidTransform.from_rotation(state.world.rotation)
+def _limits(settings: FusedSettings, name: str) -> SensorLimits:
+    stretch = settings.tracker_scale_sigma if name == TRACKER else UNUSED
+    return SensorLimits(
+        settings.mounting_sigma_rad, settings.mounting_sigma_mm, settings.clock_sigma_s, stretch
+    )
+
+
+def _sensors(
+    start: RigidTransform,
+    centre_mm: FloatArray,
+    frame_time_s: FloatArray,
+    orientation: OrientationSensor | None,
+    tracker: Tracker | None,
+    settings: FusedSettings,
+) -> list[tuple[SensorEvidence, Wander | None]]:
+    """The sensors that can be used, and what each is expected to wander by."""
+    inclination, heading = settings.inclination_sigma_rad, settings.heading_sigma_rad
+    slow = Wander(np.array([inclination, inclination, heading]), settings.wander_s)
+    found: list[tuple[SensorEvidence, Wander | None]] = []
+    for sensor, name, expected in ((tracker, TRACKER, None), (orientation, ORIENTATION, slow)):
+        if sensor is not None:
+            read = read_sensor(sensor, name, start, centre_mm, frame_time_s, _limits(settings, name))
+            found += [(read, expected)] if read else []
+    return found
+
+
+def _reported(
+    problem: Problem,
+    solution: Solution,
+    contrary: Sequence[Contradiction],
+    centre: RigidTransform,
+    seen_mm: FloatArray,
+) -> FusedPoses:
+    images, state = solution.images, solution.state
     frames, weight = images.parts
-    path = float(weight @ _along(solution.state.poses)[frames])
-    joint = solution.covariance(frames)[2::6, 2::6]
+    path = float(weight @ _along(state.poses)[frames])
+    variance = float(weight @ solution.covariance(frames)[2::6, 2::6] @ weight)
+    covariance = solution.marginals()
+    for each in contrary:
+        # Either may be right: the claim reaches from the one to the other.
+        apart = np.zeros((len(images), 6))
+        apart[:, each.parts] = difference(images.start, state.poses)[:, each.parts]
+        covariance += apart[:, :, None] * apart[:, None, :]
+        variance += (path - images.path_mm) ** 2 if 2 in each.parts else 0.0
+    world = RigidTransform.identity()
+    if problem.sensors:
+        world = state.sensors[0].world * centre.inv()
+        if problem.sensors[0].components == 3:
+            world = RigidTransform.from_rotation(state.sensors[0].world.rotation)
     sizes = _sizes(problem, solution)
+    details: dict[str, float | str] = {"used": ", ".join(problem.names), **sizes}
+    if not np.array_equal(seen_mm, images.along_mm):
+        details["stretches"] = "turned over where the tracker saw the probe go the other way"
     return FusedPoses(
-        poses=world * poses,
-        covariance=solution.marginals(),
-        log_scale=float(np.log(path / images.path_mm)),
-        log_scale_sigma=float(np.sqrt(weight @ joint @ weight)) / path,
+        poses=world * centre * state.poses * centre.inv(),
+        covariance=covariance,
+        log_scale=float(np.log(path / max(abs(float(weight @ seen_mm[frames])), LEAST_PATH_MM))),
+        log_scale_sigma=float(np.sqrt(variance)) / path,
         evidence=problem.evidence,
-        details=dict(sizes),
-        used=("images", *(s.name for s in problem.sensors), *(e.source for e in problem.evidence)),
-        contradictions=(),
+        details=details | _directions(problem, solution),
+        used=problem.names,
+        contradictions=tuple(each.doubt for each in contrary),
         sizes=sizes,
     )
+
+
+def _directions(problem: Problem, solution: Solution) -> dict[str, float | str]:
+    """How the scales there and back compare, if the sweep comes back over what it has seen."""
+    images = solution.images
+    frames, _ = images.parts
+    if frames.size < 2 or not images.returns.any():
+        return {}
+    z_mm, seen = _along(solution.state.poses)[frames], images.along_mm[frames]
+    there, back = z_mm[0], z_mm[0] - z_mm[1]
+    slope = np.array([1.0 / there - 1.0 / back, 1.0 / back])
+    sigma = float(np.sqrt(slope @ solution.covariance(frames)[2::6, 2::6] @ slope))
+    ratio = float(there / back * (seen[0] - seen[1]) / seen[0])
+    told = [name for name in problem.names if name not in ("images", ORIENTATION)]
+    said = "set by " + " and ".join(told) if told else "unknown beyond what the images claim"
+    tied = f"forward and back are tied to each other; their common scale is {said}"
+    return {"directions": tied, "direction_ratio": ratio, "direction_ratio_sigma": sigma}
 
 
 def _along(poses: RigidTransform) -> FloatArray:

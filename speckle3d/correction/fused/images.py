@@ -26,8 +26,8 @@ RETURN_MM = 1.0
 are apart."""
 RETURN_RAD = 0.03
 """How far a probe may be turned that comes back to a place: two degrees."""
-SLOW, SLOW_RAD = 3, 0.005
-"""Number of slow curves by which tilt and yaw are off, and the deviation of the slowest: 0.3 degrees. A hand
+SLOW, SLOW_RAD = 4, 0.01
+"""Number of slow curves by which tilt and yaw are off, and the deviation of the slowest: 0.6 degrees. A hand
 turns by as much in a sweep, which images hardly see."""
 LEAST_STEP_MM = 0.005
 """Steps count as at least so long in what errors may change over them: no step is exact."""
@@ -59,8 +59,8 @@ class ImageErrors:
     ----------
     common : ndarray, shape (3,)
         Logarithm of the scale; tilt and yaw per mm that the images lack.
-    slow : ndarray, shape (3, 2)
-        Weights of three slow curves in tilt and yaw, rad.
+    slow : ndarray, shape (4, 2)
+        Weights of slow curves in tilt and yaw, rad.
     changing : ndarray, shape (k + 1, 3)
         What is wrong beyond that at the knots: z, mm; tilt and yaw, rad. Zero at the first.
     """
@@ -121,9 +121,9 @@ class ImageEvidence:
     ) -> ImageEvidence:
         """Evidence with the errors that many edges share, as far as a claimed covariance tells them.
 
-        Deviations of x, y and roll over those of independent edges are read off the claim, where the structure
-        of the tissue makes them larger; the others' are the same for all tissue. So is the scale that changes
-        along the sweep: the images' own, without what is added for curves of another probe.
+        Deviations of x, y and roll over those of independent edges are read off the claim, where the
+        structure of the tissue makes them larger; the others' are the same for all tissue. So is the scale
+        that changes along the sweep: without what is added for curves of another probe.
 
         Parameters
         ----------
@@ -188,20 +188,22 @@ class ImageEvidence:
         """Some frames, and the variances of their poses had edges no errors in common, shape (k, 6)."""
         n = len(self)
         some = np.unique(np.linspace(1, n - 1, min(n - 1, COMPARED)).round().astype(int))
-        normal = Normal.of([self._alone(), self._held(self.start)], 6 * (n - 1))
+        normal = Normal.of(self.alone(), 6 * (n - 1))
         columns = pose_columns(some)
         unit = np.zeros((6 * (n - 1), columns.size))
         unit[columns.ravel(), np.arange(columns.size)] = 1.0
         variance = normal.factor().solve(unit)[columns.ravel(), np.arange(columns.size)]
         return some, variance.reshape(-1, 6)[:, TWIST]
 
-    def _alone(self) -> Block:
+    def alone(self) -> list[Block]:
+        """Equations of the edges at `start`, as if they had no errors in common."""
         first, second = self.edges.first, self.edges.second
         relative = self.start[first].inv() * self.start[second]
         error = (self.edges.poses.inv() * relative).as_exp_coords()
         w = self._independent
         parts = ((pose_columns(first), -w @ adjoint(relative.inv())), (pose_columns(second), w))
-        return Block(np.einsum("eij,ej->ei", w, error), parts).weighted(self._doubtful(error))
+        edges = Block(np.einsum("eij,ej->ei", w, error), parts).weighted(self._doubtful(error))
+        return [edges, self._held(self.start)]
 
     def _whitening(self, growth: FloatArray) -> FloatArray:
         """Whitening of edges' twists, shape (e, 6, 6)."""
@@ -289,25 +291,33 @@ class ImageEvidence:
 
     @cached_property
     def curves(self) -> FloatArray:
-        """Slow curves, zero at the first frame, shape (n, 3)."""
+        """Slow curves, zero at the first frame, shape (n, 4)."""
         part = np.linspace(0.0, np.pi, len(self))
         return np.asarray(1.0 - np.cos(np.outer(part, np.arange(1, SLOW + 1))))
 
     def distortion_parts(
-        self, frames: IntArray, errors: ImageErrors, slope: FloatArray
+        self, frames: IntArray, weights: FloatArray, errors: ImageErrors, slope: FloatArray
     ) -> tuple[tuple[IntArray, FloatArray], ...]:
-        """Parts of equations whose derivatives by the distortion of some frames are `slope`, (m, k, 3)."""
-        before, share = self._knot[0][frames], self._knot[1][frames]
-        common = np.broadcast_to(self.common_columns, (frames.size, 3))
-        return (
-            (self.knot_columns(before), slope * (1 - share)[:, None, None]),
-            (self.knot_columns(before + 1), slope * share[:, None, None]),
-            (common, slope @ errors.per_mm_slope * self.along_mm[frames][:, None, None]),
-            (
-                np.broadcast_to(self.slow_columns, (frames.size, 2 * SLOW)),
-                np.einsum("fs,fkt->fkst", self.curves[frames], slope[:, :, 1:]).reshape(*slope.shape[:2], -1),
-            ),
-        )
+        """Parts of equations about weighted sums of some frames' distortion.
+
+        Parameters
+        ----------
+        frames : ndarray of int, shape (m, f)
+        weights : ndarray, shape (m, f)
+        slope : ndarray, shape (m, k, 3)
+            Derivatives of the equations by the sums.
+        """
+        parts = []
+        for frame, weight in zip(frames.T, weights.T, strict=True):
+            before, share = self._knot[0][frame], self._knot[1][frame]
+            parts.append((self.knot_columns(before), slope * (weight * (1 - share))[:, None, None]))
+            parts.append((self.knot_columns(before + 1), slope * (weight * share)[:, None, None]))
+        along = (weights * self.along_mm[frames]).sum(axis=1)
+        curves = np.einsum("mf,mfs->ms", weights, self.curves[frames])
+        turned = np.einsum("ms,mkt->mkst", curves, slope[:, :, 1:]).reshape(*slope.shape[:2], -1)
+        shared = np.concatenate([self.common_columns, self.slow_columns])
+        both = np.concatenate([slope @ errors.per_mm_slope * along[:, None, None], turned], axis=2)
+        return (*parts, (np.broadcast_to(shared, (len(frames), shared.size)), both))
 
     def _with_errors(self, poses: RigidTransform, errors: ImageErrors) -> Block:
         first, second = self.edges.first, self.edges.second
@@ -322,13 +332,13 @@ class ImageEvidence:
         on_path = slope * np.where(self.returns, 0.0, 1.0)[:, None, None]
         of_return = slope @ errors.per_mm_slope * (apart * self.returns)[:, None, None]
         common = np.broadcast_to(self.common_columns, (len(self.edges), 3))
+        ends = np.column_stack([first, second])
         return Block(
             np.einsum("eij,ej->ei", w, error),
             (
                 (pose_columns(first), -w @ adjoint(relative.inv())),
                 (pose_columns(second), w),
-                *self.distortion_parts(second, errors, on_path),
-                *self.distortion_parts(first, errors, -on_path),
+                *self.distortion_parts(ends, np.tile([-1.0, 1.0], (len(ends), 1)), errors, on_path),
                 (common, of_return),
             ),
         ).weighted(self._doubtful(error))

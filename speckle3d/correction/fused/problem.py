@@ -25,8 +25,8 @@ class Block:
     residual : ndarray, shape (m, k)
         m groups of k equations.
     parts : tuple of (ndarray, ndarray)
-        Columns, shape (m, c), and derivatives of the residual by them, shape (m, k, c). A column below zero is
-        of a variable that is fixed.
+        Columns, shape (m, c), and derivatives of the residual by them, shape (m, k, c). A column below zero
+        is of a variable that is fixed.
     """
 
     residual: FloatArray
@@ -38,18 +38,34 @@ class Block:
         parts = tuple((columns, slope * root[:, None, None]) for columns, slope in self.parts)
         return Block(self.residual * root[:, None], parts)
 
-    def jacobian(self, size: int) -> sparse.csr_matrix:
-        """Derivatives by all variables, shape (m k, size)."""
+    def entries(self, first_row: int = 0) -> tuple[IntArray, IntArray, FloatArray]:
+        """Rows, columns and values of the derivatives."""
         m, k = self.residual.shape
-        row = np.arange(m * k).reshape(m, k, 1)
+        row = first_row + np.arange(m * k).reshape(m, k, 1)
         rows, columns, values = [], [], []
         for column, slope in self.parts:
             there = np.broadcast_to(column[:, None, :] >= 0, slope.shape)
             rows.append(np.broadcast_to(row, slope.shape)[there])
             columns.append(np.broadcast_to(column[:, None, :], slope.shape)[there])
             values.append(slope[there])
-        at = (np.concatenate(rows), np.concatenate(columns))
-        return sparse.csr_matrix((np.concatenate(values), at), shape=(m * k, size))
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    def jacobian(self, size: int) -> sparse.csr_matrix:
+        """Derivatives by all variables, shape (m k, size)."""
+        return stacked([self], size)
+
+    @property
+    def own_log_determinant(self) -> float:
+        """Of equations that have one variable each beside earlier ones', which the first part is of."""
+        return float(np.log(np.abs(np.diagonal(self.parts[0][1], axis1=1, axis2=2))).sum())
+
+
+def stacked(blocks: Sequence[Block], size: int) -> sparse.csr_matrix:
+    """Derivatives of the equations of all blocks, in order."""
+    starts = np.cumsum([0, *(block.residual.size for block in blocks)])
+    entries = [block.entries(int(start)) for block, start in zip(blocks, starts[:-1], strict=True)]
+    rows, columns, values = (np.concatenate(each) for each in zip(*entries, strict=True))
+    return sparse.csr_matrix((values, (rows, columns)), shape=(int(starts[-1]), size))
 
 
 @dataclass(frozen=True)
@@ -63,7 +79,7 @@ class Normal:
     @classmethod
     def of(cls, blocks: Sequence[Block], size: int) -> Normal:
         """Normal equations of all of `blocks`."""
-        jacobian = sparse.vstack([block.jacobian(size) for block in blocks], format="csr")
+        jacobian = stacked(blocks, size)
         residual = np.concatenate([block.residual.ravel() for block in blocks])
         matrix = (jacobian.T @ jacobian + DAMPING * sparse.identity(size)).tocsc()
         return cls(matrix, np.asarray(jacobian.T @ residual), float(residual @ residual))
@@ -93,15 +109,21 @@ def evidence(matrix: FloatArray, gradient: FloatArray, prior: Sequence[Block], f
     matrix, gradient : ndarray, shape (p, p) and (p,)
         Normal equations of the last p variables without the priors.
     prior : sequence of Block
-        Together as many equations as there are variables in them.
+        With as many equations as there are variables in them; see `Block.own_log_determinant`.
     first : int
         Column of the first of the p variables.
     """
-    size = first + gradient.size
-    jacobian = sparse.vstack([block.jacobian(size) for block in prior], format="csc")[:, first:]
-    residual = np.concatenate([block.residual.ravel() for block in prior])
-    root = np.linalg.cholesky(matrix + (jacobian.T @ jacobian).toarray())
-    pulled = solve_triangular(root, gradient + jacobian.T @ residual, lower=True)
-    own = splu(jacobian[:, np.flatnonzero(np.diff(jacobian.indptr))])
-    of_prior = np.log(np.abs(own.L.diagonal() * own.U.diagonal())).sum()
-    return float(0.5 * (pulled @ pulled - residual @ residual) - np.log(np.diag(root)).sum() + of_prior)
+    full, pull, cost, of_prior = matrix.copy(), gradient.copy(), 0.0, 0.0
+    for block in prior:
+        rows, columns, values = block.entries()
+        own, place = np.unique(columns, return_inverse=True)
+        jacobian = np.zeros((block.residual.size, own.size))
+        np.add.at(jacobian, (rows, place), values)
+        residual = block.residual.ravel()
+        full[np.ix_(own - first, own - first)] += jacobian.T @ jacobian
+        pull[own - first] += jacobian.T @ residual
+        cost += float(residual @ residual)
+        of_prior += block.own_log_determinant
+    root = np.linalg.cholesky(full)
+    pulled = solve_triangular(root, pull, lower=True, check_finite=False)
+    return float(0.5 * (pulled @ pulled - cost) - np.log(np.diag(root)).sum() + of_prior)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation, Slerp
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.geometry import adjoint
@@ -84,14 +84,15 @@ class SensorEvidence:
         As doubts name it.
     components : int
         3 for rotations, 6 for poses.
-    frame : ndarray of int, shape (m,)
-        Frame nearest to each reading.
-    offset : RigidTransform, length m
-        ``frame_from_reading``: how the images moved between the two, then the mounting.
+    before : ndarray of int, shape (m,)
+        Frame before each reading.
+    share : ndarray, shape (m,)
+        Of the way to the next frame.
+    centre_from_sensor : RigidTransform
     measured : RigidTransform, length m
         ``world_from_sensor`` as read.
-    velocity : ndarray, shape (n, 6)
-        Of every frame by the images, as a twist per second.
+    velocity : ndarray, shape (m, 6)
+        Of the image at each reading by the images, as a twist per second.
     time_s : ndarray, shape (m,)
         On the frames' clock.
     limits : SensorLimits
@@ -103,8 +104,9 @@ class SensorEvidence:
 
     name: str
     components: int
-    frame: IntArray
-    offset: RigidTransform
+    before: IntArray
+    share: FloatArray
+    centre_from_sensor: RigidTransform
     measured: RigidTransform
     velocity: FloatArray
     time_s: FloatArray
@@ -132,30 +134,40 @@ class SensorEvidence:
 
     def start(self, poses: RigidTransform) -> SensorState:
         """A state near the best: the world that fits most readings."""
-        world = self.measured * (poses[self.frame] * self.offset).inv()
+        mounted = self.between(poses) * self.centre_from_sensor
+        world = self.measured * mounted.inv()
         turn = world.rotation.mean()
         for _ in range(3):
             apart = (turn.inv() * world.rotation).magnitude()
             turn = world.rotation.mean(weights=1.0 / np.maximum(apart, 1e-3 + np.median(apart)))
-        seen = turn.apply((poses[self.frame] * self.offset).translation)
+        seen = turn.apply(mounted.translation)
         place = np.median(self.measured.translation - seen, axis=0)
         c = self.components
         found = RigidTransform.from_components(place, turn)
         return SensorState(found, np.zeros(c), 0.0, 0.0, np.zeros((self.knots_s.size, c)))
 
+    def between(self, poses: RigidTransform) -> RigidTransform:
+        """Poses at the times of the readings, between those of the frames."""
+        first = poses[self.before]
+        step = (first.inv() * poses[self.before + 1]).as_exp_coords()
+        return first * RigidTransform.from_exp_coords(step * self.share[:, None])
+
     def residuals(self, poses: RigidTransform, state: SensorState) -> tuple[FloatArray, RigidTransform]:
         """Twist from where a reading should be to where it is, shape (m, c), and where it should be."""
         c = self.components
-        turn = np.zeros((1, 6))
-        turn[0, :c] = state.mounting
-        late = RigidTransform.from_exp_coords(self.velocity[self.frame] * state.late_s)
-        expected = state.world * poses[self.frame] * late * self.offset * RigidTransform.from_exp_coords(turn)
+        late = RigidTransform.from_exp_coords(self.velocity * state.late_s)
+        expected = state.world * self.between(poses) * late * self._mounted(state)
         error = (expected.inv() * self.measured).as_exp_coords()[:, :c]
         if c == 6:
             place = expected.translation
             out = expected.rotation.inv().apply(place - place.mean(axis=0))
             error[:, 3:] -= state.stretch * out
         return error - self._wandered(expected, state), expected
+
+    def _mounted(self, state: SensorState) -> RigidTransform:
+        turn = np.zeros((1, 6))
+        turn[0, : self.components] = state.mounting
+        return self.centre_from_sensor * RigidTransform.from_exp_coords(turn)
 
     def _wandered(self, expected: RigidTransform, state: SensorState) -> FloatArray:
         wander = self._between(state.wander)
@@ -179,12 +191,10 @@ class SensorEvidence:
         c = self.components
         error, expected = self.residuals(poses, state)
         sigma = np.repeat(self.jitter, 3)[:c]
-        turn = np.zeros((1, 6))
-        turn[0, :c] = state.mounting
-        sensor_from_frame = adjoint((self.offset * RigidTransform.from_exp_coords(turn)).inv())
-        to_pose = -sensor_from_frame[:, :c]
+        carried = adjoint(self._mounted(state).inv())[:, :c]
+        to_pose = -np.broadcast_to(carried, (len(error), c, 6))
         to_world = -adjoint((state.world.inv() * expected).inv())[:, :c, :c]
-        to_clock = to_pose @ self.velocity[self.frame][:, :, None]
+        to_clock = to_pose @ self.velocity[:, :, None]
         to_stretch = np.zeros((len(error), c, 1))
         if c == 6:
             place = expected.translation
@@ -195,7 +205,8 @@ class SensorEvidence:
         before, share = self._knot
         own = self.first + np.arange(2 * c + 2)
         parts = (
-            (pose_columns(self.frame), to_pose),
+            (pose_columns(self.before), to_pose * (1 - self.share)[:, None, None]),
+            (pose_columns(self.before + 1), to_pose * self.share[:, None, None]),
             (
                 np.broadcast_to(own, (len(error), own.size)),
                 np.concatenate(
@@ -270,7 +281,8 @@ def read_sensor(
     if mounting is None or inside.sum() < FEWEST_READINGS:
         return None
     time_s = time_s[inside]
-    nearest = np.searchsorted((frame_time_s[1:] + frame_time_s[:-1]) / 2, time_s)
+    before = np.clip(np.searchsorted(frame_time_s, time_s, "right") - 1, 0, len(start) - 2)
+    pause = np.diff(frame_time_s)[before]
     centre = RigidTransform.from_translation(centre_mm)
     samples = sensor.readings.world_from_sensor[np.flatnonzero(inside)]
     if isinstance(mounting, Rotation):
@@ -279,14 +291,14 @@ def read_sensor(
         samples = RigidTransform.from_rotation(samples)
     components = 6 if isinstance(sensor, Tracker) else 3
     centre_from_sensor = centre.inv() * mounting.inv() if components == 6 else mounting.inv()
-    between = start[nearest].inv() * _interpolated(start, frame_time_s, time_s)
     evidence = SensorEvidence(
         name,
         components,
-        nearest,
-        between * centre_from_sensor,
+        before,
+        (time_s - frame_time_s[before]) / pause,
+        centre_from_sensor,
         samples,
-        _velocity(start, frame_time_s),
+        (start[before].inv() * start[before + 1]).as_exp_coords() / pause[:, None],
         time_s,
         limits,
         np.ones(2),
@@ -300,16 +312,3 @@ def _jitter(error: FloatArray) -> FloatArray:
     bent = (error[2:] - 2.0 * error[1:-1] + error[:-2]) / np.sqrt(6.0)
     place = robust_sigma(bent[:, 3:], LEAST_JITTER_MM) if error.shape[1] == 6 else 1.0
     return np.array([robust_sigma(bent[:, :3], LEAST_JITTER_RAD), place])
-
-
-def _interpolated(poses: RigidTransform, at_s: FloatArray, time_s: FloatArray) -> RigidTransform:
-    place = np.stack([np.interp(time_s, at_s, column) for column in poses.translation.T], axis=-1)
-    return RigidTransform.from_components(place, Slerp(at_s, poses.rotation)(time_s))
-
-
-def _velocity(poses: RigidTransform, time_s: FloatArray) -> FloatArray:
-    """Twist per second of every frame, from its neighbours, shape (n, 6)."""
-    n = len(poses)
-    before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
-    twist = (poses[before].inv() * poses[after]).as_exp_coords()
-    return np.asarray(twist / (time_s[after] - time_s[before])[:, None])

@@ -15,7 +15,7 @@ WANDER = (0.05, 0.25, 0.5, 1.0, 2.0, 4.0)
 WANDER_TIMES_S = (1.0, 5.0, 20.0)
 STEADY = 0.5
 """Probability, before anything is measured, that a tracker does not wander."""
-FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+FACTORS = (0.25, 0.5, 1.0, 2.0)
 """Sizes tried of an orientation sensor's wandering error over the expected."""
 FACTOR_SPREAD = 0.5
 """Standard deviation of the logarithm of that factor among sensors: twice, or half."""
@@ -50,7 +50,7 @@ class Grid:
     prior: FloatArray
 
     def mean(self, likelihood: FloatArray) -> Sizes:
-        """Geometric means, given logarithms of the likelihoods of the alternatives."""
+        """Means given logarithms of likelihoods: geometric of factors, of wander that of its square."""
         weight = self.prior * np.exp(likelihood - likelihood.max())
         weight /= weight.sum()
 
@@ -62,7 +62,7 @@ class Grid:
         )
         wander = tuple(
             Wander(
-                of([each.wander[k].sigma for each in self.sizes]),
+                np.sqrt(weight @ np.square([each.wander[k].sigma for each in self.sizes])),
                 float(np.exp(weight @ np.log([each.wander[k].time_s for each in self.sizes]))),
             )
             for k in range(len(self.sizes[0].wander))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
+from scipy.sparse.linalg import SuperLU
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
@@ -26,15 +27,15 @@ from speckle3d.correction.fused.sizes import (
 from speckle3d.correction.scale import ScaleEvidence
 
 ROUNDS = 15
-SIZED = (1, 3)
-"""Rounds after which sizes of errors are found."""
-SETTLED = 1e-5
-"""Step, mm and rad, at which the iteration ends."""
+SIZED = 3
+"""Rounds before sizes of errors are found."""
+SETTLED = 1e-4
+"""Step, mm and rad, at which the iteration ends: a hundredth of what poses are known to."""
 KNOWN_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
 LOOSENED = 3.0
-"""Factor of the scale that the images' steps may all have wrong while other errors are sized: a sensor that is
-right about a wrong scale does not wander."""
+"""Factor of the scale that the images' steps may all have wrong while other errors are sized: a sensor that
+is right about a wrong scale does not wander."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,17 @@ class Solution:
     sizes: Sizes
     images: ImageEvidence
 
+    @cached_property
+    def factor(self) -> SuperLU:
+        """Factors of the normal matrix."""
+        return self.normal.factor()
+
     def covariance(self, frames: IntArray) -> FloatArray:
         """Covariance of some frames' poses along the first frame's axes, all with all, (6 f, 6 f)."""
-        factor = self.normal.factor()
         columns = pose_columns(frames).ravel()
         unit = np.zeros((self.normal.matrix.shape[0], columns.size))
         unit[columns, np.arange(columns.size)] = 1.0
-        solved = factor.solve(unit)[columns]
+        solved = self.factor.solve(unit)[columns]
         turn = np.zeros((columns.size, columns.size))
         for k, rotation in enumerate(self.state.poses[frames].rotation.as_matrix()):
             # Translation before rotation, and along the first frame's axes.
@@ -134,6 +139,12 @@ class Problem:
         """Number of variables."""
         return self.images.size + sum(sensor.size for sensor in self.sensors)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What takes part."""
+        others = (*(sensor.name for sensor in self.sensors), *(each.source for each in self.evidence))
+        return ("images", *others)
+
     def start(self) -> State:
         """The images' own poses."""
         poses = self.images.start
@@ -148,18 +159,27 @@ class Problem:
         return Sizes(ErrorSize(np.ones(3), np.ones(3)), tuple(wander))
 
     def solve(self) -> tuple[Solution, Problem]:
-        """Gauss-Newton, and between its rounds the sizes of errors; and the problem with jitters as found."""
+        """The best state, with sizes of errors as found; and the problem with jitters as found."""
         problem, state, sizes = self, self.start(), self.expected_sizes()
-        for number in range(ROUNDS):
-            normal = problem.normal(state, sizes)
-            step = -normal.factor().solve(normal.gradient)
-            state = state.moved(step, self.sensors)
-            if number in SIZED and self.sensors:
-                problem = problem._with_jitter(state)
-                sizes = problem._sizes(state)
-            elif np.abs(step[: 6 * (len(self.images) - 1)]).max() < SETTLED and number > max(SIZED):
+        if self.sensors:
+            state = self.settled(state, sizes, SIZED).state
+            problem = self._with_jitter(state)
+            sizes = problem._sizes(state)
+        return problem.settled(state, sizes), problem
+
+    def settled(self, state: State, sizes: Sizes, rounds: int = ROUNDS) -> Solution:
+        """Gauss-Newton to the end, or for some rounds."""
+        for _ in range(rounds):
+            state, moved = self._stepped(state, sizes)
+            if moved < SETTLED:
                 break
-        return Solution(state, problem.normal(state, sizes), sizes, self.images), problem
+        return Solution(state, self.normal(state, sizes), sizes, self.images)
+
+    def _stepped(self, state: State, sizes: Sizes) -> tuple[State, float]:
+        """The state after one round, and the largest change of a pose, mm or rad."""
+        normal = self.normal(state, sizes)
+        step = -normal.factor().solve(normal.gradient)
+        return state.moved(step, self.sensors), float(np.abs(step[: 6 * (len(self.images) - 1)]).max())
 
     def normal(self, state: State, sizes: Sizes) -> Normal:
         """Normal equations of all there is."""
@@ -189,8 +209,7 @@ class Problem:
         root = np.sqrt(np.maximum(size, 0.0))[:, None] * axes.T
         error = np.array([np.log(scale), *mean[1:] / scale]) - evidence.values
         slope = root @ np.eye(3) / scale / self.images.path_mm
-        each = self.images.distortion_parts(frames, state.errors, weight[:, None, None] * slope)
-        parts = tuple((columns[[k]], slopes[[k]]) for columns, slopes in each for k in range(frames.size))
+        parts = self.images.distortion_parts(frames[None], weight[None], state.errors, slope[None])
         return Block((root @ error)[None], parts)
 
     def _with_jitter(self, state: State) -> Problem:

@@ -1,0 +1,96 @@
+"""Length, turns and refusals of crossing sweeps over simulated tissue."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from crossing_tissue import GRID, PairCase, made_pair
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.correction.crossing.pair import crossed
+from speckle3d.correction.crossing.stack import ImageStack
+from speckle3d.correction.crossing.sweep import CrossingSweep
+
+
+@cache
+def made(**case):
+    return made_pair(PairCase(**case))
+
+
+def errors(poses, truth):
+    """Of length in per cent, and of tilt from the first frame to the last in degrees."""
+    ends = [p.apply(GRID.centre_mm) for p in (poses, truth)]
+    length = [np.linalg.norm(e[-1] - e[0]) for e in ends]
+    turns = [(p[0].inv() * p[-1]).rotation for p in (poses, truth)]
+    return 100 * np.log(length[0] / length[1]), np.rad2deg((turns[1].inv() * turns[0]).as_rotvec())[0]
+
+
+@pytest.mark.slow
+def test_finds_lengths_that_were_a_fifth_wrong():
+    pair = made(seed=4)
+    before = [errors(s.poses, t)[0] for s, t in zip((pair.first, pair.second), pair.truth, strict=True)]
+    assert min(before) > 10
+    found = crossed(pair.first, pair.second)
+    for side, truth in zip((found.first, found.second), pair.truth, strict=True):
+        length, tilt = errors(side.poses, truth)
+        # Targets of 90th percentiles over many pairs.
+        assert abs(length) < 2.0
+        assert abs(tilt) < 1.0
+        assert abs(length) < 3 * 100 * side.log_scale_sigma
+    assert found.mirrored == (False, False)
+    expected = pair.truth[0][0].inv() * pair.truth[1][0]
+    away = expected.inv() * found.first_from_second
+    # 24 mm of sweep at 2 per cent, and what false turns move its first frame by.
+    assert np.linalg.norm(away.apply(GRID.centre_mm) - GRID.centre_mm) < 1.0
+
+
+@pytest.mark.slow
+def test_finds_which_sweep_went_the_other_way():
+    pair = made(seed=381, mirrored=True)
+    found = crossed(pair.first, pair.second)
+    assert found.mirrored == (False, True)
+    assert abs(errors(found.second.poses, pair.truth[1])[0]) < 2.0
+
+
+@pytest.mark.slow
+def test_a_sensor_tells_the_turns():
+    pair = made(seed=5, sensed=True)
+    found = crossed(pair.first, pair.second)
+    for side, truth in zip((found.first, found.second), pair.truth, strict=True):
+        length, tilt = errors(side.poses, truth)
+        assert abs(length) < 2.0
+        # The sensor's own inclination wanders by 0.15 degrees at either end.
+        assert abs(tilt) < 0.6
+
+
+@pytest.mark.slow
+def test_refuses_other_tissue():
+    one, other = made(seed=4), made(seed=5, sensed=True)
+    with pytest.raises((MismatchError, InsufficientDataError), match="first and second: expected"):
+        crossed(one.first, replace(other.second, sensed=None))
+
+
+@pytest.mark.slow
+def test_refuses_a_narrow_angle():
+    pair = made(seed=421, angle_deg=18.0)
+    with pytest.raises(InsufficientDataError, match="turn the probe by 90 degrees"):
+        crossed(pair.first, pair.second)
+
+
+@pytest.mark.slow
+def test_refuses_short_sweeps():
+    pair = made(seed=360, length_mm=12.0, frames=80)
+    with pytest.raises(InsufficientDataError, match="longer sweeps"):
+        crossed(pair.first, pair.second)
+
+
+def test_refuses_a_sweep_that_stands_still():
+    stack = ImageStack(GRID)
+    for index in range(20):
+        stack.keep(index, np.ones((GRID.vectors, GRID.samples), np.float32))
+    poses = RigidTransform.from_translation(np.outer(np.linspace(0, 1, 20), [0.0, 0.0, 1.0]))
+    sweep = CrossingSweep("still", stack, poses, GRID.centre_mm, 0.1, 1e-3)
+    with pytest.raises(InsufficientDataError, match="still: expected a sweep along"):
+        crossed(sweep, sweep)

@@ -1,0 +1,37 @@
+"""Reduced images of a sweep."""
+
+import numpy as np
+import pytest
+
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.correction.crossing.stack import ImageStack
+
+GRID = ImageGrid(8, 64, 0.3, 0.0115, 0.5)
+
+
+def test_pools_intensity_before_the_logarithm():
+    stack = ImageStack(GRID)
+    intensity = np.random.default_rng(1).exponential(size=(8, 64)).astype(np.float32)
+    stack.keep(0, intensity)
+    expected = 10 * np.log10(intensity[:, :60].reshape(8, 2, 30).mean(axis=2))
+    # float16 has 11 bits: steps of 0.016 dB at 20 dB.
+    np.testing.assert_allclose(stack.images(1)[0], expected, atol=0.016)
+    assert stack.grid.sample_spacing_mm == pytest.approx(30 * 0.0115)
+    assert stack.grid.first_sample_depth_mm == pytest.approx(0.5 + 14.5 * 0.0115)
+
+
+def test_pools_narrow_vectors():
+    stack = ImageStack(ImageGrid(9, 64, 0.15, 0.35))
+    assert (stack.grid.vectors, stack.grid.vector_pitch_mm) == (4, pytest.approx(0.3))
+    assert stack.left_mm == pytest.approx(0.075)
+
+
+def test_names_a_frame_that_was_not_kept():
+    stack, other = ImageStack(GRID), ImageStack(GRID)
+    for index in (0, 1, 3):
+        stack.keep(index, np.ones((8, 64), np.float32))
+    other.take(0, stack.kept(0, 2))
+    assert len(other) == 2
+    with pytest.raises(InsufficientDataError, match="frame 2"):
+        stack.images(4)
