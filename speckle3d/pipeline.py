@@ -336,8 +336,7 @@ def _measured(
 ) -> tuple[list[SignedPair], Coherence | None, FloatArray]:
     """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
 
-    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn; once
-    from a path that is known already.
+    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
     """
     sound = _sound(table, flags)
     path = known
@@ -348,7 +347,7 @@ def _measured(
         with times.of(PLANES):
             pairs = reader.measure(table, path, sound, None)
         return pairs, None, reader.path(table, pairs, None)
-    for known_scale in (False, True) if known is None else (True,):
+    for known_scale in (False, True):
         with times.of("coherence"):
             coherence, path = reader.coherence(table, path, sound, config.coherence, known_scale)
         with times.of(PLANES):

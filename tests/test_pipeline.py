@@ -12,11 +12,12 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor
+from speckle3d.corrections import correct
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_rotations
 from speckle3d.motion.plausibility import MOST_FRAMES
-from speckle3d.pipeline import correct, track
+from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes
 
 

@@ -20,8 +20,8 @@ Origin = Literal["phantom", "tracked", "data sheet", "crossing"]
 """What curves' distances come from: exact steps, a tracker, diffraction, or a sweep that crosses another."""
 STRUCTURE_SIGMA = 0.022
 """Relative error of all distances, standard deviation, from structure in tissue that the adaptation to
-coherent echoes leaves: simulated muscle full of fibres reads 5.5 % shorter than a phantom. Tissue that is read
-and tissue that curves come from lie anywhere between."""
+coherent echoes leaves: simulated muscle full of fibres reads 5.5 % shorter than a phantom; tissue that is
+read and tissue that curves come from lie anywhere between."""
 TISSUE_SIGMA = 0.027
 """`STRUCTURE_SIGMA`, and what tissue does that attenuates otherwise than what the curves were measured in:
 0.3 dB/cm/MHz more make 2.3 to 3.4 % on simulated sweeps, and soft tissues differ by 0.15."""

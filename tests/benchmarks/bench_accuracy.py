@@ -32,10 +32,11 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep
+from speckle3d.corrections import correct
 from speckle3d.io.load import load_sweep
 from speckle3d.motion.direction import settle_direction
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.pipeline import correct, track
+from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import accumulated, compare_modes
 from speckle3d.simulation.presets import SimulationSettings
 

@@ -23,12 +23,13 @@ from scipy.signal import correlate
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.corrections import correct
 from speckle3d.io.curves import write_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.kernels.correlation import patch_correlations
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.pipeline import correct, track
+from speckle3d.pipeline import track
 from speckle3d.simulation.presets import SimulationSettings
 
 SWEEP = SimulationSettings(preset="phantom", seed=2001, length_mm=7.5, frames=60)

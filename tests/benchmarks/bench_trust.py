@@ -40,10 +40,11 @@ from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.sweep import Sweep
+from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.blocks import Block, MatchedBlock, blocks_of
-from speckle3d.pipeline import Tracked, correct, match_ahead, track
+from speckle3d.pipeline import Tracked, match_ahead, track
 from speckle3d.scoring.lengths import compare_modes
 
 SHIPPED = CURVES.parent / "phantom.h5"

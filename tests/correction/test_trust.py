@@ -8,8 +8,8 @@ from rare_faults import RARE
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError
 from speckle3d.correction.trust import believed, cleaned_readings, examine_sensors, without_sensors
+from speckle3d.corrections import correct
 from speckle3d.motion.direction import settle_direction
-from speckle3d.pipeline import correct
 
 LENGTH_SIGMA = 0.0085
 """Claimed of the shipped sweep's length."""

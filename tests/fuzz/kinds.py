@@ -243,9 +243,10 @@ def read_stream(path):
 def run_track(path):
     """Track a sweep and correct it by each of its sensors; the other file of the two is whole."""
     from speckle3d.core.errors import Speckle3DError
+    from speckle3d.corrections import correct
     from speckle3d.io.curves import read_curves
     from speckle3d.io.load import load_sweep
-    from speckle3d.pipeline import correct, track
+    from speckle3d.pipeline import track
 
     beside = path.with_name("curves.h5" if path.name == "s.h5" else "s.h5")
     sweep_path, curves_path = (path, beside) if path.name == "s.h5" else (beside, path)

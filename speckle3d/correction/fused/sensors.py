@@ -255,9 +255,13 @@ class SensorEvidence:
 
 
 def outlier_weights(whitened: FloatArray) -> FloatArray:
-    """One up to `OUTLYING`, beyond it falling so fast that an outlier's pull vanishes."""
+    """One up to `OUTLYING`, beyond it falling so fast that an outlier's pull vanishes.
+
+    Over the median where that is above one: while poses are still far off, no reading is wilder than others.
+    """
     size = np.sqrt((whitened**2).mean(axis=1))
-    return np.asarray(np.minimum(1.0, (OUTLYING / np.maximum(size, OUTLYING)) ** 2))
+    limit = OUTLYING * max(1.0, float(np.median(size)))
+    return np.asarray((limit / np.maximum(size, limit)) ** 4)
 
 
 def read_sensor(

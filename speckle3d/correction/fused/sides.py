@@ -20,6 +20,8 @@ from speckle3d.correction.fused.sensors import SensorEvidence
 
 BEYOND_DOUBT = 12.0
 """Logarithm of the likelihood ratio from which a stretch is turned over: about five deviations."""
+WILD = 3.0
+"""Deviations beyond which a reading tells neither side."""
 FAR_FRAMES = 10
 """Edges over so many more frames than most are between visits of one place."""
 ROUNDS = 6
@@ -92,7 +94,9 @@ def _ratios(edges: RelativePoses, tracker: SensorEvidence, frames: int) -> Float
     ratio = np.zeros(len(edges))
     # Edges of one frame share its reading, so that each counts for less.
     shared = np.bincount(edges.second, minlength=frames)[edges.second[both]]
-    ratio[both] = 2.0 * z * sensed / (2.0 * jitter**2 + variance) / np.maximum(shared, 1)
+    sigma = np.sqrt(2.0 * jitter**2 + variance)
+    off, other = (np.minimum(np.abs(sensed - side * z) / sigma, WILD) for side in (1.0, -1.0))
+    ratio[both] = (other**2 - off**2) / 2.0 / np.maximum(shared, 1)
     return ratio
 
 

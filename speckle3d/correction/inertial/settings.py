@@ -40,7 +40,10 @@ class InertialSettings(BaseModel):
         0.02, gt=0, description="Relative standard deviation of the length up to which it is fully trusted."
     )
     largest_sigma: float = Field(
-        0.05, gt=0, description="Relative standard deviation of the length above which it is refused."
+        0.035,
+        gt=0,
+        description="Relative standard deviation of the length above which it is refused: of weak motions, "
+        "claims beyond it were too small.",
     )
     knot_hz: float = Field(60.0, ge=20, le=200, description="Knots of the motion's splines per second.")
     orientation_sigma_deg: float = Field(

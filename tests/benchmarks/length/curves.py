@@ -108,7 +108,7 @@ def _sheets(scans: Sequence[Scan]) -> list[Row]:
 def _corrected(
     name: str, curves: DecorrelationCurves, scans: Sequence[Scan], rng: np.random.Generator
 ) -> list[Row]:
-    """Curves corrected by one sweep, read on the next: length known as a crossing knows it, and by tracker."""
+    """Curves corrected by one sweep, its length known as by a crossing or by tracker, read on the next."""
     found = [scan.read(curves) for scan in scans]
     known = [
         -np.log1p(s.off(t)) + CROSSING_SIGMA * rng.standard_normal()

@@ -5,12 +5,14 @@ import pytest
 from fused_scenes import CENTRE_MM, errors, scene
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.relative import RelativePoses
 from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse, images, sensors
 from speckle3d.correction.fused.fuse import FusedSettings, _sensors
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.solution import Problem
 from speckle3d.correction.scale import ScaleEvidence
+from speckle3d.motion.trajectory import joined
 from speckle3d.simulation.movement import HandMotion
 from speckle3d.simulation.sensors import TrackerModel
 
@@ -34,7 +36,7 @@ def scaled(tracker, factor):
 
 
 def test_without_sensors_the_images_length_and_claim_remain():
-    made = scene(1, frames=20, length_mm=2.0)
+    made = scene(1, frames=16, length_mm=2.0)
     found = fuse(*made.given())
     own = np.sqrt(made.covariance[-1, 2, 2])
     # A third of the claim: edges that share a changing scale are weighed a little otherwise.
@@ -44,7 +46,7 @@ def test_without_sensors_the_images_length_and_claim_remain():
 
 
 def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim():
-    made = scene(2, frames=20, length_mm=2.0, scale_sigma=0.05)
+    made = scene(2, frames=16, length_mm=2.0, scale_sigma=0.05)
     told = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
     alone, found = fuse(*made.given()), fuse(*made.given(), evidence=[told])
     # Variances of the mean scale before: common and changing parts; after: the evidence's own, nearly.
@@ -54,6 +56,7 @@ def test_evidence_of_the_scale_counts_by_its_information_against_the_images_clai
     assert found.used == ("images", "crossing")
 
 
+@pytest.mark.slow
 def test_a_tracker_that_sees_one_and_a_half_times_the_distance_is_named_and_allowed_for():
     made = scene(3, frames=40, length_mm=4.0, scale_sigma=0.02)
     honest, found = (fuse(*made.given(), tracker=scaled(made.tracker, k)) for k in (1.0, 1.5))
@@ -86,18 +89,29 @@ def test_derivatives_of_all_equations_match_differences(monkeypatch):
         )
 
 
-def test_forward_and_back_are_tied_and_the_common_scale_is_said_to_be_unknown():
-    made = scene(5, frames=50, length_mm=3.0, motion=HandMotion(reverse=True))
-    alone, tracked = fuse(*made.given()), fuse(*made.given(), tracker=made.tracker)
-    # Edges between the two visits are not among these, so nothing ties the directions.
+def test_directions_are_called_tied_only_where_visits_are_joined():
+    made = scene(5, frames=24, length_mm=2.0, motion=HandMotion(reverse=True, pauses=0))
+    z = made.image.apply(CENTRE_MM)[:, 2]
+    apart = [(i, j) for i in range(5) for j in range(18, 24) if abs(z[i] - z[j]) < 0.5]
+    first, second = np.array(apart).T
+    local = RigidTransform.from_translation(CENTRE_MM)
+    about = local.inv() * (made.truth[0].inv() * made.truth) * local
+    tie = RelativePoses(
+        first,
+        second,
+        about[first].inv() * about[second],
+        np.tile(made.edges.covariance[0], (first.size, 1, 1)),
+    )
+    alone, tied = fuse(*made.given()), fuse(joined(made.edges, tie), *made.given()[1:])
     assert "directions" not in alone.details
-    assert tracked.used == ("images", "tracker")
+    assert "unknown beyond what the images claim" in str(tied.details["directions"])
+    assert abs(float(tied.details["direction_ratio"]) - 1.0) < 0.1
 
 
 @pytest.mark.slow
 def test_short_sweeps_with_a_tracker_are_longer_right_than_by_images_or_tracker_alone():
     by = {"images": [], "tracker": [], "fused": []}
-    for seed in range(100, 116):
+    for seed in range(100, 110):
         made = scene(seed)
         true = path_mm(made.truth)
         sensed = made.tracker.world_from_image(made.time_s)
@@ -116,15 +130,15 @@ def test_short_sweeps_with_a_tracker_are_longer_right_than_by_images_or_tracker_
 @pytest.mark.slow
 def test_claims_hold_with_both_sensors():
     inside = []
-    for seed in range(200, 216):
+    for seed in range(200, 210):
         made = scene(seed)
         found = fuse(*made.given(), made.orientation, made.tracker)
         assert not found.contradictions
         inside.append(np.abs(errors(found.poses, made.truth)) / np.sqrt(np.diag(found.covariance[-1])))
     within = np.array(inside)
-    # Of 96 in all: 68 and 95 %, with three deviations of counting.
-    assert 0.54 < (within < 1.0).mean() < 0.95
-    assert (within < 1.96).mean() > 0.88
+    # Of 60 in all: 68 and 95 %, with three deviations of counting.
+    assert 0.5 < (within < 1.0).mean() < 0.95
+    assert (within < 1.96).mean() > 0.86
 
 
 @pytest.mark.slow

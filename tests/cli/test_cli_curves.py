@@ -1,0 +1,47 @@
+"""Curves from a data sheet on the command line, and what is wrong with it told in one line."""
+
+import pytest
+
+from speckle3d.io.curves import read_curves
+
+LENS = "elevation_aperture_mm = 5.0\nelevation_focus_mm = 20.0\n"
+SHEET = LENS + "band_mhz = [5.0, 10.0]\n"
+ALONE = SHEET + "sampling_rate_mhz = 40.0\nvector_pitch_mm = 0.3\ndepth_mm = 9.0\n"
+
+
+@pytest.fixture
+def sheet(tmp_path):
+    def write(text):
+        (tmp_path / "probe.toml").write_text(text)
+        return tmp_path / "probe.toml"
+
+    return write
+
+
+def test_a_data_sheet_makes_curves(run, sheet, tmp_path):
+    code, shown, _ = run("calibrate", "curves", "--probe", sheet(ALONE), "-o", tmp_path / "c.h5")
+    assert code == 0
+    found = read_curves(tmp_path / "c.h5")
+    assert (found.origin, found.key.vector_pitch_mm, found.nominal.focus_mm) == ("data sheet", 0.3, 20.0)
+    assert shown.startswith("calculated, not measured; correlation falls to one half at")
+    assert f"{100 * found.scale_sigma:.1f} % (1 sigma)" in shown
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (SHEET, "probe.toml: vector_pitch_mm: expected in the probe's settings, or a sweep, got none"),
+        (LENS, "probe.toml: band_mhz: Field required"),
+        (LENS + "band_mhz = [10.0, 5.0]", "probe.toml: band_mhz: Value error, expected 0.1 < low < high"),
+        (SHEET + "focus_tolerance = 2.0", "probe.toml: focus_tolerance: Input should be less than 0.5"),
+        (SHEET + "lens = 3", "probe.toml: lens: Extra inputs are not permitted"),
+        (SHEET + "[", "probe.toml: expected TOML, got an error"),
+    ],
+)
+def test_a_faulty_sheet_is_named_with_its_setting(refused, sheet, tmp_path, text, told):
+    assert told in refused("calibrate", "curves", "--probe", sheet(text), "-o", tmp_path / "c.h5")
+
+
+@pytest.mark.parametrize("arguments", [(), ("--like", "x.h5", "y.h5"), ("--probe", "p.toml", "y.h5")])
+def test_options_that_do_not_go_together_are_told(refused, tmp_path, arguments):
+    assert "expected" in refused("calibrate", "curves", *arguments, "-o", tmp_path / "c.h5")

@@ -1,0 +1,62 @@
+"""Curves from a sweep by hand whose tracker jitters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.streams import TimedPoses
+from speckle3d.motion.diffraction import half_distance
+from speckle3d.tracked_curves import jitters, tracked_curves, tracker_scale
+
+
+def shaken(sweep, jitter_mm, seed=3):
+    """The sweep whose tracker alone knows where it is, and that worse."""
+    readings = sweep.tracker.readings
+    poses = readings.world_from_sensor
+    off = jitter_mm * np.random.default_rng(seed).standard_normal((len(poses), 3))
+    moved = RigidTransform.from_components(poses.translation + off, poses.rotation)
+    tracker = replace(sweep.tracker, readings=TimedPoses(readings.time_s, moved))
+    return replace(sweep, truth=None, tracker=tracker)
+
+
+def test_the_length_is_the_trackers_and_its_error_grows_with_jitter(sweep, tracked):
+    true = sweep.truth[0].inv() * sweep.truth
+    z, seen = (abs(poses.apply(sweep.grid.centre_mm)[-1, 2]) for poses in (true, tracked.image))
+    scales = [tracker_scale(shaken(sweep, jitter), tracked) for jitter in (0.05, 0.3)]
+    for scale, sigma in scales:
+        assert abs(scale - np.log(z / seen)) < 3 * sigma
+    assert 0.005 < scales[0][1] < scales[1][1] < 0.03
+    with pytest.raises(InsufficientDataError, match="expected a length that the tracker knows to 3 %, got"):
+        tracker_scale(shaken(sweep, 2.0), tracked)
+
+
+def test_a_sweep_without_a_calibrated_tracker_is_named(sweep, tracked):
+    bare = replace(sweep, tracker=None)
+    with pytest.raises(InsufficientDataError, match=r"^phantom: expected a tracker that is calibrated"):
+        tracker_scale(bare, tracked)
+
+
+def test_a_stage_in_steps_does_not_jitter(sweep):
+    steps = RigidTransform.from_translation(np.arange(len(sweep))[:, None] * [0.0, 0.0, 0.05])
+    steps = steps * sweep.tracker.sensor_from_image.inv()
+    exact = replace(sweep.tracker, readings=TimedPoses(sweep.frame_time_s, steps), time_offset_s=0.0)
+    assert not jitters(replace(sweep, truth=None, tracker=exact))
+    assert not jitters(sweep)
+    assert jitters(replace(sweep, truth=None))
+
+
+@pytest.mark.slow
+def test_curves_of_a_tracked_phantom_are_those_of_steps(sweep, curves):
+    found = tracked_curves([shaken(sweep, 0.1)])
+    ratio = [
+        half_distance(found.distance_mm, a) / half_distance(curves.distance_mm, b)
+        for a, b in zip(found.correlation, curves.at(found.depth_mm).correlation, strict=True)
+    ]
+    # One sweep of 12 mm knows a depth to 0.03, and all together to 0.02: measured on others -0.03.
+    assert abs(np.mean(ratio) - 1) < 0.05
+    assert np.abs(np.array(ratio) - 1).max() < 0.12
+    assert found.origin == "tracked"
+    assert found.scale_sigma < 0.04
