@@ -22,7 +22,7 @@ PART_MM = 6.0
 
 _REACH_MM = 12.0
 """Over which the correlation of the displacement falls to 1 / e: a probe's contact is centimetres wide, and
-what it presses moves in one piece. From 8 to 20 mm what is said of lengths changes by a third."""
+what it presses moves in one piece. 8 or 20 mm change what is said of lengths by a fifth."""
 _SEEN = 1.5
 """What is there over what is found. Parts see shifts through images that are alike in part only, and the
 smoothest of it passes for place and turn: of 0.3, 0.6 and 1.0 mm rms 0.21, 0.31 and 0.41 mm were found (six

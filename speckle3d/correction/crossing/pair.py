@@ -222,10 +222,10 @@ class _Matched:
         if sigma > self.settings.largest_sigma:
             raise InsufficientDataError(
                 f"{names}: expected parts of the tissue to agree on the length to "
-                f"{100 * self.settings.largest_sigma:.1f} %, got {100 * sigma:.1f} %, with {moved:.2f} mm rms "
-                "of movement between the sweeps; sweep again over more texture, with less pressure"
+                f"{100 * self.settings.largest_sigma:.1f} %, got {100 * sigma:.1f} %, with {moved:.2f} mm "
+                "rms of movement between the sweeps; sweep again over more texture, with less pressure"
             )
-        scaled = [self._scaled(k, mirrored[k], end, whole) for k in (0, 1)]
+        scaled = [self._scaled(k, mirrored[k], end, whole, moved) for k in (0, 1)]
         to_world = [
             s.poses[0]
             * (self.sweeps[k][mirrored[k]].corrected(end.placing.bends[k])[0] * self._back(k)).inv()
@@ -260,7 +260,9 @@ class _Matched:
     def _back(self, which: int) -> RigidTransform:
         return RigidTransform.from_translation(-self.given[which].centre_mm)
 
-    def _scaled(self, which: int, flipped: bool, end: Refined, whole: FloatArray) -> ScaledPoses:
+    def _scaled(
+        self, which: int, flipped: bool, end: Refined, whole: FloatArray, moved_mm: float
+    ) -> ScaledPoses:
         given, straight = self.given[which], self.sweeps[which][flipped]
         bends = end.placing.bends[which]
         path_from_image = straight.corrected(bends) * self._back(which)
@@ -291,7 +293,7 @@ class _Matched:
             float(values[0]),
             float(np.sqrt(own[0, 0])),
             (evidence,),
-            {"similarity": end.correlation},
+            {"similarity": end.correlation, "tissue_moved_mm": moved_mm},
         )
 
 

@@ -78,6 +78,7 @@ def test_claims_for_tissue_that_moved_a_little():
     found = crossed(pair.first, pair.second)
     # Known to a factor of 2; sweeps over still tissue show less than 0.2 mm.
     assert 0.2 < found.details["tissue_moved_mm"] < 0.6
+    assert found.second.details["tissue_moved_mm"] == found.details["tissue_moved_mm"]
     for side, truth in zip((found.first, found.second), pair.truth, strict=True):
         # 0.3 mm either way, smooth over 8 mm, make a per cent of 24 mm; without them 0.7 % were claimed.
         assert side.log_scale_sigma > 0.01
