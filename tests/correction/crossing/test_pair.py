@@ -74,7 +74,7 @@ def test_refuses_other_tissue():
 
 @pytest.mark.slow
 def test_claims_for_tissue_that_moved_a_little():
-    pair = made(seed=201, moved_mm=0.3)
+    pair = made(seed=200, moved_mm=0.3)
     found = crossed(pair.first, pair.second)
     # Known to a factor of 2; sweeps over still tissue show less than 0.2 mm.
     assert 0.2 < found.details["tissue_moved_mm"] < 0.6
