@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
+from dataclasses import replace
 
 from speckle3d.config import Config
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
@@ -14,7 +15,7 @@ from speckle3d.correction.fused.fuse import FusedPoses, fuse
 from speckle3d.correction.inertial.scale import correct_inertial
 from speckle3d.correction.modes import PUBLISHED, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
-from speckle3d.correction.trust import believed, cleaned_readings, require_believed
+from speckle3d.correction.trust import ORIENTATION, believed, cleaned_readings, require_believed
 from speckle3d.pipeline import Tracked
 
 Correction = DriftCorrection | ScaledPoses | FusedPoses
@@ -39,7 +40,7 @@ def correct(
         ``"inertial"`` and ``"fused"``.
     config : Config, optional
     crossed : CrossedPair, optional
-        Of this sweep and a second one, from `cross_sweeps`.
+        Of this sweep and another, in either order, from `cross_sweeps`.
 
     Returns
     -------
@@ -83,7 +84,7 @@ def correct(
             start = tracked.subset if tracked.subset is not None else tracked.image
             found[mode] = correct_mode(mode, start, sweep, settings.drift)
         elif mode == "crossed" and crossed is not None:
-            found[mode] = crossed.first
+            found[mode] = crossed.of(sweep.frame_time_s, sweep.name)
         elif mode == "inertial":
             found[mode] = _inertial(tracked, sweep, settings)
         elif mode == "fused":
@@ -109,13 +110,19 @@ def _inertial(tracked: Tracked, sweep: Sweep, config: Config) -> ScaledPoses:
 def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair | None) -> FusedPoses:
     """Fuse with what is left of the sensors once those that are refuted are out."""
     sweep = believed(sweep, tracked.doubts)
-    evidence: list[ScaleEvidence] = [] if crossed is None else [*crossed.first.evidence]
-    # Most sweeps lack a motion that gives the accelerometer a scale: then they do without.
-    with suppress(InsufficientDataError, MismatchError):
+    evidence: list[ScaleEvidence] = []
+    if crossed is not None:
+        evidence += crossed.of(sweep.frame_time_s, sweep.name).evidence
+    refuted: tuple[Doubt, ...] = ()
+    try:
         require_modes(sweep, ["inertial"])
         evidence += _inertial(tracked, sweep, config).evidence
+    except MismatchError as error:
+        refuted = (Doubt(ORIENTATION, "accelerometer or gyroscope", str(error), True),)
+    except InsufficientDataError:
+        pass  # most sweeps lack a motion that gives the accelerometer a scale, and do without
     with naming(f"{sweep.name}: drift mode fused"):
-        return fuse(
+        found = fuse(
             tracked.edges,
             tracked.image,
             tracked.covariance,
@@ -128,3 +135,4 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
             evidence,
             config.fused,
         )
+    return replace(found, contradictions=(*found.contradictions, *refuted))

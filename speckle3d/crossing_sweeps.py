@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
@@ -45,6 +48,7 @@ def cross_sweeps(
         As `track`; or if the sweeps do not cross, overlap too little, show too little, or do not match.
     """
     settings = config or Config()
+    require_pair(first, second)
     total, done = len(first) + len(second), 0
     sides = []
     for sweep in (first, second):
@@ -53,6 +57,28 @@ def cross_sweeps(
         sides.append(crossing_side(sweep, tracked, stack, settings))
         done += len(sweep)
     return crossed(sides[0], sides[1], settings.crossing)
+
+
+def require_pair(first: Sweep, second: Sweep) -> None:
+    """Check before any work that two sweeps are of the same settings and not of the same frames.
+
+    Raises
+    ------
+    MismatchError
+        If images or signal differ.
+    InvalidInputError
+        If they have frames in common.
+    """
+    for what, one, other in (("images", first.grid, second.grid), ("signal", first.signal, second.signal)):
+        if one != other:
+            raise MismatchError(
+                f"{second.name}: expected a crossing sweep with the {what} of {first.name}, {one}; got {other}"
+            )
+    if first.name == second.name and np.isin(second.frame_time_s, first.frame_time_s).any():
+        raise InvalidInputError(
+            f"{second.name}: expected a crossing sweep with frames of its own, got some of the sweep's: give "
+            "another recording, or parts that do not overlap (--frames and --crossing-frames)"
+        )
 
 
 def stack_for(sweep: Sweep, config: Config) -> ImageStack:
@@ -71,6 +97,7 @@ def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Con
         float(tracked.slopes.deviation_per_mm.max()),
         sensed_orientation(believed(sweep, tracked.doubts), config.sensors),
         tracked.flags,
+        sweep.frame_time_s,
     )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
+import pytest
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.correction.fused.images import ImageErrors
 from speckle3d.correction.fused.sensors import SensorState
 from speckle3d.correction.fused.solution import Problem, State
+
+gtsam = pytest.importorskip("gtsam")
 
 STEP = 1e-6
 

@@ -43,7 +43,7 @@ def expect_inertial(
     if as_json:
         emit_json({"plan": plan.model_dump(mode="json"), **vars(found), "assumption": ASSUMPTION})
         return
-    verdict = "trusted" if found.trusted else "refused: move more" if found.refused else "given as uncertain"
+    verdict = "trusted" if found.trusted else "refused: move more" if found.refused else "given as weak"
     emit(f"length: {100 * found.length:.1f} % standard deviation ({verdict})")
     emit(f"lever arm {found.lever_mm:.1f} mm and clock {1e3 * found.clock_s:.1f} ms, found on the way")
     emit(ASSUMPTION)

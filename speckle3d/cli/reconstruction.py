@@ -29,7 +29,9 @@ ReconstructionFile = Annotated[
     Path,
     typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder."),
 ]
-Mode = Annotated[str, typer.Option(help="Which poses to use: image, orientation, pose.")]
+Mode = Annotated[
+    str, typer.Option(help="Which poses to use: image, orientation, pose, crossed, inertial, fused.")
+]
 SweepFile = Annotated[
     Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
 ]
@@ -85,7 +87,8 @@ def reconstruct(
     )
     modes = list(dict.fromkeys(drift or ()))
     sweep = load_sweep(sweep_file)
-    curves = read_curves(_find_curves(curves_file, sweep_file))
+    used = _find_curves(curves_file, sweep_file)
+    curves = read_curves(used)
     mount(sweep, calibration or ())
     crossing = _crossing(sweep, sweep_file, crossing_file, crossing_frames)
     if crossing is not None and not {"crossed", "fused"}.intersection(modes):
@@ -93,7 +96,8 @@ def reconstruct(
     if save_curves is not None:
         if crossing is None:
             raise InvalidInputError("--save-curves: expected a crossing sweep (--crossing SWEEP), got none")
-        require_own_place(save_curves, "curves", sweep_file, crossing[1], config_file)
+        read = (sweep_file, crossing[1], config_file, used, *(calibration or ()))
+        require_own_place(save_curves, "curves", *read)
     sweep = _part(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(

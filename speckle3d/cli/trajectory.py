@@ -60,7 +60,7 @@ def score(
     ],
     mode: Annotated[
         str | None,
-        typer.Option(help="Poses of a reconstruction: image (by default), orientation, pose."),
+        typer.Option(help="Poses of a reconstruction: image (by default) or another mode of it."),
     ] = None,
     reference: Annotated[str | None, typer.Option(help="Which poses of a sweep: tracker or truth.")] = None,
     length_unit: Annotated[

@@ -63,7 +63,7 @@ class Lens:
 def band_nodes(band_hz: tuple[float, float], edge_fraction: float) -> FloatArray:
     """Frequencies at which the field is computed: the band and its edges, evenly."""
     edge = edge_fraction * (band_hz[1] - band_hz[0])
-    return np.linspace(band_hz[0] - edge, band_hz[1] + edge, FREQUENCIES)
+    return np.linspace(max(band_hz[0] - edge, band_hz[0] / 2.0), band_hz[1] + edge, FREQUENCIES)
 
 
 def sheet_spectrum(

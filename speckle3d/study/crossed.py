@@ -8,7 +8,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
-from speckle3d.crossing_sweeps import crossing_side, curves_from, stack_for
+from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
 from speckle3d.matching.blocks import ImageSink
 from speckle3d.pipeline import Progress, Tracked, after, track
 
@@ -24,6 +24,7 @@ class Companion:
     """
 
     def __init__(self, first: Sweep, second: Sweep, curves: DecorrelationCurves, config: Config) -> None:
+        require_pair(first, second)
         self.first, self.second, self._curves, self._config = first, second, curves, config
         self._stacks = stack_for(first, config), stack_for(second, config)
         self._tracked: Tracked | None = None

@@ -237,12 +237,12 @@ def _corrected(
         Why the sweeps could not be crossed; empty if they were, or need not be.
     """
     corrections: dict[str, Correction] = {}
-    left_out: dict[str, str] = {}
+    # Said even if only `fused` was to use it: it went without.
+    left_out = {"crossed": refusal} if refusal else {}
     for mode in modes:
         if mode == SUBSET:
             continue
-        if mode == "crossed" and crossed is None:
-            left_out[mode] = refusal
+        if mode in left_out:
             continue
         try:
             corrections |= correct(tracked, sweep, [mode], config, crossed)

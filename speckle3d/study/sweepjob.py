@@ -133,6 +133,11 @@ def plan_sweep(
     key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
     folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
     mounted = tuple(each.resolve() for each in calibrations)
+    if "crossed" in (modes or ()) and crossing is None:
+        wanted = f"{path.stem}-crossing{path.suffix}"
+        return SweepOutcome(
+            name, path, "failed", f"mode crossed: expected a crossing sweep {wanted} beside it"
+        )
     return SweepJob(
         name,
         path,

@@ -71,7 +71,7 @@ def streamed(path, tmp_path_factory):
     """What the sweep gives in one go, without any files between."""
     folder = tmp_path_factory.mktemp("streamed")
     curves = read_curves(path.parent / "curves.h5")
-    run_job(load_sweep(path), path, curves, folder, [SUBSET, "orientation", "pose"], config=CONFIG)
+    run_job(load_sweep(path), path, curves, folder, [SUBSET, "orientation", "pose", "fused"], config=CONFIG)
     return results(folder)
 
 

@@ -59,6 +59,8 @@ class CrossedPair:
     mirrored : tuple of bool
         Which of the sweeps went the other way than its poses said: images alone do not know the sign of the
         elevational motion. Without sensed orientation the first is taken at its word.
+    frame_time_s : tuple of (ndarray or None)
+        Of each sweep.
     details : dict of str to float or str
         For tables and reports.
     """
@@ -72,7 +74,25 @@ class CrossedPair:
     overlap_mm: float
     angle_deg: float
     mirrored: tuple[bool, bool]
+    frame_time_s: tuple[FloatArray | None, FloatArray | None] = (None, None)
     details: dict[str, float | str] = field(default_factory=dict)
+
+    def of(self, frame_time_s: FloatArray, name: str) -> ScaledPoses:
+        """The poses of the sweep whose frames have these times.
+
+        Raises
+        ------
+        MismatchError
+            If neither sweep's frames do.
+        """
+        for poses, times in zip((self.first, self.second), self.frame_time_s, strict=True):
+            if np.array_equal(frame_time_s if times is None else times, frame_time_s) and len(
+                poses.poses
+            ) == len(frame_time_s):
+                return poses
+        raise MismatchError(
+            f"{name}: expected one of the two crossed sweeps, all of its frames, got another or a part"
+        )
 
 
 def crossed(
@@ -248,6 +268,7 @@ class _Matched:
             overlap,
             angle,
             mirrored,
+            (self.given[0].frame_time_s, self.given[1].frame_time_s),
             details,
         )
 

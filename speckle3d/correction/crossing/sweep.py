@@ -79,6 +79,8 @@ class CrossingSweep:
         ``world_from_image`` by an orientation sensor or tracker.
     flags : ndarray of int, shape (n,), or None
         Not zero for frames that are not to be trusted.
+    frame_time_s : ndarray, shape (n,), or None
+        By which a sweep is known again; see `CrossedPair.of`.
     """
 
     name: str
@@ -89,6 +91,7 @@ class CrossingSweep:
     turn_sigma_per_mm: float
     sensed: Rotation | None = None
     flags: IntArray | None = None
+    frame_time_s: FloatArray | None = None
 
     def __post_init__(self) -> None:
         for name in ("scale_sigma", "turn_sigma_per_mm"):

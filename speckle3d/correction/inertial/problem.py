@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 from scipy.interpolate import BSpline
-from scipy.sparse.linalg import splu
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import cauchy_weights
 
 GLOBALS = (
@@ -195,7 +195,7 @@ class InertialProblem:
         for turn in range(rounds):
             jacobian, residual = self._system(x, weights)
             normal = (jacobian.T @ jacobian).tocsc()
-            solver = splu(normal, permc_spec="NATURAL", diag_pivot_thresh=0.0)
+            solver = _factorised(normal)
             step = solver.solve(-(jacobian.T @ residual))
             x = x + self._limited(step)
             if turn >= least:
@@ -221,7 +221,7 @@ class InertialProblem:
         sensed, left = jacobian[rows], residual[rows]
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (sensed.shape[0], _PROBES))
         pulled = sensed.T @ probes
-        solver = splu((jacobian.T @ jacobian).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0)
+        solver = _factorised((jacobian.T @ jacobian).tocsc())
         followed = float(np.sum(pulled * solver.solve(pulled))) / _PROBES
         return float(left @ left) / max(left.size - followed, 1.0)
 
@@ -240,7 +240,7 @@ class InertialProblem:
 
     def _solution(self, x: FloatArray, weights: FloatArray) -> Solution:
         jacobian, residual = self._system(x, weights)
-        solver = splu((jacobian.T @ jacobian).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0)
+        solver = _factorised((jacobian.T @ jacobian).tocsc())
         size, k = x.size, len(GLOBALS)
         unit = np.zeros((size, k))
         unit[np.arange(size - k, size), np.arange(k)] = 1.0
@@ -384,3 +384,14 @@ class InertialProblem:
             self._interleaved(1e-3 * self._acceleration, by_tilt + turning[0], by_yaw + turning[1]), columns
         )
         return sparse.csr_matrix(rows / r.force_sigma), (model - r.force_m_s2) / r.force_sigma
+
+
+def _factorised(normal: sparse.csc_matrix) -> SuperLU:
+    """Factors of the normal equations in their own order, which keeps neighbours in time together."""
+    try:
+        return splu(normal, permc_spec="NATURAL", diag_pivot_thresh=0.0)
+    except RuntimeError as error:
+        raise InsufficientDataError(
+            "inertial scale: expected readings that determine the motion, got some that do not "
+            f"({error}); are their units right?"
+        ) from error

@@ -115,9 +115,14 @@ def _require_sampling(time_s: FloatArray, frame_time_s: FloatArray, gap_s: float
         )
 
 
+def gravity_error(force: FloatArray) -> float:
+    """How far the accelerometer's gravity is off, relative: so far may its scale be."""
+    return abs(float(np.median(np.linalg.norm(force, axis=1))) / GRAVITY_M_S2 - 1.0)
+
+
 def _require_gravity(force: FloatArray) -> None:
     felt = float(np.median(np.linalg.norm(force, axis=1)))
-    if abs(felt / GRAVITY_M_S2 - 1.0) > _GRAVITY_SHARE:
+    if not gravity_error(force) <= _GRAVITY_SHARE:
         raise MismatchError(
             f"inertial scale: expected an accelerometer that feels gravity as 9.8 m/s^2, got {felt:.3g}; its "
             "readings are in other units, or its scale is not calibrated"
@@ -128,7 +133,10 @@ def _require_unsaturated(values: FloatArray, name: str, unit: str) -> None:
     for axis, column in zip("xyz", values.T, strict=True):
         distinct = np.unique(column)
         if distinct.size < 3:
-            continue
+            raise InsufficientDataError(
+                f"inertial scale: expected readings that change, got the {name}'s {axis} at "
+                f"{distinct[0]:.3g} {unit} throughout; is the sensor read?"
+            )
         quantum = float(np.diff(distinct).min())
         for extreme in (distinct[0], distinct[-1]):
             far = abs(extreme - np.median(column)) > _RANGE_STEPS * quantum

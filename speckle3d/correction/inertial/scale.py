@@ -27,7 +27,7 @@ from speckle3d.correction.inertial.problem import (
     Readings,
     Solution,
 )
-from speckle3d.correction.inertial.readings import inertial_readings
+from speckle3d.correction.inertial.readings import gravity_error, inertial_readings
 from speckle3d.correction.inertial.settings import ASSUMPTION, InertialSettings
 from speckle3d.correction.inertial.signs import SettledSigns, settled_signs
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
@@ -113,6 +113,10 @@ def correct_inertial(
     time_s, centre = np.asarray(frame_time_s, dtype=float), np.asarray(centre_mm, dtype=float)
     _require_shapes(image, covariance, time_s, centre)
     readings = inertial_readings(sensor, time_s)
+    # An accelerometer that feels gravity off by a share may feel everything off by it, or have a bias.
+    assert sensor.accelerometer_m_s2 is not None
+    own = float(np.hypot(s.accelerometer_scale_sigma, gravity_error(sensor.accelerometer_m_s2)))
+    s = s.model_copy(update={"accelerometer_scale_sigma": own})
     steps = (relative_poses(image).apply(centre) - centre)[:, 2]
     signs, problem, found = _settled(readings, time_s, steps, s)
     misfit = problem.sensor_misfit(found)
