@@ -72,7 +72,7 @@ def require_pair(first: Sweep, second: Sweep) -> None:
     for what, one, other in (("images", first.grid, second.grid), ("signal", first.signal, second.signal)):
         if one != other:
             raise MismatchError(
-                f"{second.name}: expected the {what} of {first.name} in its crossing sweep: {one}; got {other}"
+                f"{second.name}: expected the {what} of {first.name} in its crossing: {one}; got {other}"
             )
     if first.name == second.name and np.isin(second.frame_time_s, first.frame_time_s).any():
         raise InvalidInputError(
