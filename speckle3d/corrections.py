@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from speckle3d.config import Config
+from speckle3d.core.arrays import BoolArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
+from speckle3d.core.geometry import elevational_steps
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
@@ -92,6 +96,12 @@ def correct(
     return found
 
 
+def steps_turned(inertial: ScaledPoses, tracked: Tracked, sweep: Sweep) -> BoolArray:
+    """Steps that the accelerometer feels to go the other way than the images have them, shape (n - 1,)."""
+    felt, seen = (elevational_steps(poses, sweep.grid.centre_mm) for poses in (inertial.poses, tracked.image))
+    return np.asarray(felt * seen < 0)
+
+
 def _inertial(tracked: Tracked, sweep: Sweep, config: Config) -> ScaledPoses:
     sensor = sweep.orientation
     assert isinstance(sensor, OrientationSensor)
@@ -114,9 +124,12 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
     if crossed is not None:
         evidence += crossed.of(sweep.frame_time_s, sweep.name).evidence
     refuted: tuple[Doubt, ...] = ()
+    felt_back = None
     try:
         require_modes(sweep, ["inertial"])
-        evidence += _inertial(tracked, sweep, config).evidence
+        inertial = _inertial(tracked, sweep, config)
+        evidence += inertial.evidence
+        felt_back = steps_turned(inertial, tracked, sweep)
     except MismatchError as error:
         refuted = (Doubt(ORIENTATION, "accelerometer or gyroscope", str(error), True),)
     except InsufficientDataError:
@@ -133,6 +146,7 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
             sweep.orientation,
             sweep.tracker,
             evidence,
+            felt_back,
             config.fused,
         )
     return replace(found, contradictions=(*found.contradictions, *refuted))

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.fused.fuse import FusedPoses
 from speckle3d.correction.modes import sensor_of
 from speckle3d.correction.trust import name_of
 from speckle3d.corrections import Correction
@@ -20,18 +20,13 @@ from speckle3d.pipeline import Tracked
 from speckle3d.scoring.references import SweepCurves
 
 
-def doubted_modes(
-    sweep: Sweep, tracked: Tracked, modes: Collection[str], corrections: Mapping[str, Correction]
-) -> dict[str, str]:
+def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:
     """What is suspected of the sensor that each mode rests on; images are under all of them."""
     found = {}
     for mode in modes:
         sensor = None if mode == "image" else sensor_of(sweep, mode)
         about = {"images", "curves", "" if sensor is None else name_of(sensor)}
-        correction = corrections.get(mode)
-        more = correction.contradictions if isinstance(correction, FusedPoses) else ()
-        doubts = [*(doubt for doubt in tracked.doubts if doubt.about in about), *more]
-        suspected = dict.fromkeys(doubt.suspect for doubt in doubts)
+        suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
         if suspected:
             found[mode] = ", ".join(suspected)
     return found

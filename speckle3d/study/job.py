@@ -21,6 +21,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.fused.fuse import FusedPoses
 from speckle3d.correction.modes import PUBLISHED
+from speckle3d.correction.scale import ScaledPoses
 from speckle3d.correction.trust import believed, require_believed
 from speckle3d.corrections import Correction, correct
 from speckle3d.io.calibrations import apply_calibrations
@@ -176,6 +177,7 @@ def write_results(
         compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
     name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
+    doubts = (*tracked.doubts, *_contradictions(corrections))
     summary = Summary(
         sweep.name,
         name,
@@ -183,8 +185,8 @@ def write_results(
         share,
         _errors(sweep, poses, moved, compared),
         details_of(tracked, corrections, moved, provenance),
-        (*tracked.doubts, *_contradictions(corrections)),
-        doubted_modes(sweep, tracked, poses, corrections),
+        doubts,
+        doubted_modes(sweep, doubts, poses),
         left_out,
         claims_of(tracked, sweep.grid.centre_mm, corrections),
     )
@@ -255,9 +257,15 @@ def _corrected(
 
 
 def _contradictions(corrections: Mapping[str, Correction]) -> tuple[Doubt, ...]:
-    """What fusing found of the sensors that checks before had not."""
+    """What correcting found of sensors and images that checks before had not."""
     fused = [each for each in corrections.values() if isinstance(each, FusedPoses)]
-    return tuple(doubt for each in fused for doubt in each.contradictions)
+    found = [doubt for each in fused for doubt in each.contradictions]
+    inertial = corrections.get("inertial")
+    if isinstance(inertial, ScaledPoses) and float(inertial.details["turned_steps"]) > 0:
+        steps = f"{inertial.details['turned_steps']:.0f} steps"
+        words = f"expected the direction that the accelerometer feels, got {steps} that go the other way"
+        found.append(Doubt("images", "direction of a stretch", words, False))
+    return tuple(found)
 
 
 def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:

@@ -22,14 +22,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.fused.contradictions import Contradiction, contradictions, difference
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
-from speckle3d.correction.fused.sides import on_sensed_sides
+from speckle3d.correction.fused.sides import on_felt_sides, on_sensed_sides
 from speckle3d.correction.fused.sizes import Wander
 from speckle3d.correction.fused.solution import Problem, Solution
 from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
@@ -97,6 +97,7 @@ def fuse(
     orientation: OrientationSensor | None = None,
     tracker: Tracker | None = None,
     evidence: Sequence[ScaleEvidence] = (),
+    felt_back: BoolArray | None = None,
     settings: FusedSettings | None = None,
 ) -> FusedPoses:
     """Find poses from all that is known of a sweep.
@@ -121,6 +122,9 @@ def fuse(
         Sensors without a mounting, or with too few readings over the frames, are left out.
     evidence : sequence of ScaleEvidence
         What a crossing sweep or an accelerometer says of the scale.
+    felt_back : ndarray of bool, shape (n - 1,), optional
+        Steps from each frame to the next that an accelerometer feels to go the other way than the images
+        have them; what it says of the scale is of steps so turned.
     settings : FusedSettings, optional
 
     Returns
@@ -134,6 +138,8 @@ def fuse(
     centre = RigidTransform.from_translation(centre_mm)
     start = centre.inv() * (image[0].inv() * image) * centre
     seen_mm = _along(start)
+    if felt_back is not None:
+        edges, start = on_felt_sides(edges, start, felt_back)
     if tracker is not None:
         read = read_sensor(tracker, TRACKER, start, centre_mm, frame_time_s, _limits(settings, TRACKER))
         edges, start = on_sensed_sides(edges, start, read) if read else (edges, start)

@@ -1,7 +1,7 @@
-"""On which side of each other frames lie, where a tracker says otherwise than the images.
+"""On which side of each other frames lie, where a sensor says otherwise than the images.
 
 Distances have no sign. After a turn in the motion images may take a stretch for its mirror image; a tracker,
-however it jitters, sees over such a stretch which way the probe went.
+however it jitters, sees over such a stretch which way the probe went, and an accelerometer feels its ends.
 """
 
 from __future__ import annotations
@@ -38,16 +38,45 @@ def on_sensed_sides(
     start : RigidTransform, length n
         ``first_from_frame`` about the image's centre.
     """
-    ratio, span = _ratios(edges, tracker, len(start)), edges.second - edges.first
-    near = span <= np.median(span) + FAR_FRAMES
+    ratio, span, near = _ratios(edges, tracker, len(start)), edges.second - edges.first, _near(edges)
     across = np.zeros(len(start) + 1)
     np.add.at(across, edges.first[near], (ratio / span)[near])
     np.add.at(across, edges.second[near], -(ratio / span)[near])
     flip = _stretches(np.cumsum(across)[: len(start) - 1])
-    passed = np.concatenate([[0], np.cumsum(flip)])
-    mostly = (passed[edges.second] - passed[edges.first]) > span / 2
     # Visits of one place were found by the images' own path, and tell no more than their distance.
-    turned = np.where(near, mostly, ratio < -BEYOND_DOUBT)
+    return _turned_over(edges, start, flip, np.where(near, _mostly(edges, flip), ratio < -BEYOND_DOUBT))
+
+
+def on_felt_sides(
+    edges: RelativePoses, start: RigidTransform, flip: BoolArray
+) -> tuple[RelativePoses, RigidTransform]:
+    """Edges and the images' poses with those steps mirrored that are felt to go the other way.
+
+    Parameters
+    ----------
+    start : RigidTransform, length n
+        ``first_from_frame`` about the image's centre.
+    flip : ndarray of bool, shape (n - 1,)
+        From each frame to the next.
+    """
+    return _turned_over(edges, start, flip, _near(edges) & _mostly(edges, flip))
+
+
+def _near(edges: RelativePoses) -> BoolArray:
+    span = edges.second - edges.first
+    return np.asarray(span <= np.median(span) + FAR_FRAMES)
+
+
+def _mostly(edges: RelativePoses, flip: BoolArray) -> BoolArray:
+    """Edges most of whose steps are turned over."""
+    passed = np.concatenate([[0], np.cumsum(flip)])
+    return np.asarray((passed[edges.second] - passed[edges.first]) > (edges.second - edges.first) / 2)
+
+
+def _turned_over(
+    edges: RelativePoses, start: RigidTransform, flip: BoolArray, turned: BoolArray
+) -> tuple[RelativePoses, RigidTransform]:
+    """Mirror some edges, and start from the steps of which some are mirrored."""
     if not turned.any():
         return edges, start
     turned_edges = _mirrored_where(edges, turned)
