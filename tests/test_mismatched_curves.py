@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.curves import SpeckleSize, TiltResponse
-from speckle3d.core.errors import MismatchError
+from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.matching.blocks import Block
 from speckle3d.pipeline import match_ahead, track
 
@@ -104,5 +104,7 @@ def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves, fac
 
 @pytest.mark.slow
 def test_a_sweep_whose_depth_is_wrong_by_ten_millimetres_is_refused(part, curves):
-    with pytest.raises(MismatchError, match=r"^phantom: curves: expected"):
+    # By the curves as they are, or by the path that they give once depths have straightened them.
+    refusals = (MismatchError, InsufficientDataError)
+    with pytest.raises(refusals, match=r"^phantom: (curves: expected|images: expected frames equally alike)"):
         track(of_other_depths(part, 10.0), curves)
