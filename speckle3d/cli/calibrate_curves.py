@@ -73,9 +73,9 @@ def calibrate_curves(
 
 
 def _of_sheet(probe: Path, like: Path | None, settings: Config) -> DecorrelationCurves:
-    from speckle3d.config import load_toml
     from speckle3d.core.errors import naming
     from speckle3d.io.load import load_sweep
+    from speckle3d.io.toml import load_toml
     from speckle3d.motion.data_sheet import ProbeSheet
     from speckle3d.sheet_curves import data_sheet_curves
 

@@ -155,7 +155,7 @@ def naming_options() -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        from speckle3d.config import first_fault
+        from speckle3d.io.toml import first_fault
 
         name, fault = first_fault(error)
         raise InvalidInputError(f"--{name.replace('_', '-')}: {fault}") from None

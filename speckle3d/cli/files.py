@@ -133,11 +133,11 @@ def convert(
     unless options give it.
     """
     from speckle3d.cli.recordings import require_sequence
+    from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
-    from speckle3d.io.metaimage import ImportSettings
     from speckle3d.io.sweep_writer import write_sweep
 
-    names = ImportSettings.__dataclass_fields__
+    names = ImportSettings.model_fields
     require_own_place(out, "sweep", source, *(calibration or ()))
     given = {k: v for k, v in locals().items() if k in names and v is not None}
     if transform is not None:

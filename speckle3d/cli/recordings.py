@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,9 @@ from calibration.job import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, sniff
-from speckle3d.io.metaimage import ImportSettings, MissingSettingError, lacking_poses, read_poses
+from speckle3d.io.metaimage import lacking_poses, read_poses
 from speckle3d.study.images import GreyImages
 
 DYNAMIC_RANGE_DB = 60.0
@@ -96,11 +96,11 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | Non
         if not min(pixel_mm) > 0:
             raise InvalidInputError(f"--pixel-mm: expected two values above zero, got {pixel_mm}")
         column, row = pixel_mm
-        given = replace(given, column_pitch_mm=column, row_spacing_mm=row)
+        given = given.model_copy(update={"column_pitch_mm": column, "row_spacing_mm": row})
     try:
         return load_sweep(path, given)
-    except MissingSettingError as error:
-        raise InvalidInputError(f"{path}: {_advice(error.setting)}") from None
+    except MissingSettingsError as error:
+        raise InvalidInputError(f"{path}: {_advice(error.settings[0])}") from None
 
 
 def _advice(lacking: str) -> str:

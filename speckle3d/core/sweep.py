@@ -57,19 +57,38 @@ class _FramesPart:
 
 @dataclass(frozen=True)
 class RFSettings:
-    """How radio-frequency vectors were sampled."""
+    """How radio-frequency vectors, or their I and Q, were sampled.
+
+    Attributes
+    ----------
+    demodulation_frequency_hz : float, optional
+        Frequency that complex samples (I/Q) were shifted down by; 0 where they still carry their frequency
+        (the analytic signal); None where samples are real.
+    """
 
     sampling_rate_hz: float
     speed_of_sound_m_s: float
     centre_frequency_hz: float
     bandwidth_hz: tuple[float, float]
+    demodulation_frequency_hz: float | None = None
 
     def __post_init__(self) -> None:
         _require_positive(self, ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz"))
         low, high = self.bandwidth_hz
-        if not 0 < low < high <= self.sampling_rate_hz / 2:
+        middle, half = self.demodulation_frequency_hz, self.sampling_rate_hz / 2
+        if middle is not None and not (np.isfinite(middle) and middle >= 0):
+            raise InvalidInputError(f"demodulation_frequency_hz: expected zero or above, got {middle}")
+        if middle:
+            # A complex signal holds as much on either side of the frequency it was shifted down by.
+            if not (0 < low < high and middle - half <= low and high <= middle + half):
+                raise InvalidInputError(
+                    "bandwidth_hz: expected 0 < low < high within half the sampling rate of the demodulation "
+                    f"frequency, {middle:g}, got ({low:g}, {high:g})"
+                )
+        elif not 0 < low < high <= self.sampling_rate_hz * (1 if middle == 0 else 0.5):
+            most = "the sampling rate" if middle == 0 else "half the sampling rate"
             raise InvalidInputError(
-                f"bandwidth_hz: expected 0 < low < high <= half the sampling rate, got ({low:g}, {high:g})"
+                f"bandwidth_hz: expected 0 < low < high <= {most}, got ({low:g}, {high:g})"
             )
 
     @property

@@ -37,6 +37,7 @@ from speckle3d.io.hdf5 import (
     PathLike,
     find_member,
     has_member,
+    hdf5_claim,
     locate,
     open_hdf5,
     read_checked,
@@ -44,6 +45,7 @@ from speckle3d.io.hdf5 import (
     reading,
     require_dataset,
 )
+from speckle3d.io.readers import Reader
 from speckle3d.io.sweeps import HDF5Frames
 from speckle3d.io.text import numbers, text_lines
 
@@ -211,3 +213,11 @@ def _require_calibration(scan: Path) -> Path:
 def _landmark_file(scan: Path) -> Path | None:
     subject = scan.absolute().parent.name
     return _nearby(scan, [f"{folder}/landmark_{subject}.h5" for folder in _LANDMARK_FOLDERS])
+
+
+READER = Reader(
+    FORMAT,
+    hdf5_claim(is_challenge_scan),
+    lambda path, _: read_challenge_scan(path),
+    companions=companion_files,
+)

@@ -33,7 +33,7 @@ from speckle3d.io.hdf5 import (
     read_text,
     write_attributes,
 )
-from speckle3d.io.sweeps import read_signal
+from speckle3d.io.sweeps import read_signal, signal_attributes
 
 FORMAT = "speckle3d.curves"
 
@@ -58,7 +58,7 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
         if curves.nominal is not None:
             file.create_group("nominal").attrs.update(vars(curves.nominal))
         file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
-        file.attrs.update(vars(curves.key.signal))
+        file.attrs.update(signal_attributes(curves.key.signal))
 
 
 def read_curves(path: PathLike) -> DecorrelationCurves:

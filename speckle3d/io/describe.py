@@ -6,6 +6,7 @@ To add a kind of file, give `_DESCRIBERS` a function that tells its rows.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -20,12 +21,11 @@ from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
 from speckle3d.io.hdf5_guard import plain_attribute
 from speckle3d.io.headers import read_header
+from speckle3d.io.import_settings import settings_for
 from speckle3d.io.load import IMAGE, kind_of
 from speckle3d.io.metaimage import image_orientation, image_type
+from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
-
-Row = tuple[str, str, str]
-"""Description, value, unit."""
 
 _UNIT_NAMES = {"mm": "mm", "hz": "Hz", "db": "dB", "m_s": "m/s"}
 
@@ -42,18 +42,34 @@ def describe(path: PathLike) -> list[Row]:
     """
     kind = kind_of(path)
     if kind not in _DESCRIBERS:
-        known = ", ".join(sorted(_DESCRIBERS))
-        raise InvalidInputError(f"{path}: expected a format among {known}, got {kind!r}")
+        reader = find_reader(path)
+        if reader is None:
+            known = ", ".join(sorted(_DESCRIBERS))
+            raise InvalidInputError(f"{path}: expected a format among {known}, got {kind!r}")
+        return [("format", kind, ""), *_told(reader, Path(path))]
     rows = _DESCRIBERS[kind](path)
     return rows if kind == IMAGE else [("format", kind, ""), *rows]
 
 
+def _told(reader: Reader, path: Path) -> list[Row]:
+    """Rows of a recording; where its sweep cannot be read, what its reader tells of it, and why it cannot."""
+    settings = settings_for(path)
+    own = [] if reader.describe is None else reader.describe(path, settings)
+    try:
+        return [*own, *sweep_rows(reader.read(path, settings))]
+    except InvalidInputError as error:
+        if not own:
+            raise
+        return [*own, ("sweep", f"none: {error}", "")]
+
+
 def _describe_scan(path: PathLike) -> list[Row]:
     marks = str(len(challenge.read_landmarks(path) or ()))
-    return [*_sweep_rows(challenge.read_challenge_scan(path)), ("landmarks", marks, "")]
+    return [*sweep_rows(challenge.read_challenge_scan(path)), ("landmarks", marks, "")]
 
 
-def _sweep_rows(sweep: Sweep) -> list[Row]:
+def sweep_rows(sweep: Sweep) -> list[Row]:
+    """Tell what a sweep holds."""
     grid = sweep.grid
     return [
         ("frames", str(len(sweep)), ""),
@@ -207,7 +223,7 @@ def _describe_header(path: PathLike) -> list[Row]:
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
-    sweeps.FORMAT: lambda path: _sweep_rows(sweeps.read_sweep(path)),
+    sweeps.FORMAT: lambda path: sweep_rows(sweeps.read_sweep(path)),
     reconstructions.FORMAT: _describe_reconstruction,
     curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -32,6 +32,9 @@ from speckle3d.io.hdf5_guard import (
 )
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""First bytes of an HDF5 file without a user block."""
 
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
@@ -204,9 +207,26 @@ def opened(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.
         yield file
 
 
+def hdf5_claim(is_ours: Callable[[h5py.File], bool]) -> Callable[[Path, bytes], bool]:
+    """Make a reader's claim of a question about an open HDF5 file; other files are not claimed."""
+
+    def claims(path: Path, start: bytes) -> bool:
+        if not start.startswith(SIGNATURE):
+            return False
+        with reading(path), open_hdf5(path) as file:
+            return is_ours(file)
+
+    return claims
+
+
 def file_format(file: h5py.File) -> str:
     """Return the attribute ``format`` of an open file."""
     return read_text(file, "format")
+
+
+def has_format(file: h5py.File, name: str) -> bool:
+    """Whether an open file is of the family, and of one format."""
+    return "format" in file.attrs and file_format(file) == name
 
 
 def locate(node: Node, name: str = "") -> str:

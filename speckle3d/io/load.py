@@ -1,44 +1,31 @@
-"""One door to every file that holds a sweep: the reader is chosen by what the file holds, not by its name.
-
-To add a kind of sweep, give `kind_of` a way to tell it and `_READERS` its reader.
-"""
+"""One door to every recording that holds a sweep: the reader is chosen by what it holds, not by its name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.files import open_regular
+from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import PathLike, file_format, open_hdf5, reading, require_file
-from speckle3d.io.headers import is_metaimage, is_nrrd
-from speckle3d.io.metaimage import ImportSettings, read_metaimage
+from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file
+from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
+from speckle3d.io.metaimage import READER as _IMAGES
+from speckle3d.io.readers import find_reader, first_bytes, readers
 
-IMAGE = "image"
+IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
-
-_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_SNIFFED_BYTES = 512
-
-_READERS: dict[str, Callable[[PathLike, ImportSettings | None], Sweep]] = {
-    sweeps.FORMAT: lambda path, _: sweeps.read_sweep(path),
-    challenge.FORMAT: lambda path, _: challenge.read_challenge_scan(path),
-    IMAGE: read_metaimage,
-}
-"""How sweeps of each kind are read."""
 
 
 def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
-    """Read a sweep from a sweep file, a MetaImage or NRRD sequence, or a scan of the TUS-REC challenge.
+    """Read a sweep from any recording that a reader claims: a file, or a folder that a scanner wrote.
 
     Parameters
     ----------
     path : path
     settings : ImportSettings, optional
-        What the header of an image sequence lacks; the others need none.
+        What the recording does not say, over what a TOML file beside it gives.
 
     Returns
     -------
@@ -48,9 +35,11 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     Raises
     ------
     FileError
-        If the file cannot be read.
+        If the recording cannot be read.
     InvalidInputError
         If it is of no known kind, or what it holds is not valid.
+    MissingSettingsError
+        Naming all that it does not say.
 
     Examples
     --------
@@ -60,8 +49,11 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     >>> sweep.grid.centre_mm.round(1).tolist()
     [7.0, 22.0, 0.0]
     """
-    # A file of another format is refused by the sweep file's own reader.
-    return _READERS.get(kind_of(path), _READERS[sweeps.FORMAT])(path, settings)
+    reader = find_reader(path)
+    if reader is None:
+        kind_of(path)  # names a file of no known kind
+        return sweeps.read_sweep(path)  # refuses the family's other formats
+    return reader.read(Path(path), settings_for(path, settings))
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:
@@ -71,23 +63,30 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
 
 def companion_files(path: PathLike) -> list[Path]:
     """List other files that a sweep's content depends on."""
-    return challenge.companion_files(path) if kind_of(path) == challenge.FORMAT else []
+    reader, beside = find_reader(path), settings_file(path)
+    return [
+        *(() if reader is None else reader.companions(Path(path))),
+        *(() if beside is None else (beside,)),
+    ]
 
 
 def kind_of(path: PathLike) -> str:
-    """Tell what a file is: its HDF5 format, as ``"speckle3d.sweep"``, ``"TUS-REC scan"`` or ``"image"``.
+    """Tell what a recording is by its reader's format, or a file of the family by its own.
 
     Raises
     ------
     FileError
-        If the file cannot be read.
+        If it cannot be read.
     InvalidInputError
-        If it is neither HDF5 with a format nor an image.
+        If it is of no known kind.
     """
+    reader = find_reader(path)
+    if reader is not None:
+        return reader.format
     if sniff(path) == IMAGE:
         return IMAGE
     with reading(path), open_hdf5(path) as file:
-        return challenge.FORMAT if challenge.is_challenge_scan(file) else file_format(file)
+        return file_format(file)
 
 
 def sniff(path: PathLike) -> str:
@@ -101,11 +100,11 @@ def sniff(path: PathLike) -> str:
         If it is neither.
     """
     require_file(path)
-    with reading(path), open_regular(path) as stream:
-        start = stream.read(_SNIFFED_BYTES)
-    if start.startswith(_HDF5_SIGNATURE):
+    start = first_bytes(path)
+    if start.startswith(SIGNATURE):
         return "hdf5"
-    if is_metaimage(start) or is_nrrd(start):
+    if _IMAGES.claims(Path(path), start):
         return IMAGE
     got = "an empty file" if not start else "something else"
-    raise InvalidInputError(f"{path}: expected a sweep file, MetaImage or NRRD sequence, got {got}")
+    known = ", ".join(reader.format for reader in readers())
+    raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")

@@ -23,8 +23,10 @@ from speckle3d.core.printable import printable
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.headers import SequenceHeader, read_header
+from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
+from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings, MissingSettingsError
 from speckle3d.io.pixels import read_pixels
+from speckle3d.io.readers import Reader
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -38,55 +40,6 @@ tracker that rounds its own output was measured at 4.6e-4; six written digits al
 Value = TypeVar("Value")
 
 _RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
-
-
-class MissingSettingError(InvalidInputError):
-    """A header lacks a value, and no setting gives it.
-
-    Attributes
-    ----------
-    setting : str
-        Name in `ImportSettings`.
-    """
-
-    def __init__(self, message: str, setting: str = "") -> None:
-        super().__init__(message)
-        self.setting = setting
-
-
-@dataclass(frozen=True)
-class ImportSettings:
-    """Values for what an image file's header lacks; they replace the header's own.
-
-    Attributes
-    ----------
-    sampling_rate_hz, centre_frequency_hz, bandwidth_hz, vector_pitch_mm
-        For RF.
-    column_pitch_mm, row_spacing_mm, dynamic_range_db
-        For B-mode.
-    frame_rate_hz
-        For sequences without time stamps.
-    tracker_transform, reference_transform : str, optional
-        Names of the tracked frames, as ``ToolToTracker``; ``"none"`` for neither. By default PLUS's usual
-        names where they occur: ``ProbeToTracker``, and ``ReferenceTo`` the same world. A transform of which
-        the header holds the inverse, ``TrackerToTool``, is inverted.
-    image_to_probe : 4x4 nested tuple, optional
-        PLUS's image calibration, pixels to mm; gives the pitch and spacing of B-mode too.
-    """
-
-    sampling_rate_hz: float | None = None
-    vector_pitch_mm: float | None = None
-    speed_of_sound_m_s: float = 1540.0
-    centre_frequency_hz: float | None = None
-    bandwidth_hz: tuple[float, float] | None = None
-    first_sample_depth_mm: float = 0.0
-    column_pitch_mm: float | None = None
-    row_spacing_mm: float | None = None
-    dynamic_range_db: float | None = None
-    frame_rate_hz: float | None = None
-    tracker_transform: str | None = None
-    reference_transform: str | None = None
-    image_to_probe: tuple[tuple[float, ...], ...] | None = None
 
 
 def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> Sweep:
@@ -157,17 +110,17 @@ def _geometry(
             rf = _rf_settings(header, settings, axial_mm)
             pitch = _need(header, "vector_pitch_mm", settings.vector_pitch_mm, lateral_mm)
             spacing = rf.sample_spacing_mm
-            return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm), rf
+            return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm or 0.0), rf
         if settings.image_to_probe is not None:
             lateral_mm, axial_mm = np.linalg.norm(_calibration(settings)[:3, :2], axis=0).tolist()
         pitch = _need(header, "column_pitch_mm", settings.column_pitch_mm, lateral_mm)
         spacing = _need(header, "row_spacing_mm", settings.row_spacing_mm, axial_mm)
         bmode = BModeSettings(_need(header, "dynamic_range_db", settings.dynamic_range_db, None))
-        return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm), bmode
+        return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm or 0.0), bmode
 
 
 def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: float | None) -> RFSettings:
-    speed = settings.speed_of_sound_m_s
+    speed = settings.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
     implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
     rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
     centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
@@ -177,7 +130,7 @@ def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: flo
 def _need(header: SequenceHeader, name: str, given: Value | None, read: Value | None) -> Value:
     value = read if given is None else given
     if value is None:
-        raise MissingSettingError(f"{header.path}: the header does not say: give {name}", name)
+        raise MissingSettingsError(header.path, (name,))
     return value
 
 
@@ -408,3 +361,10 @@ def _positive_carrier(frames: npt.NDArray[np.complex64]) -> npt.NDArray[np.compl
     first = frames[0]
     turn = np.angle(np.vdot(first[:, :-1], first[:, 1:]))
     return np.conj(frames) if turn < 0 else frames
+
+
+READER = Reader(
+    "image",
+    lambda _, start: is_metaimage(start) or is_nrrd(start),
+    lambda path, settings: read_metaimage(path, settings),
+)

@@ -26,7 +26,15 @@ from speckle3d.core.sweep import (
 )
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
 from speckle3d.io.hdf5_guard import plain_attribute, require_own
-from speckle3d.io.sweeps import FORMAT, KNOWN, SAMPLE_TYPES, VERSION, HDF5Frames, require_sample_type
+from speckle3d.io.sweeps import (
+    FORMAT,
+    KNOWN,
+    SAMPLE_TYPES,
+    VERSION,
+    HDF5Frames,
+    require_sample_type,
+    signal_attributes,
+)
 
 Compression = Literal["gzip", "lzf"] | None
 Progress = Callable[[int, int], None]
@@ -244,7 +252,7 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
-    held = vars(signal) | {"first_sample_depth_mm": grid.first_sample_depth_mm}
+    held = signal_attributes(signal) | {"first_sample_depth_mm": grid.first_sample_depth_mm}
     if isinstance(signal, RFSettings):
         band = np.asarray(signal.bandwidth_hz, dtype=float)
         return held | {"vector_pitch_mm": grid.vector_pitch_mm, "bandwidth_hz": band}

@@ -35,7 +35,9 @@ from speckle3d.core.sweep import (
 from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
+    has_format,
     has_member,
+    hdf5_claim,
     locate,
     open_hdf5,
     opened,
@@ -48,6 +50,7 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.hdf5_guard import is_only_deflated, require_whole_chunk, unpacked
+from speckle3d.io.readers import Reader
 
 FORMAT = "speckle3d.sweep"
 VERSION = 1
@@ -201,7 +204,15 @@ def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BMod
         dynamic_range_db = read_attribute(node, "dynamic_range_db")
         return BModeSettings(dynamic_range_db, read_attribute(node, "full_scale", default=255.0))
     low, high = read_vector_attribute(node, "bandwidth_hz", 2).tolist()
-    return RFSettings(**{name: read_attribute(node, name) for name in RF_NUMBERS}, bandwidth_hz=(low, high))
+    numbers = {name: read_attribute(node, name) for name in RF_NUMBERS}
+    name = "demodulation_frequency_hz"
+    middle = read_attribute(node, name) if name in node.attrs else None
+    return RFSettings(**numbers, bandwidth_hz=(low, high), demodulation_frequency_hz=middle)
+
+
+def signal_attributes(signal: RFSettings | BModeSettings) -> dict[str, Any]:
+    """Attributes that `read_signal` reads back."""
+    return {name: value for name, value in vars(signal).items() if value is not None}
 
 
 def _read_grid(node: h5py.Dataset, signal: RFSettings | BModeSettings) -> ImageGrid:
@@ -268,3 +279,10 @@ def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
     if samples and not valid.any():
         raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
     return valid
+
+
+READER = Reader(
+    FORMAT,
+    hdf5_claim(lambda file: has_format(file, FORMAT)),
+    lambda path, _: read_sweep(path),
+)

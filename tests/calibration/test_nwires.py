@@ -18,7 +18,8 @@ from calibration.nwires import (
     trimmed_mean_mm,
 )
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.io.metaimage import ImportSettings, read_metaimage, read_poses
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.metaimage import read_metaimage, read_poses
 from speckle3d.io.plus_config import read_wire_phantom
 
 PUBLISHED = {"Calibration": (0.479116, 0.22656), "Validation": (0.539932, 0.223536)}

@@ -7,7 +7,7 @@ import pytest
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.tables import text_table
-from speckle3d.io.metaimage import MissingSettingError
+from speckle3d.io.import_settings import MissingSettingsError
 
 HOSTILE = "a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
 SHOWN = r"a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
@@ -24,7 +24,7 @@ def test_what_people_write_stays(text):
     assert printable(text) == text
 
 
-@pytest.mark.parametrize("kind", [InvalidInputError, FileError, MissingSettingError])
+@pytest.mark.parametrize("kind", [InvalidInputError, FileError, MissingSettingsError])
 def test_an_error_is_one_line_whatever_it_quotes(kind):
     error = kind(f"{HOSTILE}: expected a")
     assert str(error) == f"{SHOWN}: expected a"

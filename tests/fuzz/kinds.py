@@ -227,7 +227,8 @@ def read_described(reader):
 
 
 def read_image(path):
-    from speckle3d.io.metaimage import ImportSettings, read_metaimage, read_poses
+    from speckle3d.io.import_settings import ImportSettings
+    from speckle3d.io.metaimage import read_metaimage, read_poses
 
     settings = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
     read_metaimage(path, settings)

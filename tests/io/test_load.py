@@ -11,8 +11,8 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.io.curves import write_curves
 from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
-from speckle3d.io.metaimage import ImportSettings
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import write_sweep
 

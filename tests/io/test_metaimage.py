@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +7,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.io.metaimage import ImportSettings, MissingSettingError, read_metaimage, read_poses
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.metaimage import read_metaimage, read_poses
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 RF = ImportSettings(
@@ -47,7 +46,7 @@ def test_spacing_in_the_header_is_used_where_no_setting_is_given(tmp_path):
     path = write_mha(
         tmp_path / "a.mha", rf, spacing="0.01925 0.25 1", fields={"UltrasoundImageType": "RF_REAL"}
     )
-    sweep = read_metaimage(path, replace(RF, sampling_rate_hz=None, vector_pitch_mm=None))
+    sweep = read_metaimage(path, RF.model_copy(update={"sampling_rate_hz": None, "vector_pitch_mm": None}))
     assert isinstance(sweep.signal, RFSettings)
     assert sweep.signal.sampling_rate_hz == pytest.approx(1540e3 / (2 * 0.01925))
     assert sweep.grid.vector_pitch_mm == 0.25
@@ -102,7 +101,7 @@ def test_transforms_are_chosen_by_name(tmp_path):
     other = ImportSettings(tracker_transform="ReferenceToTrackerTransform", reference_transform="none")
     swapped = read_poses(path, other).readings.world_from_sensor
     np.testing.assert_allclose(swapped.as_matrix(), reference.as_matrix(), atol=1e-3)
-    assert read_metaimage(path, replace(BMODE, tracker_transform="none")).tracker is None
+    assert read_metaimage(path, BMODE.model_copy(update={"tracker_transform": "none"})).tracker is None
     with pytest.raises(InvalidInputError, match=r"StylusToTracker.*ProbeToTracker"):
         read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
 
@@ -192,16 +191,16 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(tmp_path_
 )
 def test_the_missing_setting_is_named(tmp_path, setting, pixels):
     full = BMODE if pixels.dtype == np.uint8 else RF
-    with pytest.raises(MissingSettingError, match=rf"a\.mha: .*{setting}") as caught:
-        read_metaimage(write_mha(tmp_path / "a.mha", pixels), replace(full, **{setting: None}))
+    with pytest.raises(MissingSettingsError, match=rf"a\.mha: .*--{setting.replace('_', '-')}") as caught:
+        read_metaimage(write_mha(tmp_path / "a.mha", pixels), full.model_copy(update=dict(**{setting: None})))
     assert "\n" not in str(caught.value)
 
 
 def test_a_frame_rate_stands_in_for_time_stamps(tmp_path):
     path = write_mha(tmp_path / "a.mha", grey(), frames=[])
-    with pytest.raises(MissingSettingError, match="frame_rate_hz"):
+    with pytest.raises(MissingSettingsError, match="--frame-rate-hz"):
         read_metaimage(path, BMODE)
-    sweep = read_metaimage(path, replace(BMODE, frame_rate_hz=20.0))
+    sweep = read_metaimage(path, BMODE.model_copy(update={"frame_rate_hz": 20.0}))
     np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
 
 
@@ -244,14 +243,16 @@ def test_bad_fields_are_named_with_their_frame(tmp_path, frames, message):
 def test_bad_headers_are_refused(tmp_path, fields, message):
     pixels = grey(rows=5) if "RF_I_LINE_Q_LINE" in fields.values() else grey()
     with pytest.raises(InvalidInputError, match=message):
-        read_metaimage(write_mha(tmp_path / "a.mha", pixels, fields), replace(BMODE, bandwidth_hz=(1, 2)))
+        read_metaimage(
+            write_mha(tmp_path / "a.mha", pixels, fields), BMODE.model_copy(update={"bandwidth_hz": (1, 2)})
+        )
 
 
 def test_a_turned_image_calibration_is_refused(tmp_path):
     slanted = ((1.0, 0.5, 0, 0), (0, 1.0, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
     path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
     with pytest.raises(InvalidInputError, match=r"image_to_probe.*0\.447"):
-        read_metaimage(path, replace(BMODE, image_to_probe=slanted))
+        read_metaimage(path, BMODE.model_copy(update={"image_to_probe": slanted}))
 
 
 @settings(deadline=None, max_examples=40)
@@ -307,7 +308,7 @@ def test_ultrasonix_i_and_q_lines(realdata):
     ],
 )
 def test_tracked_bmode_of_plus(realdata, name, frames):
-    settings_ = replace(BMODE, column_pitch_mm=0.085, row_spacing_mm=0.085)
+    settings_ = BMODE.model_copy(update={"column_pitch_mm": 0.085, "row_spacing_mm": 0.085})
     sweep = read_metaimage(realdata / "plus" / name, settings_)
     assert sweep.frames.shape == (frames, 820, 616)
     assert len(sweep.tracker.readings) == frames

@@ -11,7 +11,8 @@ from image_examples import grey, tracked, write_mha
 
 from speckle3d.core.errors import FileError, Speckle3DError
 from speckle3d.io.headers import read_header
-from speckle3d.io.metaimage import ImportSettings, read_metaimage
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.metaimage import read_metaimage
 from speckle3d.io.pixels import read_pixels
 from speckle3d.io.volumes import read_volume
 

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
-from speckle3d.io.metaimage import ImportSettings
 from speckle3d.matching.inplane import InPlaneMotion, InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher, MatchingSettings

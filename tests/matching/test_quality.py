@@ -10,8 +10,8 @@ from speckle import GRID, RF, Speckle, intensity
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
-from speckle3d.io.metaimage import ImportSettings
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.matching.patches import lay_patches
 from speckle3d.matching.quality import (

@@ -6,7 +6,8 @@ from wire_scenes import PIXEL_MM, SHAPE, picture, plus_results, scene
 
 from calibration.detection.dots import DotSettings, dots_in_frames, dots_in_image
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.metaimage import ImportSettings, read_metaimage
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.metaimage import read_metaimage
 from speckle3d.io.plus_config import read_wire_phantom
 
 NOTHING = np.zeros((0, 2))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calibration.detection.lines import LineSettings, detect_line, detect_lines
-from speckle3d.io.metaimage import ImportSettings, read_metaimage
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.metaimage import read_metaimage
 
 pytestmark = pytest.mark.realdata
 

@@ -1,0 +1,153 @@
+"""What a recording's own files do not say, and is given instead: by options, or by a TOML file beside them.
+
+The numbers for ``scan.mha`` are looked for in ``scan.mha.toml`` and else in ``import.toml``, which serves
+every recording of its folder; options replace them one by one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.files import PathLike
+from speckle3d.io.toml import load_toml
+
+SPEED_OF_SOUND_M_S = 1540.0
+"""Of scanners that do not say theirs."""
+
+_FOLDER_FILE = "import.toml"
+
+
+class ImportSettings(BaseModel):
+    """Values that replace a recording's own, or stand in where it has none.
+
+    Attributes are named as the options of ``speckle3d convert``, and as they are in TOML.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sampling_rate_hz: float | None = Field(
+        None, gt=0, description="samples per second along a line, in the scanner's export settings or log"
+    )
+    vector_pitch_mm: float | None = Field(
+        None,
+        gt=0,
+        description="distance between lines; a linear probe's element pitch, in its data sheet, where each "
+        "element has one line",
+    )
+    speed_of_sound_m_s: float | None = Field(
+        None, gt=0, description="assumed by the scanner; 1540 unless its manual says otherwise"
+    )
+    centre_frequency_hz: float | None = Field(
+        None, gt=0, description="transmit frequency, on the scanner's screen or in the probe's data sheet"
+    )
+    bandwidth_hz: tuple[float, float] | None = Field(
+        None, description="lowest and highest frequency of the echoes, at -6 dB in the probe's data sheet"
+    )
+    demodulation_frequency_hz: float | None = Field(
+        None, ge=0, description="frequency that I/Q were shifted down by, usually the transmit frequency"
+    )
+    first_sample_depth_mm: float | None = Field(
+        None, description="depth of a line's first sample; 0 unless the scanner records later"
+    )
+    column_pitch_mm: float | None = Field(
+        None, gt=0, description="distance between columns, from the scanner's depth ruler or DICOM"
+    )
+    row_spacing_mm: float | None = Field(
+        None, gt=0, description="distance between rows, from the scanner's depth ruler or DICOM"
+    )
+    dynamic_range_db: float | None = Field(
+        None, gt=0, description="decibels from black to white, beside the image on the scanner's screen"
+    )
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames per second, on the scanner's screen")
+    probe: str | None = Field(
+        None, description="model of the probe, printed on it: gives the pitch of its elements"
+    )
+    tracker_transform: str | None = Field(
+        None,
+        description="poses to use, by their name in the file, as ToolToTracker; none for none",
+    )
+    reference_transform: str | None = Field(
+        None, description="poses of the reference, as ReferenceToTracker; none for none"
+    )
+    image_to_probe: tuple[tuple[float, ...], ...] | None = Field(
+        None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
+    )
+    arrays: dict[str, str] = Field(
+        default_factory=dict, description="arrays of a MATLAB file by what they are, as rf = 'RcvData'"
+    )
+
+    def over(self, path: PathLike, **found: Any) -> dict[str, Any]:
+        """Put what is given over what a file says of the same names.
+
+        Parameters
+        ----------
+        path : path
+            The recording, for the message.
+        **found
+            By setting's name, the file's own value; None where it does not say and the value is needed.
+
+        Raises
+        ------
+        MissingSettingsError
+            Naming every setting that neither has.
+        """
+        values = {
+            name: own if (given := getattr(self, name)) is None else given for name, own in found.items()
+        }
+        lacking = tuple(name for name, value in values.items() if value is None)
+        if lacking:
+            raise MissingSettingsError(path, lacking)
+        return values
+
+
+class MissingSettingsError(InvalidInputError):
+    """A recording does not say values that are needed, and nothing gives them.
+
+    Attributes
+    ----------
+    settings : tuple of str
+        All of them, by their names in `ImportSettings`.
+    """
+
+    def __init__(self, path: PathLike | str, settings: tuple[str, ...] = ()) -> None:
+        self.settings = settings
+        super().__init__(_asking(path, settings) if settings else str(path))
+
+
+def settings_for(path: PathLike, given: ImportSettings | None = None) -> ImportSettings:
+    """Settings beside a recording, with those given over them.
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        If the file beside it cannot be read, or holds other settings.
+    """
+    given = given or ImportSettings()
+    beside = settings_file(path)
+    if beside is None:
+        return given
+    return load_toml(ImportSettings, beside).model_copy(
+        update={name: getattr(given, name) for name in given.model_fields_set}
+    )
+
+
+def settings_file(path: PathLike) -> Path | None:
+    """Find the file beside a recording that gives what it lacks."""
+    own = Path(path)
+    for file in (own.with_name(f"{own.name}.toml"), own.with_name(_FOLDER_FILE)):
+        if file.is_file():
+            return file
+    return None
+
+
+def _asking(path: PathLike | str, settings: tuple[str, ...]) -> str:
+    fields = ImportSettings.model_fields
+    wanted = "; ".join(f"--{name.replace('_', '-')} ({fields[name].description})" for name in settings)
+    return (
+        f"{path}: the file does not say, so give `speckle3d convert` or {Path(path).name}.toml beside it: "
+        f"{wanted}"
+    )

@@ -1,0 +1,102 @@
+"""Readers of sweeps: one object a format, found by what a file holds. Other packages add theirs.
+
+A package adds a format by an entry point of the group ``speckle3d.readers`` that names a `Reader`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.sweep import Sweep
+from speckle3d.io.import_settings import ImportSettings
+
+Row = tuple[str, str, str]
+"""Description, value, unit."""
+
+GROUP = "speckle3d.readers"
+START_BYTES = 4096
+
+_OWN = ("sweeps", "challenge", "metaimage")
+"""Modules of this package that have a reader, in the order in which they are asked."""
+
+
+def _nothing_beside(_: Path) -> Sequence[Path]:
+    return ()
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How sweeps of one format are told and read.
+
+    Attributes
+    ----------
+    format : str
+        What `speckle3d info` calls it.
+    claims : callable
+        Whether a recording is of this format, from its path and its first `START_BYTES` bytes, which are
+        none for a folder. It raises nothing.
+    read : callable
+        The sweep of a recording, with `ImportSettings` for what it does not say.
+    describe : callable, optional
+        Rows of what a recording holds, also where it is no sweep; by default the sweep's.
+    companions : callable
+        Other files that the sweep's content depends on.
+    """
+
+    format: str
+    claims: Callable[[Path, bytes], bool]
+    read: Callable[[Path, ImportSettings], Sweep]
+    describe: Callable[[Path, ImportSettings], list[Row]] | None = None
+    companions: Callable[[Path], Sequence[Path]] = _nothing_beside
+
+
+def find_reader(path: PathLike) -> Reader | None:
+    """Find the reader that claims a recording, a file or a folder; None where none does.
+
+    Raises
+    ------
+    FileError
+        If there is no such file or folder, or it cannot be read.
+    """
+    place = Path(path)
+    start = first_bytes(place)
+    return next((reader for reader in readers() if reader.claims(place, start)), None)
+
+
+def first_bytes(path: PathLike) -> bytes:
+    """First bytes of a file, none of a folder.
+
+    Raises
+    ------
+    FileError
+        If there is neither, or it cannot be read.
+    """
+    if Path(path).is_dir():
+        return b""
+    if not Path(path).exists():
+        raise FileError(f"{path}: expected a file, got none")
+    with open_regular(path) as stream:
+        return stream.read(START_BYTES)
+
+
+@cache
+def readers() -> tuple[Reader, ...]:
+    """All readers, those of other packages first."""
+    return (*_others(), *(import_module(f"speckle3d.io.{name}").READER for name in _OWN))
+
+
+def _others() -> Iterator[Reader]:
+    for entry in sorted(entry_points(group=GROUP), key=lambda each: each.name):
+        reader = entry.load()
+        if not isinstance(reader, Reader):
+            raise InvalidInputError(
+                f"entry point {entry.name} of {GROUP}: expected a Reader, got {type(reader).__name__}"
+            )
+        yield reader

@@ -1,0 +1,64 @@
+"""TOML files checked against a pydantic model, so that an error names the file and the setting."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.files import open_regular
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_MOST_BYTES = 2**20
+"""A hundred times what every setting takes."""
+
+
+def load_toml(model: type[Model], path: Path) -> Model:
+    """Read settings of a model from a TOML file; those that it does not give keep their defaults.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the setting that is unknown or out of range.
+    """
+    try:
+        with open_regular(path) as stream:
+            content = stream.read(_MOST_BYTES + 1)
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
+    if len(content) > _MOST_BYTES:
+        raise FileError(f"{path}: expected at most {_MOST_BYTES} bytes of TOML, got more")
+    return validated(parsed(text, str(path)), str(path), model)
+
+
+def parsed(text: str, where: str) -> dict[str, Any]:
+    """Parse TOML text; `where` is named in errors."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InvalidInputError(f"{where}: expected TOML, got brackets within brackets without end") from None
+    # Of TOML, and of numbers with thousands of digits.
+    except ValueError as error:
+        raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
+
+
+def first_fault(error: ValidationError) -> tuple[str, str]:
+    """Return the name of the first setting that is wrong, and what is wrong with it."""
+    first = error.errors()[0]
+    return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {first['input']!r}"
+
+
+def validated(values: dict[str, Any], where: str, model: type[Model]) -> Model:
+    """Make a model of values; an error names `where` and the first wrong setting."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        name, fault = first_fault(error)
+        raise InvalidInputError(f"{where}: {f'{name}: ' if name else ''}{fault}") from error
