@@ -73,6 +73,11 @@ class ImportSettings(BaseModel):
     reference_transform: str | None = Field(
         None, description="poses of the reference, as ReferenceToTracker; none for none"
     )
+    plus_config: str | None = Field(
+        None,
+        description="device set of PLUS, with the place of the image on the probe and the size of its "
+        "pixels; in TOML, a file of the same folder",
+    )
     image_to_probe: tuple[tuple[float, ...], ...] | None = Field(
         None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import h5py
 import numpy as np
@@ -41,6 +41,14 @@ Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
+
+
+@runtime_checkable
+class CarriesMore(Protocol):
+    """Frames of a recording that says more than a sweep holds."""
+
+    def write_more(self, file: h5py.File) -> None:
+        """Write that into groups of its own."""
 
 
 class SweepWriter(HDF5Writer):
@@ -131,6 +139,10 @@ class SweepWriter(HDF5Writer):
             plain = isinstance(value, str | int | float)
             group.attrs[name] = value if plain else json.dumps(value, sort_keys=True)
 
+    def write_more(self, frames: CarriesMore) -> None:
+        """Write what frames carry beyond the format."""
+        frames.write_more(self._file)
+
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
         with reading(source), naming(str(source)), open_hdf5(source) as other:
@@ -207,6 +219,8 @@ def write_sweep(
             writer.write_probe(sweep.probe)
         if simulation is not None:
             writer.write_simulation(simulation)
+        if isinstance(sweep.frames, CarriesMore):
+            writer.write_more(sweep.frames)
         if type(sweep.frames) is HDF5Frames:
             writer.copy_unknown(sweep.frames.path)
 
