@@ -246,6 +246,19 @@ class _Source:
         found = self.device.transform(IMAGE, self.tool)
         return None if found is None else (found, f"{self.settings.plus_config}: {name}")
 
+    def sources(self) -> list[Row]:
+        """Rows that tell where values which the header does not say come from."""
+        given, own = self.settings, self.own
+        calibrated = self.image_to_probe()
+        rows = [("image calibration", "none" if calibrated is None else calibrated[1], "")]
+        if given.plus_config is not None:
+            rows.append(("device set", given.plus_config, ""))
+        if given.first_sample_depth_mm is None and "first_sample_depth_mm" not in own:
+            rows.append(("first sample depth", "0 (assumed)", "mm"))
+        if self.layout.is_rf and given.speed_of_sound_m_s is None and "speed_of_sound_m_s" not in own:
+            rows.append(("speed of sound", f"{SPEED_OF_SOUND_M_S:g} (assumed)", "m/s"))
+        return rows
+
     @property
     def tool(self) -> str:
         """Frame of the tracked tool, as Probe."""
@@ -317,23 +330,31 @@ def _turns_backwards(frame: npt.NDArray[Any]) -> bool:
     return bool(np.angle(np.vdot(frame[:, :-1], frame[:, 1:])) < 0)
 
 
-def describe_header(path: PathLike, settings: ImportSettings) -> list[Row]:
-    """Tell what a header says."""
-    header = read_header(path)
-    layout = layout_of(header)
+def describe_sequence(path: PathLike, settings: ImportSettings) -> list[Row]:
+    """Tell what a header says, and what is taken from elsewhere or assumed."""
+    source = _Source.open(path, settings)
+    header, layout = source.header, source.layout
     spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
+    poses = source.poses()
     return [
         ("container", header.file_format, ""),
         ("size", " x ".join(str(n) for n in header.size), ""),
         ("images", str(header.frame_count), ""),
+        ("images not valid", str(np.count_nonzero(~source.record().has_image)), ""),
         ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
-        ("image type", layout.kind, ""),
-        ("image orientation", layout.orientation, ""),
+        ("image type", _said(header, "UltrasoundImageType", layout.kind), ""),
+        ("image orientation", _said(header, "UltrasoundImageOrientation", layout.orientation), ""),
         ("pixel type", header.pixels.dtype.name, ""),
         ("packing", header.pixels.packing, ""),
         ("transforms", ", ".join(header.transforms) or "none", ""),
-        ("time stamps", "yes" if any("Timestamp" in f for f in header.frames) else "no", ""),
+        ("tracker of", "none" if poses is None else " and ".join(poses.names), ""),
+        ("time stamps", "yes" if source.has_times else "no", ""),
+        *source.sources(),
     ]
+
+
+def _said(header: SequenceHeader, name: str, used: str) -> str:
+    return used if name in header.fields else f"{used} (assumed)"
 
 
 def _companions(path: Path) -> Sequence[Path]:
@@ -345,6 +366,6 @@ READER = Reader(
     "image",
     lambda _, start: is_metaimage(start) or is_nrrd(start),
     read_metaimage,
-    describe_header,
+    describe_sequence,
     _companions,
 )

@@ -94,13 +94,16 @@ class DeviceSet:
                         waiting.append(target)
         return reached.get(end)
 
-    def pixel_mm(self, size: tuple[int, ...]) -> tuple[float, float] | None:
+    def pixel_mm(self, size: tuple[float, ...] | None) -> tuple[float, float] | None:
         """Distances of columns and rows of the image, whose size is (x, y), mm; None if unknown."""
         for end in (self.probe_frame, self.origin_frame):
             found = self.transform(self.image_frame, end)
             if found is not None:
                 return pixel_axes(found, f"{self.image_frame} to {end}")
-        return self.scan.output_mm if self.scan.output_size in (None, tuple(size[:2])) else None
+                is_of_size = self.scan.output_size is None or (
+                    size is not None and size[:2] == self.scan.output_size
+                )
+        return self.scan.output_mm if is_of_size else None
 
     def line_pitch_mm(self, path: PathLike, lines: int) -> float | None:
         """Distance between the lines of which PLUS makes an image: the transducer's width over their number.
