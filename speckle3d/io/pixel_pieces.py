@@ -1,7 +1,7 @@
 """Pixels of image files piece by piece, in memory that does not grow with their number.
 
 Raw pixels are read where they lie. Packed ones are unpacked from the front; places on the way are kept, at
-most `_MOST_PLACES` of some 50 KB each, so that going back costs a bounded part of the file. Pixels packed
+most `_MOST_PLACES` of some 60 KB each, so that going back costs a bounded part of the file. Pixels packed
 with bzip2 have no such places and are unpacked from the start again; those written as text are held in
 memory.
 """
@@ -25,7 +25,7 @@ from speckle3d.core.files import open_regular
 from speckle3d.io.pixels import Pixels, read_pixels
 
 _MOST_PLACES = 64
-_PACKED_BYTES = 2**18
+_PACKED_BYTES = 2**14
 
 
 class PixelPieces:
