@@ -28,7 +28,7 @@ def axes(vectors=VECTORS, samples=SAMPLES):
 
 
 def write_uff(path, frames, modulation_hz=0.0, pulse=(6e6, 0.5), scan="uff.linear_scan", name="b_data"):
-    """Write beamformed data as USTB does from MATLAB: axes in reverse, those of length 1 at its end left out."""
+    """Write beamformed data as USTB does from MATLAB: axes in reverse, last ones of length 1 left out."""
     data = frames.reshape(len(frames), 1, 1, -1)
     if len(frames) == 1:
         data = data.reshape(1, -1)

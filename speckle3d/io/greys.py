@@ -20,7 +20,7 @@ dB."""
 
 @dataclass(frozen=True)
 class Levels:
-    """Turns decibels, or an echo's amplitude, into grey levels: `top` to 255, `dynamic_range_db` below to 0."""
+    """Turns decibels, or an echo's amplitude, into grey levels, 255 at `top`, 0 that range below."""
 
     layout: Layout
     decibels: bool
