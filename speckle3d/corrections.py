@@ -68,11 +68,11 @@ def correct(
     Examples
     --------
     >>> import speckle3d as s3
-    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> sweep = s3.load_sweep("data/phantom.h5").part(0, 32)
     >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
     >>> corrected = s3.correct(tracked, sweep, ["orientation", "pose"])
     >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
-    [96, 96]
+    [32, 32]
     """
     settings = config or Config()
     require_modes(sweep, modes, crossed is not None)

@@ -167,10 +167,10 @@ def track(
     Examples
     --------
     >>> import speckle3d as s3
-    >>> sweep = s3.load_sweep("data/phantom.h5")
+    >>> sweep = s3.load_sweep("data/phantom.h5").part(0, 32)
     >>> tracked = s3.track(sweep, s3.load_curves("data/curves.h5"))
     >>> len(tracked.image), tracked.direction_from, bool(tracked.flags.any())
-    (96, 'tracker', False)
+    (32, 'tracker', False)
     """
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)

@@ -9,6 +9,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from made_once import made_once
 
 # Started in the background, a process ignores Ctrl-C and so would all that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -46,9 +47,12 @@ def back(tmp_path_factory) -> Path:
     settings = SimulationSettings(
         preset="reversal", vectors=26, samples=1200, seed=77, length_mm=10.0, frames=50
     )
-    path = tmp_path_factory.mktemp("back") / "back.h5"
-    write_sweep(path, simulate(settings)[0].sweep)
-    return path
+    folder = made_once(
+        tmp_path_factory,
+        "back",
+        lambda folder: write_sweep(folder / "back.h5", simulate(settings)[0].sweep),
+    )
+    return folder / "back.h5"
 
 
 @pytest.fixture(scope="session")
@@ -57,14 +61,15 @@ def small_sweeps(tmp_path_factory, shipped) -> Path:
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings, simulate
 
-    folder = tmp_path_factory.mktemp("small-sweeps")
-    shutil.copy(shipped / "curves.h5", folder)
-    for seed in (5, 6):
-        settings = SimulationSettings(
-            preset="tissue", vectors=26, samples=1000, seed=seed, length_mm=3.0, frames=24
-        )
-        write_sweep(folder / f"s{seed}.h5", simulate(settings)[0].sweep)
-    return folder
+    def make(folder):
+        shutil.copy(shipped / "curves.h5", folder)
+        for seed in (5, 6):
+            settings = SimulationSettings(
+                preset="tissue", vectors=26, samples=1000, seed=seed, length_mm=3.0, frames=24
+            )
+            write_sweep(folder / f"s{seed}.h5", simulate(settings)[0].sweep)
+
+    return made_once(tmp_path_factory, "small-sweeps", make)
 
 
 @pytest.fixture(scope="session")

@@ -80,10 +80,11 @@ def write_with_report(
     from speckle3d.core.calibration import Source
     from speckle3d.io.calibrations import write_calibration
     from speckle3d.io.fileset import FileSet
-    from speckle3d.io.hdf5 import atomic_path, sha256_of
+    from speckle3d.io.hdf5 import atomic_path
+    from speckle3d.io.load import recording_sha256
     from speckle3d.study.figures import save_figure
 
-    names, hashes = (" ".join(map(of, inputs)) for of in (str, sha256_of))
+    names, hashes = (" ".join(map(of, inputs)) for of in (str, recording_sha256))
     named = replace(calibration, source=Source(names, hashes, version("speckle3d")))
     table = text_report(named, beam, notes)
     text, pictures, points = (out.with_suffix(suffix) for suffix in _BESIDE)

@@ -13,7 +13,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import load_sweep, sniff
+from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
 from speckle3d.io.metaimage import lacking_poses, read_poses
 from speckle3d.study.images import GreyImages
 
@@ -121,10 +121,10 @@ def require_sequence(path: Path, transform: str | None) -> None:
     ------
     InvalidInputError
     """
-    if transform is not None and sniff(path) == "hdf5":
+    if transform is not None and kind_of(path) != IMAGE:
         raise InvalidInputError(
-            f"--transform: expected an image sequence with it, got {path}, a sweep file, whose poses have no "
-            "names"
+            f"--transform: expected an image sequence with it, got {path} ({kind_of(path)}), whose poses "
+            "have no names"
         )
 
 
@@ -135,8 +135,8 @@ def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
     ------
     InvalidInputError
     """
-    if pixel_mm is not None and sniff(path) == "hdf5":
-        raise InvalidInputError(f"--pixel-mm: expected none with {path}, a sweep file, which has its own")
+    if pixel_mm is not None and kind_of(path) in SIZED:
+        raise InvalidInputError(f"--pixel-mm: expected none with {path}, which has its own")
 
 
 def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
@@ -150,7 +150,7 @@ def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:
     found = sweep.orientation if sensor == "orientation" else sweep.tracker
     if found is None:
-        held = "none" if sniff(path) == "hdf5" else lacking_poses(path)
+        held = lacking_poses(path) if kind_of(path) == IMAGE else "none"
         others = "a tracker (--sensor tracker uses its orientation)" if sweep.tracker else held
         raise InsufficientDataError(
             f"{path}: expected readings of the {sensor} sensor there or in --poses, got {others}"
@@ -161,7 +161,7 @@ def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | Timed
 
 
 def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedPoses | TimedRotations, float]:
-    if sniff(path) == "hdf5":
+    if kind_of(path) != IMAGE:
         return _readings(load_sweep(path), path, sensor)
     tracker = read_poses(path, ImportSettings(tracker_transform=transform))
     if sensor == "orientation":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
@@ -9,13 +10,16 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file
+from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import find_reader, first_bytes, readers
 
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
+
+SIZED = (sweeps.FORMAT, challenge.FORMAT)
+"""Kinds that always say how large their pixels are."""
 
 
 def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
@@ -62,12 +66,30 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
 
 
 def companion_files(path: PathLike) -> list[Path]:
-    """List other files that a sweep's content depends on."""
+    """List other files that a sweep's content depends on; none of what no reader claims."""
     reader, beside = find_reader(path), settings_file(path)
-    return [
-        *(() if reader is None else reader.companions(Path(path))),
-        *(() if beside is None else (beside,)),
-    ]
+    if reader is None:
+        return []
+    return [*reader.companions(Path(path)), *(() if beside is None else (beside,))]
+
+
+def recording_files(path: PathLike) -> list[Path]:
+    """List the files that a recording's content depends on: itself, unless it is a folder, and companions."""
+    place = Path(path)
+    return [*([] if place.is_dir() else [place]), *companion_files(place)]
+
+
+def recording_sha256(path: PathLike) -> str:
+    """SHA-256 of all that a recording's content depends on, as 64 hexadecimal digits.
+
+    Of a file alone, that of its bytes; with companions, or of a folder, that of a line of name and SHA-256
+    for each file, sorted.
+    """
+    files = recording_files(path)
+    if files == [Path(path)]:
+        return sha256_of(path)
+    lines = sorted(f"{file.name} {sha256_of(file)}" for file in files)
+    return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
 
 
 def kind_of(path: PathLike) -> str:

@@ -24,8 +24,7 @@ from speckle3d.core.reconstruction import FramePairs, Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.io.calibrations import apply_calibrations
-from speckle3d.io.hdf5 import sha256_of
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves
@@ -237,13 +236,13 @@ def _read_details(folder: Path) -> Record:
 
 def _open_sweep(directory: Path, entry: Record, found: Reconstruction, notes: list[str]) -> Sweep | None:
     stored = Path(str(entry["path"]))
-    path = stored if stored.is_file() else directory / stored
+    path = stored if stored.exists() else directory / stored
     missing = "so there is no reference in its curves and there are no reslices"
-    if not path.is_file():
+    if not path.exists():
         notes.append(f"The sweep is no longer at {stored}, {missing}.")
         return None
     try:
-        if sha256_of(path) != found.provenance.input_sha256:
+        if recording_sha256(path) != found.provenance.input_sha256:
             notes.append(f"The sweep at {stored} is no longer the one that was reconstructed, {missing}.")
             return None
         return apply_calibrations(load_sweep(path), [c.path for c in found.provenance.calibrations])[0]

@@ -20,8 +20,9 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import file_format, open_hdf5, reading, sha256_of
-from speckle3d.io.load import load_landmarks, load_sweep, sniff
+from speckle3d.io.hdf5 import file_format, open_hdf5, reading
+from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256, sniff
+from speckle3d.io.readers import find_reader
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import LengthUnit, read_tum
 from speckle3d.scoring.displacements import challenge_score, score_row
@@ -86,12 +87,12 @@ def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> Pos
 
 def kind_of(path: Path) -> str:
     """Kind of a file by its content: "reconstruction", "sweep" or "text" (anything unknown)."""
+    if find_reader(path) is not None:
+        return "sweep"
     try:
-        kind = sniff(path)
+        sniff(path)
     except InvalidInputError:
         return "text"
-    if kind != "hdf5":
-        return "sweep"
     with reading(path), open_hdf5(path) as file:
         is_reconstruction = "format" in file.attrs and file_format(file) == FORMAT
     return "reconstruction" if is_reconstruction else "sweep"
@@ -161,7 +162,7 @@ def load_reference(
     marks = load_landmarks(path) if held.covered.all() else None
     times = sweep.frame_time_s[held.covered]
     name = f"{path.name}, {held.name}"
-    return Trajectory(name, times, held.world_from_image, sweep.grid, marks, sha256_of(path))
+    return Trajectory(name, times, held.world_from_image, sweep.grid, marks, recording_sha256(path))
 
 
 def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:

@@ -16,8 +16,7 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.images import Images
 from speckle3d.imaging.reslice import ReslicePlane, along_sweep_plane, reslice_frames
-from speckle3d.io.hdf5 import sha256_of
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
 
@@ -141,10 +140,10 @@ def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Rec
     reconstruction = read_reconstruction(path, with_pairs=False)
     stored = Path(reconstruction.provenance.input_path)
     # The stored path is tried as it is, then from the reconstruction's folder.
-    source = sweep_file or (stored if stored.is_file() else path.parent / stored)
-    if not source.is_file():
+    source = sweep_file or (stored if stored.exists() else path.parent / stored)
+    if not source.exists():
         raise InvalidInputError(f"{path}: expected its sweep at {source}, got none; say where it is: --sweep")
-    if sha256_of(source) != reconstruction.provenance.input_sha256:
+    if recording_sha256(source) != reconstruction.provenance.input_sha256:
         raise MismatchError(f"{source}: expected the sweep that {path} was made from, got another (SHA-256)")
     return reconstruction, part_at(load_sweep(source), reconstruction.frame_time_s)
 

@@ -26,8 +26,8 @@ from speckle3d.correction.trust import believed, require_believed
 from speckle3d.corrections import Correction, correct
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
-from speckle3d.io.hdf5 import PathLike, sha256_of
-from speckle3d.io.load import kind_of
+from speckle3d.io.hdf5 import PathLike
+from speckle3d.io.load import kind_of, recording_sha256
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Progress, Tracked, after, track
@@ -170,7 +170,11 @@ def write_results(
             left_out[SUBSET] = _refusal_of_subset(sweep, tracked)
         poses |= {mode: c.poses for mode, c in corrections.items()}
         provenance = Provenance(
-            written_path(source), sha256_of(source), version("speckle3d"), mounted, request.crossing_file
+            written_path(source),
+            recording_sha256(source),
+            version("speckle3d"),
+            mounted,
+            request.crossing_file,
         )
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     if request.reference is None and compared is not None and compared.name == "tracker":

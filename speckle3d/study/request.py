@@ -15,7 +15,8 @@ from speckle3d.core.reconstruction import SourceFile
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.modes import require_modes
 from speckle3d.correction.trust import cleaned_readings
-from speckle3d.io.hdf5 import PathLike, sha256_of
+from speckle3d.io.hdf5 import PathLike
+from speckle3d.io.load import recording_sha256
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.scoring.references import Reference, find_reference
 
@@ -59,7 +60,7 @@ class Request:
         if self.crossing is None:
             return None
         path = self.crossing[1]
-        return SourceFile(written_path(path), sha256_of(path))
+        return SourceFile(written_path(path), recording_sha256(path))
 
 
 def require_possible(

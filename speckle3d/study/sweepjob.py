@@ -24,7 +24,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
-from speckle3d.io.load import companion_files, load_landmarks, load_sweep, sniff
+from speckle3d.io.load import load_landmarks, load_sweep, recording_files, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.blocks import Block, blocks_of
 from speckle3d.pipeline import match_ahead
@@ -121,12 +121,11 @@ def plan_sweep(
     path = path.resolve()
     found = (curves or path.parent / "curves.h5").resolve()
     try:
-        sniff(path)  # names a file that is not there
         stamp = _stamp(path)
-        frames, sha256 = len(load_sweep(path)), sha256_of(path)
+        frames, sha256 = len(load_sweep(path)), recording_sha256(path)
         crossing = crossing_of(path) if "crossed" in (modes or ()) else None
-        beside = () if crossing is None else (crossing, *companion_files(crossing))
-        used = [sha256_of(each) for each in (found, *calibrations, *companion_files(path), *beside)]
+        used = [sha256_of(each) for each in (found, *calibrations)]
+        used += [] if crossing is None else [recording_sha256(crossing)]
     except Exception as error:  # noqa: BLE001 - one row that says why
         return SweepOutcome(name, path, "failed", _reason(error))
     parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
@@ -159,7 +158,7 @@ def crossing_of(path: Path) -> Path | None:
     """The crossing sweep of ``SWEEP.h5``: ``SWEEP-crossing.h5`` beside it, and the other way round."""
     stem = path.stem.removesuffix("-crossing") if path.stem.endswith("-crossing") else f"{path.stem}-crossing"
     beside = path.with_name(f"{stem}{path.suffix}")
-    return beside if beside.is_file() else None
+    return beside if beside.exists() else None
 
 
 def plan_blocks(job: SweepJob) -> list[BlockJob]:
@@ -256,13 +255,14 @@ def _require_unchanged(job: SweepJob) -> None:
 
 
 def _require_same(job: SweepJob) -> None:
-    if sha256_of(job.path) != job.sha256:
+    if recording_sha256(job.path) != job.sha256:
         raise InvalidInputError(f"{job.path}: expected the file that the study began with, got another")
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns
+    """Bytes of all files of a recording, and when the last of them was written, ns."""
+    held = [file.stat() for file in recording_files(path)]
+    return sum(each.st_size for each in held), max(each.st_mtime_ns for each in held)
 
 
 def finished(job: SweepJob) -> SweepOutcome | None:

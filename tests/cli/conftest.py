@@ -7,6 +7,7 @@ import sys
 import h5py
 import pytest
 from commands import SMALL, command
+from made_once import made_once
 
 from speckle3d import cli
 
@@ -49,32 +50,37 @@ def refused(run, tmp_path):
 @pytest.fixture(scope="session")
 def bench(tmp_path_factory):
     """A folder with a small sweep and the curves for it, made by the command in a process of its own."""
-    folder = tmp_path_factory.mktemp("bench")
     steps = ("--preset", "stepped", "--steps", "15", "--step-mm", "0.06", "--blocks", "2")
-    for arguments in (
-        ("simulate", folder / "sweep.h5", *SMALL, "--length-mm", "3", "--frames", "24"),
-        ("simulate", folder / "stepped.h5", *SMALL, *steps),
-        ("calibrate", "curves", folder / "stepped.h5", "-o", folder / "curves.h5"),
-    ):
-        done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0, done.stderr
-    return folder
+
+    def make(folder):
+        for arguments in (
+            ("simulate", folder / "sweep.h5", *SMALL, "--length-mm", "3", "--frames", "24"),
+            ("simulate", folder / "stepped.h5", *SMALL, *steps),
+            ("calibrate", "curves", folder / "stepped.h5", "-o", folder / "curves.h5"),
+        ):
+            done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+            assert done.returncode == 0, done.stderr
+
+    return made_once(tmp_path_factory, "bench", make)
 
 
 @pytest.fixture(scope="session")
-def reconstructed(bench):
+def reconstructed(bench, tmp_path_factory):
     """The folder of the small sweep's results."""
-    folder = bench / "out"
     modes = ("--drift", "orientation", "--drift", "pose")
-    done = subprocess.run(
-        command("reconstruct", bench / "sweep.h5", "-o", folder, *modes),
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert [line.split()[2] for line in done.stdout.splitlines()[2:]] == ["image", "orientation", "pose"]
-    return folder
+
+    def make(folder):
+        done = subprocess.run(
+            command("reconstruct", bench / "sweep.h5", "-o", folder, *modes),
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        rows = done.stdout.splitlines()[2:]
+        assert [line.split()[2] for line in rows] == ["image", "orientation", "pose"]
+
+    return made_once(tmp_path_factory, "bench-out", make)
 
 
 @pytest.fixture

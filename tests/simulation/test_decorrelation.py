@@ -65,6 +65,7 @@ def measured():
     return intensity_correlation(TiledMedium(5, 100.0, 0.0), tabulate_beam(), DEPTHS_MM)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", range(len(DEPTHS_MM)))
 def test_decorrelation_is_what_diffraction_predicts(measured, which):
     rho, error = measured
@@ -75,6 +76,7 @@ def test_decorrelation_is_what_diffraction_predicts(measured, which):
     assert (np.abs(rho[which] - predicted) < tolerance).all(), (rho[which], predicted, error[which])
 
 
+@pytest.mark.slow
 def test_speckle_decorrelates_fastest_off_focus_where_the_beam_is_widest(measured):
     rho, _ = measured
     # Its elevational half width at 10 mm is twice that at 20 mm, and yet: the wavefront is curved.

@@ -1,0 +1,18 @@
+"""Folders that are dear to make, made by the first of several test processes and used by all."""
+
+import fcntl
+import os
+
+
+def made_once(tmp_path_factory, name, make):
+    """Folder of a name that `make` has filled, in this run of the tests; nothing may change it afterwards."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, done = shared / name, shared / f"{name}.made"
+    with open(shared / f"{name}.lock", "w", encoding="utf-8") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            folder.mkdir()
+            make(folder)
+            done.touch()
+    return folder
