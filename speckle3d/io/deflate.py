@@ -43,7 +43,7 @@ def deflate() -> Callable[[ByteArray], bytes]:
 def deflated_by_zlib(data: ByteArray) -> bytes:
     """Pack bytes; of the repetitions in echoes, only those of single bytes are worth their search."""
     packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, zlib.Z_RLE)
-    return packer.compress(data) + packer.flush()
+    return packer.compress(data.data) + packer.flush()
 
 
 class DeflatingWriter:
