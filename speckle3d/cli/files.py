@@ -86,6 +86,16 @@ def simulate(
     sensor_noise: Annotated[
         float | None, typer.Option(help="plane: factor on the noise of both sensors (1).")
     ] = None,
+    signal: Annotated[str | None, typer.Option(help="What is stored: rf, iq or bmode (rf).")] = None,
+    demodulation_frequency_hz: Annotated[
+        float | None, typer.Option(help="iq: what the echoes are shifted down by (their centre frequency).")
+    ] = None,
+    decimation: Annotated[
+        int | None, typer.Option(help="iq, bmode: samples of the echoes in one that is stored.")
+    ] = None,
+    dynamic_range_db: Annotated[
+        float | None, typer.Option(help="bmode: from black to white, 8 bits (60).")
+    ] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
     from speckle3d.io.fileset import FileSet

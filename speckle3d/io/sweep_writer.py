@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from types import TracebackType
 from typing import Any, Literal
 
 import h5py
@@ -25,6 +26,7 @@ from speckle3d.core.sweep import (
     Tracker,
     stored_dtype,
 )
+from speckle3d.io.deflate import DeflatingWriter
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
 from speckle3d.io.hdf5_guard import plain_attribute, require_own
 from speckle3d.io.sweeps import (
@@ -42,7 +44,7 @@ Compression = Literal["gzip", "lzf"] | None
 Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1
-"""Speckle hardly compresses further at higher levels, which cost several times the time."""
+"""Told to readers; what packs is `speckle3d.io.deflate`."""
 
 
 class SweepWriter(HDF5Writer):
@@ -57,7 +59,8 @@ class SweepWriter(HDF5Writer):
     dtype : dtype
         int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
     compression : {"gzip", "lzf", None}
-        HDF5 filter, with byte shuffling; lzf is faster and larger.
+        HDF5 filter, with byte shuffling. gzip packs in threads (see `speckle3d.io.deflate`), lzf does not and
+        is both slower and larger; None is as fast as the disk.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class SweepWriter(HDF5Writer):
         require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
         self._paired = self._name == "iq" and self._dtype == np.int16
         self._compression = compression
+        self._deflating: DeflatingWriter | None = None
         self._time_s: list[float] = []
 
     def _begin(self) -> None:
@@ -93,6 +97,17 @@ class SweepWriter(HDF5Writer):
         self._frames = node.id
         self._in_memory = h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
+        if self._compression == "gzip":
+            self._deflating = DeflatingWriter(self._frames, self._require_room)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            super().__exit__(kind, error, trace)
+        finally:
+            if self._deflating is not None:
+                self._deflating.close()
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
@@ -117,7 +132,8 @@ class SweepWriter(HDF5Writer):
         if self._paired:
             frame = _as_pairs(frame, where)
         self._write(i, np.ascontiguousarray(frame, self._dtype))
-        self._require_room()
+        if self._deflating is None:
+            self._require_room()
         self._time_s.append(float(time_s))
 
     def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
@@ -150,6 +166,9 @@ class SweepWriter(HDF5Writer):
                     self._file.attrs[name] = plain_attribute(other, name)
 
     def _write(self, i: int, frame: npt.NDArray[Any]) -> None:
+        if self._deflating is not None:
+            self._deflating.append(frame)
+            return
         self._frames.set_extent((i + 1, *frame.shape))
         on_disk = self._frames.get_space()
         on_disk.select_hyperslab((i, *(0,) * frame.ndim), (1, *frame.shape))
@@ -158,6 +177,8 @@ class SweepWriter(HDF5Writer):
         self._on_disk = on_disk
 
     def _finish(self) -> None:
+        if self._deflating is not None:
+            self._deflating.finish()
         with naming(str(self._path)):
             times = require_increasing(np.asarray(self._time_s, dtype=float), "/frame_time_s")
             if times.size == 0:
