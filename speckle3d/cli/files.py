@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(help="A file the package reads.")], as_json: Json = False
+    path: Annotated[Path, typer.Argument(help="A file or folder that the package reads.")],
+    as_json: Json = False,
 ) -> None:
     """Tell what a file holds, after checking it."""
     from speckle3d.io.describe import describe

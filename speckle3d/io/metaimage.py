@@ -124,7 +124,11 @@ def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: flo
     implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
     rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
     centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
-    return RFSettings(rate, speed, centre, _need(header, "bandwidth_hz", settings.bandwidth_hz, None))
+    # I and Q become the analytic signal, which still carries its frequency, unless settings give another.
+    analytic = None if image_type(header) == "RF_REAL" else settings.demodulation_frequency_hz or 0.0
+    return RFSettings(
+        rate, speed, centre, _need(header, "bandwidth_hz", settings.bandwidth_hz, None), analytic
+    )
 
 
 def _need(header: SequenceHeader, name: str, given: Value | None, read: Value | None) -> Value:

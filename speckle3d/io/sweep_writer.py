@@ -1,4 +1,4 @@
-"""Writing of the sweep file, version 1, frame by frame."""
+"""Writing of the sweep file, frame by frame: version 1, or 2 with I/Q."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from speckle3d.core.sweep import (
     RFSettings,
     Sweep,
     Tracker,
+    stored_dtype,
 )
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
 from speckle3d.io.hdf5_guard import plain_attribute, require_own
 from speckle3d.io.sweeps import (
     FORMAT,
+    IQ_VERSION,
     KNOWN,
     SAMPLE_TYPES,
     VERSION,
@@ -51,9 +53,9 @@ class SweepWriter(HDF5Writer):
     path : path
     grid : ImageGrid
     signal : RFSettings or BModeSettings
-        Decides whether frames become ``/rf`` or ``/bmode``.
+        Decides whether frames become ``/rf``, ``/iq`` or ``/bmode``.
     dtype : dtype
-        int16 or float32 for RF, uint8 for B-mode; by default int16 or uint8.
+        int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
     compression : {"gzip", "lzf", None}
         HDF5 filter, with byte shuffling; lzf is faster and larger.
     """
@@ -66,16 +68,17 @@ class SweepWriter(HDF5Writer):
         dtype: npt.DTypeLike | None = None,
         compression: Compression = "gzip",
     ) -> None:
-        super().__init__(path, FORMAT, VERSION)
         self._grid, self._signal = grid, signal
-        self._name = "rf" if isinstance(signal, RFSettings) else "bmode"
-        self._dtype = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
+        self._name = _name_for(signal)
+        super().__init__(path, FORMAT, IQ_VERSION if self._name == "iq" else VERSION)
+        self._dtype: np.dtype[Any] = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
         require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
+        self._paired = self._name == "iq" and self._dtype == np.int16
         self._compression = compression
         self._time_s: list[float] = []
 
     def _begin(self) -> None:
-        shape = (self._grid.vectors, self._grid.samples)
+        shape = (self._grid.vectors, self._grid.samples, *((2,) if self._paired else ()))
         node = self._file.create_dataset(
             self._name,
             shape=(0, *shape),
@@ -104,11 +107,16 @@ class SweepWriter(HDF5Writer):
         expected = (self._grid.vectors, self._grid.samples)
         if frame.shape != expected:
             raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
-        if not np.can_cast(frame.dtype, self._dtype, "same_kind"):
-            raise InvalidInputError(f"{where}: expected samples of type {self._dtype}, got {frame.dtype}")
-        if frame.dtype.kind == "f":
+        wanted: np.dtype[Any] = np.dtype(np.complex64) if self._name == "iq" else self._dtype
+        if not np.can_cast(frame.dtype, wanted, "same_kind") or (
+            self._name == "iq" and frame.dtype.kind != "c"
+        ):
+            raise InvalidInputError(f"{where}: expected samples of type {wanted}, got {frame.dtype}")
+        if frame.dtype.kind in "fc":
             require_finite(frame, where)
-        self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
+        if self._paired:
+            frame = _as_pairs(frame, where)
+        self._write(i, np.ascontiguousarray(frame, self._dtype))
         self._require_room()
         self._time_s.append(float(time_s))
 
@@ -144,7 +152,7 @@ class SweepWriter(HDF5Writer):
     def _write(self, i: int, frame: npt.NDArray[Any]) -> None:
         self._frames.set_extent((i + 1, *frame.shape))
         on_disk = self._frames.get_space()
-        on_disk.select_hyperslab((i, 0, 0), (1, *frame.shape))
+        on_disk.select_hyperslab((i, *(0,) * frame.ndim), (1, *frame.shape))
         self._frames.write(self._in_memory, on_disk, frame, self._kind)
         # Kept until the next frame, so that a Ctrl-C pressed meanwhile is not lost (as in HDF5Frames).
         self._on_disk = on_disk
@@ -179,7 +187,7 @@ def write_sweep(
     Raises
     ------
     InvalidInputError
-        If the samples are of a type the format does not hold, as analytic (complex) ones.
+        If the samples are of a type the format does not hold, as float64.
 
     Examples
     --------
@@ -193,7 +201,7 @@ def write_sweep(
     ...     len(speckle3d.load_sweep(f"{folder}/sweep.h5"))
     3
     """
-    with SweepWriter(path, sweep.grid, sweep.signal, sweep.frames.dtype, compression) as writer:
+    with SweepWriter(path, sweep.grid, sweep.signal, stored_dtype(sweep.frames), compression) as writer:
         for i, time_s in enumerate(sweep.frame_time_s):
             writer.append(sweep.frames[i], time_s)
             if progress is not None:
@@ -223,7 +231,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    with opened(path, FORMAT, VERSION) as file:
+    with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
         held = has_member(file, "orientation")
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
@@ -249,6 +257,31 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
             group[name] = np.asarray(values, dtype=np.float64)
     if sensor.sensor_from_image is not None:
         group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
+
+
+def _name_for(signal: RFSettings | BModeSettings) -> str:
+    if not isinstance(signal, RFSettings):
+        return "bmode"
+    return "iq" if signal.are_complex else "rf"
+
+
+def _as_pairs(frame: npt.NDArray[Any], where: str) -> npt.NDArray[np.int16]:
+    """Make pairs of int16, shape (vector, sample, 2), of I/Q whose parts are such numbers.
+
+    Raises
+    ------
+    InvalidInputError
+        If some are not whole, or are out of range.
+    """
+    parts = np.ascontiguousarray(frame, dtype=np.complex64).view(np.float32).reshape(*frame.shape, 2)
+    limits = np.iinfo(np.int16)
+    if float(parts.min()) >= limits.min and float(parts.max()) <= limits.max:
+        pairs = parts.astype(np.int16)
+        if np.array_equal(pairs, parts):
+            return pairs
+    raise InvalidInputError(
+        f"{where}: expected I and Q that are whole numbers from {limits.min} to {limits.max}, got others"
+    )
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
