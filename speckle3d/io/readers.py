@@ -23,7 +23,7 @@ Row = tuple[str, str, str]
 GROUP = "speckle3d.readers"
 START_BYTES = 4096
 
-_OWN = ("sweeps", "challenge", "uff", "dicom", "metaimage", "ultrasonix", "clarius")
+_OWN = ("sweeps", "challenge", "uff", "zea", "dicom", "matlab", "metaimage", "ultrasonix", "clarius")
 """Modules of this package that have a reader, in the order in which they are asked."""
 
 
