@@ -183,7 +183,7 @@ def convert(
 
     options = locals()
     suffix = out.suffix.lower()
-    if suffix not in (".h5", ".hdf5", *SUFFIXES):
+    if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
         known = ", ".join((".h5", ".hdf5", *SUFFIXES))
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
     given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
