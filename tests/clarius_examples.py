@@ -13,7 +13,8 @@ import lzallright
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.sweep import BModeSettings
+from speckle3d.core.streams import TimedRotations
+from speckle3d.core.sweep import BModeSettings, OrientationSensor
 
 NAME = "2024-05-01T10-00-00+0000"
 ELEMENT_MM = 0.2
@@ -44,8 +45,8 @@ def write_files(target, files):
 
 
 def package_files(
-    sweep, *, packed=False, sensor=True, name=NAME, tgc=None, stamps=None, imu_text=None, element_mm=ELEMENT_MM,
-    kind=None, yml_kind=None, delay=None, yml=None,
+    sweep, *, packed=False, sensor=True, name=NAME, tgc=None, stamps=None, imu_text=None,
+    element_mm=ELEMENT_MM, kind=None, yml_kind=None, delay=None, yml=None,
 ):  # fmt: skip
     """Content of a package's files by name; `tgc` has a curve for each frame, None for an empty file."""
     kind = kind or kind_of(sweep)
@@ -110,7 +111,8 @@ def yml_text(sweep, element_mm=ELEMENT_MM, kind=None, delay=None):
         "# raw data parameters\n\n"
         f"frames: {n}\nframe rate: 11 Hz\ntransmit frequency: {centre_mhz!r} MHz\nimaging depth: 40 mm\n"
         "focal depth: 20 mm\ntgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }\n"
-        f"size: {{samples per line: {samples}, number of lines: {lines}, sample size: {sample_bytes(sweep)} bytes}}\n"
+        f"size: {{samples per line: {samples}, number of lines: {lines}, "
+        f"sample size: {sample_bytes(sweep)} bytes}}\n"
         f"type: {spoken}\ncompression: none\nsampling rate: {rate_hz / 1e6!r} MHz\ndelay samples: {delay!r}\n"
         f"lines:\n{lists}{focus}"
     )
@@ -152,10 +154,7 @@ def sample_text(time_ns, accelerometer, gyroscope, magnetometer, quaternion):
 
 
 def sensor_of(rotations, time_s, seed=0):
-    """Vectors that a sensor measures while it is turned so in the package's world, as m/s^2, rad/s and gauss."""
-    from speckle3d.core.streams import TimedRotations
-    from speckle3d.core.sweep import OrientationSensor
-
+    """Stream of a sensor that turns so in the package's world, with the vectors that it measures."""
     rng = np.random.default_rng(seed)
     shape = (len(rotations), 3)
     into = rotations.inv()

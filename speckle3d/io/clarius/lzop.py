@@ -11,15 +11,18 @@ from __future__ import annotations
 
 import struct
 import zlib
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from io import BufferedReader
 from typing import Any, TypeAlias
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.files import open_regular
 from speckle3d.io.clarius.package import Member
+from speckle3d.io.hdf5 import reading
 
 MAGIC = b"\x89LZO\x00\r\n\x1a\n"
 
@@ -65,11 +68,21 @@ class Index:
 
 
 class Unpacker:
-    """Reads runs of bytes of a member that is packed."""
+    """Reads runs of bytes of a member that is packed; the blocks last used are kept."""
 
-    def __init__(self, member: Member, index: Index, stream: BufferedReader) -> None:
-        self._member, self._index, self._stream = member, index, stream
+    def __init__(self, member: Member) -> None:
+        self._member = member
         self._unpacked: OrderedDict[int, bytes] = OrderedDict()
+
+    @cached_property
+    def _index(self) -> Index:
+        with reading(self._member.where), open_regular(self._member.path) as stream:
+            return read_index(self._member, stream)
+
+    @property
+    def size(self) -> int:
+        """Bytes, unpacked."""
+        return self._index.size
 
     def read(self, start: int, size: int) -> bytes:
         """Unpack bytes from `start` on.
@@ -79,23 +92,22 @@ class Unpacker:
         FileError
             Naming the block that is damaged.
         """
-        index, parts, at, stop = self._index, [], start, start + size
-        while at < stop:
-            i = bisect_right(index.firsts, at) - 1
-            block = self._block(i)
-            part = block[at - index.firsts[i] : stop - index.firsts[i]]
-            if not part:
-                raise FileError(f"{self._member.where}: expected {stop} bytes unpacked, got {index.size}")
-            parts.append(part)
-            at += len(part)
+        index, stop = self._index, start + size
+        if stop > index.size:
+            raise FileError(f"{self._member.where}: expected {stop} bytes unpacked, got {index.size}")
+        first, last = bisect_right(index.firsts, start) - 1, bisect_left(index.firsts, stop)
+        parts = [self._block(i) for i in range(first, last)]
+        parts[-1] = parts[-1][: stop - index.firsts[last - 1]]
+        parts[0] = parts[0][start - index.firsts[first] :]
         return b"".join(parts)
 
     def _block(self, i: int) -> bytes:
         if i not in self._unpacked:
-            block = self._index.blocks[i]
-            self._stream.seek(block.start)
-            packed = self._stream.read(block.packed_bytes)
-            self._unpacked[i] = unpack(packed, block, self._index.flags, f"{self._member.where}: block {i}")
+            block, where = self._index.blocks[i], f"{self._member.where}: block {i}"
+            with reading(where), open_regular(self._member.path) as stream:
+                stream.seek(block.start)
+                packed = stream.read(block.packed_bytes)
+            self._unpacked[i] = unpack(packed, block, self._index.flags, where)
             if len(self._unpacked) > _KEPT_BLOCKS:
                 self._unpacked.popitem(last=False)
         self._unpacked.move_to_end(i)

@@ -14,7 +14,6 @@ import operator
 import struct
 import threading
 from dataclasses import dataclass
-from io import BufferedReader
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,9 @@ import numpy.typing as npt
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
-from speckle3d.io.clarius.lzop import Index, Unpacker, read_index
+from speckle3d.io.clarius.lzop import Unpacker
 from speckle3d.io.clarius.package import Member
+from speckle3d.io.hdf5 import reading
 
 HEADER = struct.Struct("<5I")
 _TIME_BYTES = 8
@@ -58,22 +58,20 @@ class RawHeader:
 
 
 class RawFile:
-    """A raw file, packed or not: any run of its bytes."""
+    """A raw file, packed or not: any run of its bytes. It is open only while it is read."""
 
     def __init__(self, member: Member) -> None:
         self.member = member
-        self.packed = member.name.endswith(".lzo")
-        self._stream: BufferedReader | None = None
-        self._index: Index | None = None
-        self._unpacker: Unpacker | None = None
+        self._unpacker = Unpacker(member) if member.name.endswith(".lzo") else None
         self._lock = threading.Lock()
 
     @property
     def size(self) -> int:
         """Bytes, unpacked."""
+        if self._unpacker is None:
+            return self.member.size
         with self._lock:
-            self._opened()
-            return self.member.size if self._index is None else self._index.size
+            return self._unpacker.size
 
     def read(self, start: int, size: int) -> bytes:
         """Read bytes from `start` on.
@@ -83,30 +81,15 @@ class RawFile:
         FileError
             If there are fewer, or they are damaged.
         """
-        with self._lock:
-            stream = self._opened()
-            if self._unpacker is not None:
+        if self._unpacker is not None:
+            with self._lock:
                 return self._unpacker.read(start, size)
+        with reading(self.member.where), open_regular(self.member.path) as stream:
             stream.seek(self.member.start + start)
-            found = stream.read(min(size, self.member.size - start))
+            found = stream.read(max(min(size, self.member.size - start), 0))
         if len(found) != size:
             raise FileError(f"{self.member.where}: expected {start + size} bytes, got {start + len(found)}")
         return found
-
-    def close(self) -> None:
-        """Close the file if it is open; the next read opens it again."""
-        with self._lock:
-            if self._stream is not None:
-                self._stream.close()
-                self._stream = self._unpacker = None
-
-    def _opened(self) -> BufferedReader:
-        if self._stream is None:
-            self._stream = open_regular(self.member.path)
-            if self.packed:
-                self._index = self._index or read_index(self.member, self._stream)
-                self._unpacker = Unpacker(self.member, self._index, self._stream)
-        return self._stream
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.member,)
@@ -213,10 +196,6 @@ class RawFrames:
         shape = (header.lines, header.samples)
         whole: npt.NDArray[Any] = flat.reshape(shape if self._parts == 1 else (*shape, 2))
         return whole
-
-    def close(self) -> None:
-        """Close the file if it is open."""
-        self.raw.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.raw, self.header, self.kind, self.lines, self.samples, self.gains)

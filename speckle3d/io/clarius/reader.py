@@ -321,7 +321,8 @@ def _chosen_rows(recording: Recording, path: Path, settings: ImportSettings) -> 
     speed = settings.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
     rows += [
         ("vector pitch from", pitch, ""),
-        ("first line at element", f"{place.first_element:g}", ""),
+        ("first line at element", f"{place.first_element:g}, taken as the image's left", ""),
+        ("lines taken as", "parallel, of a linear array: its yml does not say", ""),
         ("first sample's depth from", *_depth_source(place, said, speed, settings)),
         ("speed of sound from", _source(settings.speed_of_sound_m_s, said.speed_of_sound_m_s, "assumed"), ""),
     ]
