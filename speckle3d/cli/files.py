@@ -19,6 +19,7 @@ from speckle3d.cli.common import (
     progress_bar,
 )
 from speckle3d.cli.outputs import require_own_place
+from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.simulation.settings import SimulatedSweep
@@ -137,6 +138,9 @@ def convert(
     frame_rate_hz: Annotated[float | None, typer.Option(help="For sequences without time stamps.")] = None,
     transform: Transform = None,
     calibration: CalibrationFiles = None,
+    compression: Annotated[
+        str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
+    ] = "gzip",
 ) -> None:
     """Turn an image sequence into a sweep file; options give what its header lacks.
 
@@ -146,8 +150,10 @@ def convert(
     from speckle3d.cli.recordings import require_sequence
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
 
+    if compression not in COMPRESSIONS:
+        raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
     names = ImportSettings.model_fields
     require_own_place(out, "sweep", source, *(calibration or ()))
     given = {k: v for k, v in locals().items() if k in names and v is not None}
@@ -158,4 +164,4 @@ def convert(
     sweep = resize(load_sweep(source, ImportSettings(**(fitted | given))), fitted)
     sweep = mount(sweep, calibration or ())
     with progress_bar(f"writing {out.name}") as progress:
-        write_sweep(out, sweep, progress)
+        write_sweep(out, sweep, progress, COMPRESSIONS[compression])
