@@ -159,8 +159,8 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     assert abs(of_iq.grid.sample_spacing_mm / of_rf.grid.sample_spacing_mm - 1) < 1e-4
     shared = min(expected.shape[1], got.shape[1])
     np.testing.assert_allclose(got[:, :shared], expected[:, :shared], atol=3e-3 * expected.max())
-    # The phase is the same but for what the mixer started with and the nearest bins to the band's centre, which
-    # are up to half a bin off it.
+    # The phase is the same but for what the mixer started with, and the nearest bins to the band's centre are
+    # up to half a bin off it.
     a, b = of_rf.analytic(rf.astype(np.float32))[:, :shared], of_iq.analytic(iq)[:, :shared]
     turning = fft.fft((np.conj(a) * b).sum(axis=0), 16 * shared)
     coherence = np.abs(turning) / (np.linalg.norm(a) * np.linalg.norm(b))
