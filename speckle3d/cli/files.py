@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(help="A file the package reads.")], as_json: Json = False
+    path: Annotated[Path, typer.Argument(help="A file or folder that the package reads.")],
+    as_json: Json = False,
 ) -> None:
     """Tell what a file holds, after checking it."""
     from speckle3d.io.describe import describe
@@ -87,6 +88,16 @@ def simulate(
     floor_slope_deg: Annotated[float | None, typer.Option(help="plane: slope of the floor (0).")] = None,
     sensor_noise: Annotated[
         float | None, typer.Option(help="plane: factor on the noise of both sensors (1).")
+    ] = None,
+    signal: Annotated[str | None, typer.Option(help="What is stored: rf, iq or bmode (rf).")] = None,
+    demodulation_frequency_hz: Annotated[
+        float | None, typer.Option(help="iq: what the echoes are shifted down by (their centre frequency).")
+    ] = None,
+    decimation: Annotated[
+        int | None, typer.Option(help="iq, bmode: samples of the echoes in one that is stored.")
+    ] = None,
+    dynamic_range_db: Annotated[
+        float | None, typer.Option(help="bmode: from black to white, 8 bits (60).")
     ] = None,
 ) -> None:
     """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
@@ -157,7 +168,9 @@ def convert(
     transform: Transform = None,
     reference_transform: Annotated[str | None, typer.Option(metavar="NAME")] = None,
     calibration: CalibrationFiles = None,
-    compress: Annotated[bool, typer.Option(help="Pack what is written: smaller and slower.")] = True,
+    compression: Annotated[
+        str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
+    ] = "gzip",
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
 
@@ -168,7 +181,7 @@ def convert(
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
 
     options = locals()
     suffix = out.suffix.lower()
@@ -177,6 +190,8 @@ def convert(
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
     given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
     require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
+    if compression not in COMPRESSIONS:
+        raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
     if transform is not None:
         require_sequence(source, transform)
         options["tracker_transform"] = transform
@@ -186,8 +201,8 @@ def convert(
     sweep = mount(sweep, calibration or ())
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
-            write_sweep(out, sweep, progress, "gzip" if compress else None)
+            write_sweep(out, sweep, progress, COMPRESSIONS[compression])
             return
-        left_out = write_sequence(out, sweep, progress, compress)
+        left_out = write_sequence(out, sweep, progress, compression != "none")
     for each in left_out:
         note(f"{out}: does not hold {each}")

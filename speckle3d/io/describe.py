@@ -15,7 +15,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
@@ -72,7 +72,7 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
         ("frames", str(len(sweep)), ""),
         *_rate_rows("", sweep.frame_time_s, "frames/s"),
         ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
-        ("sample type", str(sweep.frames.dtype), ""),
+        ("sample type", _sample_type(sweep), ""),
         ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
         ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
         ("width", f"{grid.width_mm:.2f}", "mm"),
@@ -95,12 +95,30 @@ def _signal_rows(signal: RFSettings | BModeSettings) -> list[Row]:
         return [("signal", "B-mode", ""), ("dynamic range", f"{signal.dynamic_range_db:g}", "dB")]
     low, high = (f"{edge / 1e6:g}" for edge in signal.bandwidth_hz)
     return [
-        ("signal", "RF", ""),
+        *_kind_rows(signal.demodulation_frequency_hz),
         ("sampling rate", f"{signal.sampling_rate_hz / 1e6:g}", "MHz"),
         ("centre frequency", f"{signal.centre_frequency_hz / 1e6:g}", "MHz"),
         ("band", f"{low} to {high}", "MHz"),
         ("speed of sound", f"{signal.speed_of_sound_m_s:g}", "m/s"),
     ]
+
+
+def _kind_rows(demodulation_frequency_hz: float | None) -> list[Row]:
+    if demodulation_frequency_hz is None:
+        return [("signal", "RF", "")]
+    if demodulation_frequency_hz == 0:
+        return [("signal", "I/Q, not demodulated (the analytic signal)", "")]
+    return [
+        ("signal", "I/Q", ""),
+        ("demodulation frequency", f"{demodulation_frequency_hz / 1e6:g}", "MHz"),
+    ]
+
+
+def _sample_type(sweep: Sweep) -> str:
+    stored = stored_dtype(sweep.frames)
+    if sweep.frames.dtype == stored:
+        return str(stored)
+    return f"{sweep.frames.dtype}, stored as pairs of {stored}"
 
 
 def _sensor_rows(sweep: Sweep) -> list[Row]:

@@ -84,7 +84,8 @@ class ImportSettings(BaseModel):
         None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
     )
     arrays: dict[str, str] = Field(
-        default_factory=dict, description="arrays of a MATLAB file by what they are, as rf = 'RcvData'"
+        default_factory=dict,
+        description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
     )
 
     def over(self, path: PathLike, **found: Any) -> dict[str, Any]:
