@@ -36,10 +36,10 @@ from speckle3d.io.plus.layout import Layout
 GROUP = "plus"
 
 _STORAGE = {
-    "ObjectType", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB", "CompressedData", "HeaderSize",
-    "CompressedDataSize", "DimSize", "ElementNumberOfChannels", "ElementSize", "ElementDataFile", "Kinds",
-    "dimension", "encoding", "endian", "kinds", "sizes", "type", "spacings", "data file", "datafile",
-    "space dimension", "space directions", "space origin",
+    "ObjectType", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB", "CompressedData",
+    "HeaderSize", "CompressedDataSize", "DimSize", "ElementNumberOfChannels", "ElementSize", "Kinds",
+    "ElementDataFile", "dimension", "encoding", "endian", "kinds", "sizes", "type", "spacings", "data file",
+    "datafile", "space dimension", "space directions", "space origin",
 }  # fmt: skip
 """Fields that say how pixels are stored; a writer makes them anew."""
 

@@ -1,5 +1,7 @@
 """Sequences written and read back, and through a sweep file, are equal in every field."""
 
+import pickle
+
 import numpy as np
 import pytest
 import sweep_examples
@@ -254,6 +256,16 @@ def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     with pytest.raises(InvalidInputError, match=r"a\.mha: .*got a volume"):
         load_sweep(path, BMODE)
     assert len(load_sweep(path, BMODE.model_copy(update={"frame_rate_hz": 10.0}))) == 3
+
+
+def test_frames_go_to_other_processes_and_are_opened_again(tmp_path):
+    frames = load_sweep(write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2]), BMODE).frames
+    expected = frames[1]
+    again = pickle.loads(pickle.dumps(frames))
+    frames.close()
+    for each in (frames, again):
+        np.testing.assert_array_equal(each[1], expected)
+    assert again.record == frames.record
 
 
 def test_names_of_other_files_are_refused(tmp_path):
