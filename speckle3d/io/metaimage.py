@@ -222,7 +222,8 @@ class _Source:
                 f"{self.path}: expected an image calibration for pixels of {given} mm, as ElementSpacing "
                 f"says, got one for {got} mm"
             )
-        return calibrated or held or self.device.pixel_mm(self.header.size) or (None, None)
+        shown = None if self.layout.is_rf else self.device.pixel_mm(self.header.size)
+        return calibrated or held or shown or (None, None)
 
     def _calibrated_pixel_mm(self) -> tuple[float, float] | None:
         found = self.image_to_probe()

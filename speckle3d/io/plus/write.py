@@ -145,12 +145,21 @@ class _Images:
 
     def write(self, file: BinaryIO, window: int | None) -> int:
         """Write all images, packed if there is a window, and return how many bytes that took."""
-        packer = None if window is None else zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
+        packer = None if window is None else _packer(window)
         size = 0
         for image in self:
             raw = image.astype(self.dtype.newbyteorder("<"), order="C").data.cast("B")
             size += file.write(raw if packer is None else packer.compress(raw))
         return size if packer is None else size + file.write(packer.flush())
+
+
+def _packer(window: int) -> Any:
+    """Return ISA-L's packer, or zlib's where that has no wheel."""
+    try:
+        from isal import isal_zlib
+    except ImportError:
+        return zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
+    return isal_zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
 
 
 def _narrowest(sweep: Sweep) -> np.dtype[Any]:
