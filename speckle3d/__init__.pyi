@@ -14,7 +14,9 @@ from .io.calibrations import load_calibration as load_calibration
 from .io.calibrations import write_calibration as write_calibration
 from .io.curves import load_curves as load_curves
 from .io.curves import write_curves as write_curves
+from .io.import_settings import ImportSettings as ImportSettings
 from .io.load import load_sweep as load_sweep
+from .io.readers import Reader as Reader
 from .io.reconstructions import read_reconstruction as read_reconstruction
 from .io.sweep_writer import write_sweep as write_sweep
 from .io.volumes import read_volume as read_volume

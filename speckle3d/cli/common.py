@@ -41,7 +41,10 @@ CalibrationFiles = Annotated[
         "--calibration", help="Calibration to use for its sensor in place of the file's; may be repeated."
     ),
 ]
-Images = Annotated[Path, typer.Argument(metavar="IMAGES", help="Sweep file, MetaImage or NRRD sequence.")]
+Images = Annotated[
+    Path,
+    typer.Argument(metavar="IMAGES", help="Recording: a sweep file, an image sequence, a scanner's package."),
+]
 CalibrationOut = Annotated[
     Path, typer.Option("-o", "--output", help="Calibration file to write; .txt and .png beside it.")
 ]

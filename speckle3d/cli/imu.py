@@ -29,8 +29,9 @@ Log = Annotated[
     Path,
     typer.Argument(
         metavar="LOG",
-        help="A log of the sensor, of any kind that is known. A plain CSV has the columns time_s, "
-        "accelerometer_x_m_s2, gyroscope_x_rad_s, magnetometer_x_au (y and z likewise), quaternion_w to _z.",
+        help="A log of the sensor, of any kind that is known, or a sweep with one. A plain CSV has the "
+        "columns time_s, accelerometer_x_m_s2, gyroscope_x_rad_s, magnetometer_x_au (y and z likewise), "
+        "quaternion_w to _z.",
     ),
 ]
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs that do not say.")]
@@ -108,8 +109,12 @@ def imu_orient(
     method: MethodOption = Method.smoother,
     magnetometer: Magnetometer = True,
     time_offset_s: Annotated[
-        float, typer.Option(help="A reading at t belongs to image time t + this; see calibrate clock.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="A reading at t belongs to image time t + this (0, or as LOG has it if it is a sweep); see "
+            "calibrate clock."
+        ),
+    ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration file of this mounting, to go into the sweep with it.")
     ] = None,
@@ -124,14 +129,17 @@ def imu_orient(
 
     if into is None and out is None:
         raise InvalidInputError("expected --into SWEEP.h5, -o CSV or both, got neither")
-    require_finite_offset(time_offset_s)
+    require_finite_offset(time_offset_s or 0.0)
     if out is not None:
         require_own_place(out, "log", log_file, into, calibration)
-    log = read(log_file, rate_hz)
+    held = _ridden_along(log_file)
+    log = read(log_file, rate_hz) if held is None else log_of(held, log_file.name)
     with naming(str(log_file)):
         rotations, found = orientation_of(log, method, magnetometer)
     if into is not None:
-        _attach(into, log, rotations, time_offset_s, calibration, replace_stream)
+        own = (None, 0.0) if held is None else (held.sensor_from_image, held.time_offset_s)
+        mounting, offset_s = _mounting(calibration, time_offset_s, own)
+        _attach(into, log, rotations, mounting, offset_s, replace_stream)
     if out is not None:
         write_csv(out, _with(log, rotations))
     tell(log)
@@ -186,11 +194,45 @@ def require_finite_offset(time_offset_s: float) -> None:
 
 
 def read(path: Path, rate_hz: float | None) -> ImuLog:
-    """Read a log of any kind."""
+    """Read a log of any kind, or what a sweep holds of its orientation sensor."""
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
+    held = _ridden_along(path)
+    if held is not None:
+        return log_of(held, path.name)
     return read_log(path, None if rate_hz is None else Hints(rate_hz=rate_hz))
+
+
+def _ridden_along(path: Path) -> OrientationSensor | None:
+    """The orientation sensor that a sweep was recorded with, as one inside a probe; None of what is a log."""
+    from speckle3d.core.errors import InsufficientDataError
+    from speckle3d.io.load import load_sweep
+    from speckle3d.io.readers import find_reader
+
+    if find_reader(path) is None:
+        return None
+    sensor = load_sweep(path).orientation
+    if sensor is None:
+        raise InsufficientDataError(f"{path}: expected an orientation sensor's stream in the sweep, got none")
+    return sensor
+
+
+def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
+    """Log of a sweep's orientation sensor, on its own clock."""
+    from speckle3d.core.sweep import INERTIAL
+    from xsens.logs.clocks import timeline_of_times
+    from xsens.logs.samples import ImuLog
+
+    clock = timeline_of_times(sensor.readings.time_s)
+    return ImuLog(
+        clock.time_s,
+        **{name: getattr(sensor, name) for name in INERTIAL},
+        world_from_sensor=sensor.readings.world_from_sensor,
+        gaps=clock.gaps,
+        notes=clock.notes,
+        source=source,
+    )
 
 
 def tell(log: ImuLog) -> None:
@@ -229,26 +271,33 @@ def _with(log: ImuLog, rotations: TimedRotations) -> ImuLog:
     return replace(log, world_from_sensor=Rotation.from_quat(quaternions), oriented=there)
 
 
+def _mounting(
+    calibration: Path | None, time_offset_s: float | None, held: tuple[Rotation | None, float]
+) -> tuple[Rotation | None, float]:
+    """Mounting and clock offset: as given, else the calibration's, else those the sensor's sweep has."""
+    from speckle3d.io.calibrations import read_calibration
+
+    mounting, offset_s = held
+    if calibration is not None:
+        known = read_calibration(calibration)
+        mounting = known.rotation
+        offset_s = offset_s if known.time_offset_s is None else known.time_offset_s
+    return mounting, offset_s if time_offset_s is None else time_offset_s
+
+
 def _attach(
     sweep_file: Path,
     log: ImuLog,
     rotations: TimedRotations,
+    mounting: Rotation | None,
     time_offset_s: float,
-    calibration: Path | None,
     replace_stream: bool,
 ) -> None:
     import numpy as np
 
     from speckle3d.core.sweep import INERTIAL, OrientationSensor
-    from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.sweep_writer import attach_orientation
 
-    mounting: Rotation | None = None
-    if calibration is not None:
-        known = read_calibration(calibration)
-        mounting = known.rotation
-        if known.time_offset_s is not None and time_offset_s == 0.0:
-            time_offset_s = known.time_offset_s
     kept = np.isin(log.time_s, rotations.time_s)
     vectors = {}
     for name in INERTIAL:

@@ -40,7 +40,10 @@ DynamicRange = Annotated[float, typer.Option(help="Range of the log-compressed g
 
 @app.command()
 def reconstruct(
-    sweep_file: Annotated[Path, typer.Argument(metavar="SWEEP", help="Sweep to reconstruct.")],
+    sweep_file: Annotated[
+        Path,
+        typer.Argument(metavar="SWEEP", help="Sweep to reconstruct: a file or folder of any known format."),
+    ],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
     curves_file: Annotated[
         Path | None, typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside SWEEP.")

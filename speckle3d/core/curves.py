@@ -245,7 +245,7 @@ class DecorrelationCurves:
 def _settings(key: CurveKey) -> dict[str, Any]:
     kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
     numbers = {name: getattr(key, name) for name in (*PATCH_NUMBERS, "edge_fraction")}
-    # How finely the echo was sampled, real or as I/Q, is no property of the beam.
+    # How finely the echo was sampled, real or as I/Q, is no property of the beam, and matching resamples it.
     left_out = ("demodulation_frequency_hz", *(("sampling_rate_hz",) if kind == "RF" else ()))
     signal = {name: value for name, value in vars(key.signal).items() if name not in left_out}
     return {"signal": kind, "correlation_of": key.correlation_of} | signal | numbers

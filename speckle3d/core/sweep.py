@@ -29,10 +29,18 @@ class Frames(Protocol):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Sample type: int16, float32, or complex64 for analytic (I/Q) data."""
+        """Sample type: int16, float32, uint8 for B-mode, or complex64 for I/Q and analytic data."""
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """Read one frame, shape (vector, sample)."""
+
+
+def stored_dtype(frames: Frames) -> np.dtype[Any]:
+    """Type of the samples where they were recorded, by the frames' attribute ``stored_dtype``.
+
+    Pairs of int16 (I/Q) are read as complex64, which they are not stored as.
+    """
+    return np.dtype(getattr(frames, "stored_dtype", frames.dtype))
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,10 @@ class _FramesPart:
     @property
     def dtype(self) -> np.dtype[Any]:
         return self.frames.dtype
+
+    @property
+    def stored_dtype(self) -> np.dtype[Any]:
+        return stored_dtype(self.frames)
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         return self.frames[range(self.first, self.stop)[index]]
@@ -95,6 +107,25 @@ class RFSettings:
     def sample_spacing_mm(self) -> float:
         """Depth between neighbouring samples, mm."""
         return 1e3 * self.speed_of_sound_m_s / (2.0 * self.sampling_rate_hz)
+
+    @property
+    def are_complex(self) -> bool:
+        """Whether samples are complex: I/Q, or the analytic signal."""
+        return self.demodulation_frequency_hz is not None
+
+    def bin_frequency_hz(self, length: int) -> FloatArray:
+        """Frequency of the echo that each bin of a Fourier transform of `length` samples holds.
+
+        Returns
+        -------
+        ndarray
+            Of shape (length // 2 + 1,) for real samples, whose negative frequencies say nothing new, else of
+            shape (length,), in the order of ``scipy.fft.fft``.
+        """
+        bins = np.arange(length if self.are_complex else length // 2 + 1, dtype=float)
+        if self.demodulation_frequency_hz:
+            bins[(length + 1) // 2 :] -= length
+        return bins * (self.sampling_rate_hz / length) + (self.demodulation_frequency_hz or 0.0)
 
 
 @dataclass(frozen=True)
@@ -236,6 +267,7 @@ class Sweep:
     def __post_init__(self) -> None:
         times = require_increasing(self.frame_time_s, f"{self.name}: frame_time_s")
         object.__setattr__(self, "frame_time_s", times)
+        _require_kind(self)
         n, vectors, samples = self.frames.shape
         if (vectors, samples) != (self.grid.vectors, self.grid.samples):
             raise InvalidInputError(
@@ -279,6 +311,18 @@ def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.Arr
     """Orientation ``world_from_image`` at each frame time, by either kind of sensor."""
     measured = sensor.world_from_image(frame_time_s)
     return measured.rotation if isinstance(measured, RigidTransform) else measured
+
+
+def _require_kind(sweep: Sweep) -> None:
+    """Raise unless samples are complex where the settings say so, and real where they do not."""
+    are_complex = np.dtype(sweep.frames.dtype).kind == "c"
+    if are_complex != (isinstance(sweep.signal, RFSettings) and sweep.signal.are_complex):
+        expected = (
+            "real samples, or a demodulation_frequency_hz with them (0 for the analytic signal)"
+            if are_complex
+            else "complex samples (I/Q) with a demodulation_frequency_hz"
+        )
+        raise InvalidInputError(f"{sweep.name}: expected {expected}, got {sweep.frames.dtype}")
 
 
 def _require_positive(settings: object, names: tuple[str, ...]) -> None:

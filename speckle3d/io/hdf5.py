@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -195,15 +195,16 @@ def reading(where: PathLike) -> Iterator[None]:
 
 
 @contextmanager
-def opened(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
-    """Open an HDF5 file of the family for reading and require its format and version."""
+def opened(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> Iterator[h5py.File]:
+    """Open an HDF5 file of the family for reading and require its format and one of the versions."""
     with reading(path), open_hdf5(path) as file:
         found = file_format(file)
         if found != format_name:
             raise InvalidInputError(f"{path}: expected format {format_name!r}, got {found!r}")
         got = read_attribute(file, "version")
-        if got != version:
-            raise InvalidInputError(f"{path}: expected {format_name} version {version}, got {got:g}")
+        if got not in versions:
+            known = " or ".join(map(str, versions))
+            raise InvalidInputError(f"{path}: expected {format_name} version {known}, got {got:g}")
         yield file
 
 

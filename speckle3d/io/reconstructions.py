@@ -148,7 +148,7 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
     InvalidInputError
         Naming the file, the data set and the first bad index.
     """
-    with opened(path, FORMAT, VERSION) as file:
+    with opened(path, FORMAT, (VERSION,)) as file:
         times = read_checked(file, "frame_time_s", ("frame",))
         with naming(str(path)):
             return Reconstruction(

@@ -1,11 +1,12 @@
-"""Writing of the sweep file, version 1, frame by frame."""
+"""Writing of the sweep file, frame by frame: version 1, or 2 with I/Q."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from types import TracebackType
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import h5py
 import numpy as np
@@ -23,11 +24,14 @@ from speckle3d.core.sweep import (
     RFSettings,
     Sweep,
     Tracker,
+    stored_dtype,
 )
+from speckle3d.io.deflate import DeflatingWriter
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
 from speckle3d.io.hdf5_guard import plain_attribute, require_own
 from speckle3d.io.sweeps import (
     FORMAT,
+    IQ_VERSION,
     KNOWN,
     SAMPLE_TYPES,
     VERSION,
@@ -40,7 +44,15 @@ Compression = Literal["gzip", "lzf"] | None
 Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1
-"""Speckle hardly compresses further at higher levels, which cost several times the time."""
+"""Told to readers; what packs is `speckle3d.io.deflate`."""
+
+
+@runtime_checkable
+class CarriesMore(Protocol):
+    """Frames of a recording that says more than a sweep holds."""
+
+    def write_more(self, file: h5py.File) -> None:
+        """Write that into groups of its own."""
 
 
 class SweepWriter(HDF5Writer):
@@ -51,11 +63,12 @@ class SweepWriter(HDF5Writer):
     path : path
     grid : ImageGrid
     signal : RFSettings or BModeSettings
-        Decides whether frames become ``/rf`` or ``/bmode``.
+        Decides whether frames become ``/rf``, ``/iq`` or ``/bmode``.
     dtype : dtype
-        int16 or float32 for RF, uint8 for B-mode; by default int16 or uint8.
+        int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
     compression : {"gzip", "lzf", None}
-        HDF5 filter, with byte shuffling; lzf is faster and larger.
+        HDF5 filter, with byte shuffling. gzip packs in threads (see `speckle3d.io.deflate`), lzf does not and
+        is both slower and larger; None is as fast as the disk.
     """
 
     def __init__(
@@ -66,16 +79,18 @@ class SweepWriter(HDF5Writer):
         dtype: npt.DTypeLike | None = None,
         compression: Compression = "gzip",
     ) -> None:
-        super().__init__(path, FORMAT, VERSION)
         self._grid, self._signal = grid, signal
-        self._name = "rf" if isinstance(signal, RFSettings) else "bmode"
-        self._dtype = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
+        self._name = _name_for(signal)
+        super().__init__(path, FORMAT, IQ_VERSION if self._name == "iq" else VERSION)
+        self._dtype: np.dtype[Any] = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
         require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
+        self._paired = self._name == "iq" and self._dtype == np.int16
         self._compression = compression
+        self._deflating: DeflatingWriter | None = None
         self._time_s: list[float] = []
 
     def _begin(self) -> None:
-        shape = (self._grid.vectors, self._grid.samples)
+        shape = (self._grid.vectors, self._grid.samples, *((2,) if self._paired else ()))
         node = self._file.create_dataset(
             self._name,
             shape=(0, *shape),
@@ -90,6 +105,17 @@ class SweepWriter(HDF5Writer):
         self._frames = node.id
         self._in_memory = h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
+        if self._compression == "gzip":
+            self._deflating = DeflatingWriter(self._frames, self._require_room)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            super().__exit__(kind, error, trace)
+        finally:
+            if self._deflating is not None:
+                self._deflating.close()
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
@@ -104,12 +130,18 @@ class SweepWriter(HDF5Writer):
         expected = (self._grid.vectors, self._grid.samples)
         if frame.shape != expected:
             raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
-        if not np.can_cast(frame.dtype, self._dtype, "same_kind"):
-            raise InvalidInputError(f"{where}: expected samples of type {self._dtype}, got {frame.dtype}")
-        if frame.dtype.kind == "f":
+        wanted: np.dtype[Any] = np.dtype(np.complex64) if self._name == "iq" else self._dtype
+        if not np.can_cast(frame.dtype, wanted, "same_kind") or (
+            self._name == "iq" and frame.dtype.kind != "c"
+        ):
+            raise InvalidInputError(f"{where}: expected samples of type {wanted}, got {frame.dtype}")
+        if frame.dtype.kind in "fc":
             require_finite(frame, where)
-        self._write(i, np.ascontiguousarray(frame, dtype=self._dtype))
-        self._require_room()
+        if self._paired:
+            frame = _as_pairs(frame, where)
+        self._write(i, np.ascontiguousarray(frame, self._dtype))
+        if self._deflating is None:
+            self._require_room()
         self._time_s.append(float(time_s))
 
     def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
@@ -131,6 +163,10 @@ class SweepWriter(HDF5Writer):
             plain = isinstance(value, str | int | float)
             group.attrs[name] = value if plain else json.dumps(value, sort_keys=True)
 
+    def write_more(self, frames: CarriesMore) -> None:
+        """Write what frames carry beyond the format."""
+        frames.write_more(self._file)
+
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
         with reading(source), naming(str(source)), open_hdf5(source) as other:
@@ -142,14 +178,19 @@ class SweepWriter(HDF5Writer):
                     self._file.attrs[name] = plain_attribute(other, name)
 
     def _write(self, i: int, frame: npt.NDArray[Any]) -> None:
+        if self._deflating is not None:
+            self._deflating.append(frame)
+            return
         self._frames.set_extent((i + 1, *frame.shape))
         on_disk = self._frames.get_space()
-        on_disk.select_hyperslab((i, 0, 0), (1, *frame.shape))
+        on_disk.select_hyperslab((i, *(0,) * frame.ndim), (1, *frame.shape))
         self._frames.write(self._in_memory, on_disk, frame, self._kind)
         # Kept until the next frame, so that a Ctrl-C pressed meanwhile is not lost (as in HDF5Frames).
         self._on_disk = on_disk
 
     def _finish(self) -> None:
+        if self._deflating is not None:
+            self._deflating.finish()
         with naming(str(self._path)):
             times = require_increasing(np.asarray(self._time_s, dtype=float), "/frame_time_s")
             if times.size == 0:
@@ -179,7 +220,7 @@ def write_sweep(
     Raises
     ------
     InvalidInputError
-        If the samples are of a type the format does not hold, as analytic (complex) ones.
+        If the samples are of a type the format does not hold, as float64.
 
     Examples
     --------
@@ -193,7 +234,7 @@ def write_sweep(
     ...     len(speckle3d.load_sweep(f"{folder}/sweep.h5"))
     3
     """
-    with SweepWriter(path, sweep.grid, sweep.signal, sweep.frames.dtype, compression) as writer:
+    with SweepWriter(path, sweep.grid, sweep.signal, stored_dtype(sweep.frames), compression) as writer:
         for i, time_s in enumerate(sweep.frame_time_s):
             writer.append(sweep.frames[i], time_s)
             if progress is not None:
@@ -207,6 +248,8 @@ def write_sweep(
             writer.write_probe(sweep.probe)
         if simulation is not None:
             writer.write_simulation(simulation)
+        if isinstance(sweep.frames, CarriesMore):
+            writer.write_more(sweep.frames)
         if type(sweep.frames) is HDF5Frames:
             writer.copy_unknown(sweep.frames.path)
 
@@ -223,7 +266,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    with opened(path, FORMAT, VERSION) as file:
+    with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
         held = has_member(file, "orientation")
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
@@ -249,6 +292,31 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
             group[name] = np.asarray(values, dtype=np.float64)
     if sensor.sensor_from_image is not None:
         group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
+
+
+def _name_for(signal: RFSettings | BModeSettings) -> str:
+    if not isinstance(signal, RFSettings):
+        return "bmode"
+    return "iq" if signal.are_complex else "rf"
+
+
+def _as_pairs(frame: npt.NDArray[Any], where: str) -> npt.NDArray[np.int16]:
+    """Make pairs of int16, shape (vector, sample, 2), of I/Q whose parts are such numbers.
+
+    Raises
+    ------
+    InvalidInputError
+        If some are not whole, or are out of range.
+    """
+    parts = np.ascontiguousarray(frame, dtype=np.complex64).view(np.float32).reshape(*frame.shape, 2)
+    limits = np.iinfo(np.int16)
+    if float(parts.min()) >= limits.min and float(parts.max()) <= limits.max:
+        pairs = parts.astype(np.int16)
+        if np.array_equal(pairs, parts):
+            return pairs
+    raise InvalidInputError(
+        f"{where}: expected I and Q that are whole numbers from {limits.min} to {limits.max}, got others"
+    )
 
 
 def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Reading of the sweep file, version 1; frames stay on disk."""
+"""Reading of the sweep file, versions 1 and 2 (with I/Q); frames stay on disk."""
 
 from __future__ import annotations
 
@@ -49,37 +49,46 @@ from speckle3d.io.hdf5 import (
     reading,
     require_dataset,
 )
-from speckle3d.io.hdf5_guard import is_only_deflated, require_whole_chunk, unpacked
+from speckle3d.io.hdf5_guard import is_filtered, is_only_deflated, require_whole_chunk, unpacked
 from speckle3d.io.readers import Reader
 
 FORMAT = "speckle3d.sweep"
-VERSION = 1
-KNOWN = frozenset({"rf", "bmode", "frame_time_s", "orientation", "tracker", "truth"})
-"""Members of the root that this version of the format gives a meaning to."""
+VERSION, IQ_VERSION = 1, 2
+"""Of files without and with I/Q, so that older readers still read what they can make sense of."""
 
-SAMPLE_TYPES = {"rf": (np.dtype(np.int16), np.dtype(np.float32)), "bmode": (np.dtype(np.uint8),)}
+KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth"})
+"""Members of the root that these versions of the format give a meaning to."""
+
+SAMPLE_TYPES: dict[str, tuple[np.dtype[Any], ...]] = {
+    "rf": (np.dtype(np.int16), np.dtype(np.float32)),
+    "iq": (np.dtype(np.complex64), np.dtype(np.int16)),
+    "bmode": (np.dtype(np.uint8),),
+}
+"""Types that the samples of each kind may have in the file; int16 of I/Q in pairs, I first."""
 
 RF_NUMBERS = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
 """Attributes of /rf that are a number each of `RFSettings`."""
 
 
 class HDF5Frames:
-    """Frames of a sweep file, read one at a time.
+    """Frames of a sweep file, read one at a time; pairs of int16 (I/Q) as complex64.
 
     The file is opened at the first frame asked for and stays open until `close`, which may be called at any
     time: the next frame opens it again. A copy sent to another process opens the file there.
     """
 
-    def __init__(self, path: PathLike, name: str, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
+    def __init__(self, path: PathLike, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         self.path = Path(path).absolute()
-        self.name, self.stored_shape, self.dtype = name, shape, dtype
+        self.name, self.stored_shape, self.stored_dtype = name, shape, dtype
+        self.dtype = np.dtype(np.complex64) if len(shape) == 4 else dtype
         self._open: _OpenFrames | None = None
         self._lock = threading.Lock()
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
-        return self.stored_shape
+        n, vectors, samples = self.stored_shape[:3]
+        return n, vectors, samples
 
     def __len__(self) -> int:
         return self.stored_shape[0]
@@ -94,9 +103,9 @@ class HDF5Frames:
             if self._open is None:
                 self._open = _OpenFrames(self)
             frame = self._open.read(i)
-        if frame.dtype.kind == "f":
+        if frame.dtype.kind in "fc":
             require_finite(frame, where)
-        return frame
+        return from_pairs(frame) if frame.ndim == 3 else frame
 
     def close(self) -> None:
         """Close the file if it is open."""
@@ -106,7 +115,7 @@ class HDF5Frames:
                 self._open = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, self.name, self.stored_shape, self.dtype)
+        return type(self), (self.path, self.name, self.stored_shape, self.stored_dtype)
 
 
 class _OpenFrames:
@@ -118,7 +127,8 @@ class _OpenFrames:
 
     def __init__(self, frames: HDF5Frames) -> None:
         self.file = open_hdf5(frames.path)
-        self._frame_shape, self._dtype = frames.stored_shape[1:], frames.dtype
+        self._frame_shape, self._dtype = frames.stored_shape[1:], frames.stored_dtype
+        self._no_offset = (0,) * len(self._frame_shape)
         self._data = require_dataset(self.file, frames.name)
         if self._data.shape != frames.stored_shape:
             raise InvalidInputError(f"expected shape {frames.stored_shape}, got {self._data.shape}")
@@ -127,20 +137,22 @@ class _OpenFrames:
         self._in_memory = h5py.h5s.create_simple(self._frame_shape)
         self._kind = h5py.h5t.py_create(self._dtype)
         self._unpacks = self._data.chunks == (1, *self._frame_shape) and is_only_deflated(self._data)
+        # Chunks that no filter made were looked at when the data set was found.
+        self._checks = self._data.chunks is not None and is_filtered(self._data)
         self._checked: set[tuple[int, ...]] = set()
 
     def read(self, i: int) -> npt.NDArray[Any]:
         if self._unpacks:
-            frame: npt.NDArray[Any] = unpacked(self._data, (i, 0, 0))[0]
+            frame: npt.NDArray[Any] = unpacked(self._data, (i, *self._no_offset))[0]
             return frame
-        if self._data.chunks is not None:
+        if self._checks:
             self._check_chunks(i, self._data.chunks)
         frame = np.empty(self._frame_shape, self._dtype)
-        self._on_disk.select_hyperslab((i, 0, 0), (1, *self._frame_shape))
+        self._on_disk.select_hyperslab((i, *self._no_offset), (1, *self._frame_shape))
         self._node.read(self._in_memory, self._on_disk, frame, self._kind)
         return frame
 
-    def _check_chunks(self, i: int, chunks: tuple[int, int, int]) -> None:
+    def _check_chunks(self, i: int, chunks: tuple[int, ...]) -> None:
         starts = (range(0, n, step) for n, step in zip(self._frame_shape, chunks[1:], strict=True))
         for offset in itertools.product([i // chunks[0] * chunks[0]], *starts):
             if offset not in self._checked:
@@ -158,7 +170,7 @@ def read_sweep(path: PathLike) -> Sweep:
     InvalidInputError
         Naming the file, the data set and the first bad index.
     """
-    with opened(path, FORMAT, VERSION) as file:
+    with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
         frames, grid, signal = _read_image(file)
         n = frames.shape[0]
         times = read_checked(file, "frame_time_s", (n,))
@@ -176,37 +188,54 @@ def read_sweep(path: PathLike) -> Sweep:
 
 
 def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
-    name = "rf" if has_member(file, "rf") else "bmode"
-    if not has_member(file, name):
-        raise InvalidInputError(f"{locate(file)}: expected a data set rf or bmode, got neither")
+    name = _name_of_image(file)
     node = require_dataset(file, name)
     where = locate(file, name)
     dtype = node.dtype.newbyteorder("=")
     require_sample_type(name, dtype, where)
-    if node.ndim != 3 or 0 in node.shape:
-        raise InvalidInputError(f"{where}: expected shape (frame, vector, sample), got {node.shape}")
+    pairs = (2,) if name == "iq" and dtype == np.int16 else ()
+    if node.ndim != 3 + len(pairs) or node.shape[3:] != pairs or 0 in node.shape:
+        expected = f"(frame, vector, sample{', 2' if pairs else ''})"
+        raise InvalidInputError(f"{where}: expected shape {expected}, got {node.shape}")
     frames = HDF5Frames(file.filename, name, node.shape, dtype)
     with naming(where):
         signal = read_signal(node, name)
         return frames, _read_grid(node, signal), signal
 
 
+def _name_of_image(file: h5py.File) -> str:
+    """Name of the data set that holds the frames."""
+    known = ("rf", "bmode") if read_attribute(file, "version") == VERSION else ("rf", "iq", "bmode")
+    held = [name for name in known if has_member(file, name)]
+    if not held or ("iq" in held and len(held) > 1):
+        raise InvalidInputError(
+            f"{locate(file)}: expected a data set {', '.join(known[:-1])} or {known[-1]}, got "
+            f"{' and '.join(held) or 'none of them'}"
+        )
+    return held[0]
+
+
+def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
+    """Complex samples of pairs of I and Q, the last axis."""
+    return pairs.astype(np.float32).view(np.complex64)[..., 0]
+
+
 def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
-    """Raise `InvalidInputError` unless /rf or /bmode may hold samples of a type."""
+    """Raise `InvalidInputError` unless /rf, /iq or /bmode may hold samples of a type."""
     if dtype not in SAMPLE_TYPES[name]:
         expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
         raise InvalidInputError(f"{where}: expected samples of type {expected}, got {dtype}")
 
 
 def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BModeSettings:
-    """Read how the samples were made from attributes; `kind` is ``"rf"`` or ``"bmode"``."""
+    """Read how the samples were made from attributes; `kind` is ``"rf"``, ``"iq"`` or ``"bmode"``."""
     if kind == "bmode":
         dynamic_range_db = read_attribute(node, "dynamic_range_db")
         return BModeSettings(dynamic_range_db, read_attribute(node, "full_scale", default=255.0))
     low, high = read_vector_attribute(node, "bandwidth_hz", 2).tolist()
     numbers = {name: read_attribute(node, name) for name in RF_NUMBERS}
     name = "demodulation_frequency_hz"
-    middle = read_attribute(node, name) if name in node.attrs else None
+    middle = read_attribute(node, name) if kind == "iq" or name in node.attrs else None
     return RFSettings(**numbers, bandwidth_hz=(low, high), demodulation_frequency_hz=middle)
 
 
@@ -216,7 +245,7 @@ def signal_attributes(signal: RFSettings | BModeSettings) -> dict[str, Any]:
 
 
 def _read_grid(node: h5py.Dataset, signal: RFSettings | BModeSettings) -> ImageGrid:
-    _, vectors, samples = node.shape
+    vectors, samples = node.shape[1:3]
     first_mm = read_attribute(node, "first_sample_depth_mm")
     if isinstance(signal, RFSettings):
         pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm

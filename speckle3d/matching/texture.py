@@ -79,19 +79,18 @@ def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[
             f"{sweep.name}: expected echoes from {depth_mm[0]:.1f} to {depth_mm[-1]:.1f} mm, got images of "
             f"{grid.depth_mm:.1f} mm"
         )
+    frequency_hz, bins = _bins(signal, count)
     window = np.hanning(count).astype(np.float32)
-    power = np.zeros((depth_mm.size, count // 2))
+    power = np.zeros((depth_mm.size, bins.size))
     for k in _spread(np.arange(len(sweep)), FRAMES):
         frame = sweep.frames[k]
         for row, start in enumerate(first):
-            spectrum = np.fft.fft(frame[:, start : start + count] * window, axis=1)[:, : count // 2]
+            spectrum = np.fft.fft(frame[:, start : start + count] * window, axis=1)[:, bins]
             # Bright structure counts no more than speckle: images are equalised before they are correlated.
             energy = np.abs(spectrum) ** 2
             power[row] += (energy / np.maximum(energy.sum(axis=1, keepdims=True), 1e-30)).mean(axis=0)
     noise = np.quantile(power, _NOISE_QUANTILE, axis=1, keepdims=True)
-    return np.arange(count // 2) * signal.sampling_rate_hz / count, np.maximum(
-        power - noise, 1e-12 * power.max()
-    )
+    return frequency_hz, np.maximum(power - noise, 1e-12 * power.max())
 
 
 def doubt_band(sweep: Sweep) -> tuple[Doubt, ...]:
@@ -104,7 +103,7 @@ def doubt_band(sweep: Sweep) -> tuple[Doubt, ...]:
     if not isinstance(signal, RFSettings):
         return ()
     low, high = signal.bandwidth_hz
-    frequency, power = _spectrum(sweep, signal.sampling_rate_hz)
+    frequency, power = _spectrum(sweep, signal)
     # Mains, gain control and steps between samples are below.
     frequency, power = frequency[frequency >= low / 4], power[frequency >= low / 4]
     echo = np.maximum(power - 2 * np.quantile(power, _NOISE_QUANTILE), 0.0)
@@ -153,13 +152,21 @@ def _sizes(intensity: Float32Array, patches: PatchGrid) -> FloatArray:
     return np.where(fair & np.isfinite(rho), size, np.nan)
 
 
-def _spectrum(sweep: Sweep, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Power by frequency from zero to half the sampling rate, over all vectors of some frames."""
-    total, samples = np.zeros(1), sweep.grid.samples
+def _bins(signal: RFSettings, count: int) -> tuple[FloatArray, IntArray]:
+    """Frequencies above zero that `count` samples hold, increasing, and their bins in ``fft``."""
+    frequency_hz = signal.bin_frequency_hz(count)[: None if signal.are_complex else count // 2]
+    rising = np.argsort(frequency_hz)
+    rising = rising[frequency_hz[rising] >= 0]
+    return frequency_hz[rising], rising
+
+
+def _spectrum(sweep: Sweep, signal: RFSettings) -> tuple[FloatArray, FloatArray]:
+    """Power by frequency, over all vectors of some frames."""
+    samples = sweep.grid.samples
+    frequency_hz, bins = _bins(signal, samples)
     window = np.hanning(samples).astype(np.float32)
+    total = np.zeros(bins.size)
     for k in _spread(np.arange(len(sweep)), SPECTRA):
-        frame = sweep.frames[k]
-        # Of analytic samples the negative frequencies are empty.
-        spectrum = np.fft.fft(frame * window, axis=1)[:, : samples // 2]
+        spectrum = np.fft.fft(sweep.frames[k] * window, axis=1)[:, bins]
         total = total + (np.abs(spectrum) ** 2).mean(axis=0)
-    return np.arange(samples // 2) * rate_hz / samples, total
+    return frequency_hz, total

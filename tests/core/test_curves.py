@@ -14,7 +14,6 @@ BMODE = BModeSettings(60.0)
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("sampling_rate_hz", 50e6),
         ("speed_of_sound_m_s", 1580.0),
         ("centre_frequency_hz", 6e6),
         ("bandwidth_hz", (4e6, 9e6)),
@@ -26,6 +25,19 @@ def test_curves_of_another_signal_are_refused_and_the_setting_named(setting, val
         speckle.KEY.require_same(other, "curves c.h5 and sweep s.h5")
     assert str(error.value).startswith("curves c.h5 and sweep s.h5: ")
     assert "\n" not in str(error.value)
+
+
+def test_curves_serve_the_probe_however_its_echoes_were_sampled():
+    """The matching resamples every signal to one rate, which its band decides."""
+    faster = replace(speckle.RF, sampling_rate_hz=50e6)
+    low, high = speckle.RF.bandwidth_hz
+    baseband = replace(
+        speckle.RF, sampling_rate_hz=1.3 * (high - low), demodulation_frequency_hz=(low + high) / 2
+    )
+    for other in (faster, baseband):
+        key = replace(speckle.KEY, signal=other)
+        speckle.KEY.require_same(key)
+        key.require_same(speckle.KEY)
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def replaced(node, value):
 
 
 FAMILY = [
-    (attribute("/", "version", 2), r"version 1.*2"),
+    (attribute("/", "version", 3), r"version 1.*got 3"),
     (
         attribute("/", "format", "speckle3d.other"),
         r"'speckle3d\.(sweep|calibration|curves)'.*'speckle3d\.other'",

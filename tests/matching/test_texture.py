@@ -64,7 +64,7 @@ def echoes(low_hz, high_hz, complex_too=False, noise=0.0, rate_hz=RATE, band=(4e
     spectrum = rng.normal(size=(3, 8, SAMPLES)) + 1j * rng.normal(size=(3, 8, SAMPLES))
     frames = np.fft.ifft(spectrum * ((frequency >= low_hz) & (frequency <= high_hz))) * 1e3
     frames += noise * frames.std() * (rng.normal(size=frames.shape) + 1j * rng.normal(size=frames.shape))
-    signal = RFSettings(rate_hz, 1540.0, sum(band) / 2, band)
+    signal = RFSettings(rate_hz, 1540.0, sum(band) / 2, band, 0.0 if complex_too else None)
     grid = replace(speckle.GRID, vectors=8, samples=SAMPLES, sample_spacing_mm=signal.sample_spacing_mm)
     data = frames.astype(np.complex64) if complex_too else frames.real.astype(np.float32)
     return Sweep(data, grid, signal, np.arange(3) / 25)

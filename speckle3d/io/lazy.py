@@ -1,0 +1,276 @@
+"""Frames that stay in the file of another's format and are read, and turned, one at a time."""
+
+from __future__ import annotations
+
+import itertools
+import operator
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.geometry import require_finite
+from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
+from speckle3d.io.hdf5_guard import require_whole_chunk
+
+Slices: TypeAlias = Sequence[npt.NDArray[Any]]
+Turn: TypeAlias = Callable[[Slices], npt.NDArray[Any]]
+"""Makes a frame (vector, sample) of the slices that a file holds of it; a top-level function or a dataclass,
+so that frames can be sent to another process."""
+
+
+class OpenFrames(Protocol):
+    """An open recording."""
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        """Read frame `i`, shape (vector, sample)."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+class LazyFrames(ABC):
+    """Frames read one at a time from a file that is opened at the first one asked for.
+
+    It stays open until `close`, which may be called at any time: the next frame opens it again. A copy sent
+    to another process opens it there.
+    """
+
+    def __init__(self, path: PathLike, shape: tuple[int, int, int], dtype: npt.DTypeLike) -> None:
+        self.path = Path(path).absolute()
+        self.shape, self.dtype = shape, np.dtype(dtype)
+        self._open: OpenFrames | None = None
+        self._lock = threading.Lock()
+
+    @abstractmethod
+    def _opened(self) -> OpenFrames: ...
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        i = operator.index(index)
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"frame {i} of {len(self)}")
+        i %= len(self)
+        where = f"{self.path}: frame {i}"
+        with self._lock, reading(where), naming(where):
+            if self._open is None:
+                self._open = self._opened()
+            frame = self._open.read(i)
+            if frame.shape != self.shape[1:]:
+                raise InvalidInputError(f"expected shape {self.shape[1:]}, got {frame.shape}")
+        if frame.dtype.kind in "fc":
+            require_finite(frame, where)
+        return np.ascontiguousarray(frame, dtype=self.dtype)
+
+    def close(self) -> None:
+        """Close the file if it is open."""
+        with self._lock:
+            if self._open is not None:
+                self._open.close()
+                self._open = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("_open", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _open=None, _lock=threading.Lock())
+
+
+class HDF5Slices(LazyFrames):
+    """Frames that are slices of data sets of an HDF5 file.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Data sets that hold a part of each frame each, as real and imaginary parts.
+    axis : int, optional
+        Of the data sets: the frames. None where there is one frame and no axis for it.
+    turn : callable
+        Makes a frame of the data sets' slices, which lack that axis.
+    """
+
+    def __init__(
+        self,
+        path: PathLike,
+        names: Sequence[str],
+        axis: int | None,
+        turn: Turn,
+        shape: tuple[int, int, int],
+        dtype: npt.DTypeLike,
+    ) -> None:
+        super().__init__(path, shape, dtype)
+        self.names, self.axis, self.turn = tuple(names), axis, turn
+
+    def _opened(self) -> OpenFrames:
+        return _OpenSlices(self)
+
+
+class _OpenSlices:
+    """HDF5's handles to the data sets, made once: freeing one can lose a Ctrl-C (as in `HDF5Frames`)."""
+
+    def __init__(self, frames: HDF5Slices) -> None:
+        self._file = open_hdf5(frames.path)
+        self._turn = frames.turn
+        try:
+            self._parts = [_Part(require_dataset(self._file, name), frames) for name in frames.names]
+        except BaseException:
+            self._file.close()
+            raise
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        return self._turn([part.read(i) for part in self._parts])
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Part:
+    def __init__(self, data: h5py.Dataset, frames: HDF5Slices) -> None:
+        self._data, self._axis = data, frames.axis
+        found = 1 if self._axis is None else data.shape[self._axis] if self._axis < data.ndim else 0
+        if found != len(frames):
+            raise InvalidInputError(
+                f"{data.name}: expected {len(frames)} frames on axis {self._axis}, got {data.shape}"
+            )
+        self._count = tuple(1 if axis == self._axis else n for axis, n in enumerate(data.shape))
+        self._shape = tuple(n for axis, n in enumerate(data.shape) if axis != self._axis)
+        self._dtype = data.dtype.newbyteorder("=")
+        self._node, self._on_disk = data.id, data.id.get_space()
+        self._in_memory = h5py.h5s.create_simple(self._shape or (1,))
+        self._kind = h5py.h5t.py_create(self._dtype)
+        self._checked: set[tuple[int, ...]] = set()
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        start = tuple(i if axis == self._axis else 0 for axis in range(len(self._count)))
+        if self._data.chunks is not None:
+            self._check_chunks(i, self._data.chunks)
+        values = np.empty(self._shape or (1,), self._dtype)
+        self._on_disk.select_hyperslab(start, self._count)
+        self._node.read(self._in_memory, self._on_disk, values, self._kind)
+        return values.reshape(self._shape)
+
+    def _check_chunks(self, i: int, chunks: tuple[int, ...]) -> None:
+        starts = [
+            range(i // step * step, i + 1, step) if axis == self._axis else range(0, n, step)
+            for axis, (n, step) in enumerate(zip(self._data.shape, chunks, strict=True))
+        ]
+        for offset in itertools.product(*starts):
+            if offset not in self._checked:
+                require_whole_chunk(self._data, offset)
+                self._checked.add(offset)
+
+
+class RawFrames(LazyFrames):
+    """Frames of numbers one after the other in a plain file.
+
+    Parameters
+    ----------
+    start : int
+        Byte of the first frame's first number.
+    step : int
+        Bytes from frame to frame.
+    stored : dtype
+        Of the numbers in the file, with their byte order.
+    turn : callable
+        Makes a frame of its numbers, which come flat.
+    """
+
+    def __init__(
+        self,
+        path: PathLike,
+        start: int,
+        step: int,
+        stored: npt.DTypeLike,
+        turn: Turn,
+        shape: tuple[int, int, int],
+        dtype: npt.DTypeLike,
+    ) -> None:
+        super().__init__(path, shape, dtype)
+        self.start, self.step, self.stored, self.turn = start, step, np.dtype(stored), turn
+
+    def _opened(self) -> OpenFrames:
+        return _OpenRaw(self)
+
+
+class _OpenRaw:
+    def __init__(self, frames: RawFrames) -> None:
+        self._frames, self._stream = frames, open_regular(frames.path)
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        frames = self._frames
+        count = frames.shape[1] * frames.shape[2]
+        self._stream.seek(frames.start + i * frames.step)
+        content = self._stream.read(count * frames.stored.itemsize)
+        if len(content) != count * frames.stored.itemsize:
+            raise FileError(f"expected {count * frames.stored.itemsize} bytes, got {len(content)}: truncated")
+        return frames.turn([np.frombuffer(content, frames.stored)])
+
+    def close(self) -> None:
+        self._stream.close()
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Order of a frame's numbers in a file.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Into which they are put, the last axis running fastest.
+    axes : tuple of int
+        Where vectors and samples are among its axes; other axes have length 1.
+    """
+
+    shape: tuple[int, ...]
+    axes: tuple[int, int]
+
+    def of(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Turn numbers to (vector, sample)."""
+        shaped = values.reshape(self.shape)
+        return np.moveaxis(shaped, self.axes, (0, 1)).reshape([self.shape[axis] for axis in self.axes])
+
+
+@dataclass(frozen=True)
+class Real:
+    """Turns numbers as they are."""
+
+    layout: Layout
+
+    def __call__(self, slices: Slices) -> npt.NDArray[Any]:
+        """Make a frame."""
+        return self.layout.of(slices[0])
+
+
+@dataclass(frozen=True)
+class Complex:
+    """Turns real and imaginary parts, or I and Q."""
+
+    layout: Layout
+
+    def __call__(self, slices: Slices) -> npt.NDArray[Any]:
+        """Make a frame."""
+        real, imaginary = (self.layout.of(part) for part in slices)
+        made = np.empty(real.shape, np.complex64)
+        made.real, made.imag = real, imaginary
+        return made
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Turns numbers whose last axis is I and Q."""
+
+    layout: Layout
+
+    def __call__(self, slices: Slices) -> npt.NDArray[Any]:
+        """Make a frame."""
+        return Complex(self.layout)([slices[0][..., 0], slices[0][..., 1]])

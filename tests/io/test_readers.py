@@ -1,0 +1,144 @@
+"""One door: what a recording lacks comes from options or from a file beside it, and is asked for at once."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from image_examples import grey, tracked, write_mha
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.io import readers
+from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
+from speckle3d.io.load import load_sweep, recording_files, recording_sha256
+from speckle3d.io.readers import Reader, find_reader
+
+BMODE = "column_pitch_mm = 0.1\nrow_spacing_mm = 0.2\ndynamic_range_db = 60\n"
+
+
+@pytest.fixture
+def images(tmp_path):
+    return write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+
+
+def test_a_file_beside_a_recording_gives_what_it_lacks(images):
+    with pytest.raises(MissingSettingsError):
+        load_sweep(images)
+    images.with_name("a.mha.toml").write_text(BMODE)
+    sweep = load_sweep(images)
+    assert sweep.grid.vector_pitch_mm == 0.1
+    assert sweep.grid.sample_spacing_mm == 0.2
+    assert sweep.signal == BModeSettings(60.0)
+
+
+def test_a_recordings_own_file_comes_before_the_folders_and_options_before_both(images):
+    images.with_name("import.toml").write_text(BMODE)
+    assert load_sweep(images).signal == BModeSettings(60.0)
+    images.with_name("a.mha.toml").write_text(BMODE.replace("60", "70"))
+    assert load_sweep(images).signal == BModeSettings(70.0)
+    given = ImportSettings(dynamic_range_db=80.0)
+    assert load_sweep(images, given).signal == BModeSettings(80.0)
+    assert settings_for(images, given).column_pitch_mm == 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("column_pitch = 0.1", r"a\.mha\.toml: column_pitch: .*not permitted"),
+        ("column_pitch_mm = -1", r"a\.mha\.toml: column_pitch_mm: .*greater than 0, got -1"),
+        ("column_pitch_mm", r"a\.mha\.toml: expected TOML"),
+    ],
+)
+def test_a_wrong_file_beside_a_recording_is_named(images, text, message):
+    images.with_name("a.mha.toml").write_text(text)
+    with pytest.raises(InvalidInputError, match=message):
+        load_sweep(images)
+
+
+def test_all_that_is_missing_is_asked_for_at_once():
+    with pytest.raises(MissingSettingsError) as caught:
+        ImportSettings(bandwidth_hz=(4e6, 8e6)).over(
+            "a.rf", sampling_rate_hz=40e6, bandwidth_hz=None, vector_pitch_mm=None, centre_frequency_hz=None
+        )
+    assert caught.value.settings == ("vector_pitch_mm", "centre_frequency_hz")
+    assert "--vector-pitch-mm (distance between lines" in str(caught.value)
+    assert "--centre-frequency-hz" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_given_replaces_what_a_file_says():
+    found = ImportSettings(sampling_rate_hz=20e6).over("a", sampling_rate_hz=40e6, vector_pitch_mm=0.3)
+    assert found == {"sampling_rate_hz": 20e6, "vector_pitch_mm": 0.3}
+
+
+def test_every_setting_says_where_its_value_is_found():
+    assert all(field.description for field in ImportSettings.model_fields.values())
+
+
+def test_the_hash_of_a_recording_covers_what_stands_beside_it(images):
+    alone = recording_sha256(images)
+    beside = images.with_name("a.mha.toml")
+    beside.write_text(BMODE)
+    assert recording_files(images) == [images, beside]
+    with_settings = recording_sha256(images)
+    beside.write_text(BMODE.replace("60", "70"))
+    assert len({alone, with_settings, recording_sha256(images)}) == 3
+
+
+@pytest.fixture
+def folders(monkeypatch):
+    """A reader of another package, for folders with a file `frames.npy`."""
+
+    def read(path: Path, settings: ImportSettings) -> Sweep:
+        given = settings.over(path, frame_rate_hz=None, column_pitch_mm=None)
+        frames = np.load(path / "frames.npy")
+        grid = ImageGrid(frames.shape[1], frames.shape[2], given["column_pitch_mm"], 0.1)
+        times = np.arange(len(frames)) / given["frame_rate_hz"]
+        return Sweep(frames, grid, BModeSettings(60.0), times, name=path.name)
+
+    reader = Reader(
+        "folder of a lab",
+        lambda path, start: not start and (path / "frames.npy").is_file(),
+        read,
+        lambda path, _: [("frames", "as many as there are", "")],
+        lambda path: [path / "frames.npy"],
+    )
+    monkeypatch.setattr(readers, "_others", lambda: iter([reader]))
+    readers.readers.cache_clear()
+    yield reader
+    readers.readers.cache_clear()
+
+
+def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path):
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    np.save(scan / "frames.npy", np.zeros((3, 4, 5), dtype=np.uint8))
+    assert find_reader(scan) is folders
+    with pytest.raises(MissingSettingsError, match=r"--frame-rate-hz.*--column-pitch-mm"):
+        load_sweep(scan)
+    told = {name: value for name, value, _ in describe(scan)}
+    assert told["format"] == "folder of a lab"
+    assert "--frame-rate-hz" in told["sweep"]
+    (tmp_path / "scan.toml").write_text("frame_rate_hz = 10\ncolumn_pitch_mm = 0.3\n")
+    sweep = load_sweep(scan)
+    assert sweep.frame_time_s.tolist() == [0.0, 0.1, 0.2]
+    assert recording_files(scan) == [scan / "frames.npy", tmp_path / "scan.toml"]
+    assert len(recording_sha256(scan)) == 64
+
+
+def test_a_folder_that_no_reader_claims_is_refused(tmp_path):
+    with pytest.raises(FileError, match="expected a file, got a folder"):
+        load_sweep(tmp_path)
+
+
+def test_an_entry_point_that_is_no_reader_is_named(monkeypatch):
+    class Entry:
+        name = "lab"
+
+        def load(self):
+            return "text"
+
+    monkeypatch.setattr(readers, "entry_points", lambda group: [Entry()])
+    with pytest.raises(InvalidInputError, match=r"entry point lab of speckle3d\.readers: .*got str"):
+        list(readers._others())
