@@ -69,10 +69,9 @@ def test_a_package_reconstructs_as_the_sweep_it_was_made_from(tmp_path, sweep, c
     np.testing.assert_allclose(by_package.as_matrix(), by_sweep.as_matrix(), atol=1e-6)
     for mode in ("image", "orientation"):
         # Other samples of the sensor, and none in a pause: its noise over some 20 samples a degree of freedom.
-        assert errors[mode].length_error_percent == pytest.approx(
-            expected[mode].length_error_percent, abs=0.3
-        )
-        assert errors[mode].tilt_error_deg == pytest.approx(expected[mode].tilt_error_deg, abs=0.1)
-        assert errors[mode].yaw_error_deg == pytest.approx(expected[mode].yaw_error_deg, abs=0.1)
+        got, wanted = errors[mode], expected[mode]
+        assert got.length_error_percent == pytest.approx(wanted.length_error_percent, abs=0.3)
+        assert got.tilt_error_deg == pytest.approx(wanted.tilt_error_deg, abs=0.1)
+        assert got.yaw_error_deg == pytest.approx(wanted.yaw_error_deg, abs=0.1)
     assert abs(errors["orientation"].tilt_error_deg) < 0.4
     assert abs(errors["image"].length_error_percent) < 6
