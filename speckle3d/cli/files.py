@@ -168,7 +168,9 @@ def convert(
     transform: Transform = None,
     reference_transform: Annotated[str | None, typer.Option(metavar="NAME")] = None,
     calibration: CalibrationFiles = None,
-    compress: Annotated[bool, typer.Option(help="Pack what is written: smaller and slower.")] = True,
+    compression: Annotated[
+        str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
+    ] = "gzip",
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
 
@@ -179,15 +181,17 @@ def convert(
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
 
     options = locals()
     suffix = out.suffix.lower()
-    if suffix not in (".h5", ".hdf5", *SUFFIXES):
+    if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
         known = ", ".join((".h5", ".hdf5", *SUFFIXES))
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
     given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
     require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
+    if compression not in COMPRESSIONS:
+        raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
     if transform is not None:
         require_sequence(source, transform)
         options["tracker_transform"] = transform
@@ -197,8 +201,8 @@ def convert(
     sweep = mount(sweep, calibration or ())
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
-            write_sweep(out, sweep, progress, "gzip" if compress else None)
+            write_sweep(out, sweep, progress, COMPRESSIONS[compression])
             return
-        left_out = write_sequence(out, sweep, progress, compress)
+        left_out = write_sequence(out, sweep, progress, compression != "none")
     for each in left_out:
         note(f"{out}: does not hold {each}")

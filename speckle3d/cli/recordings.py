@@ -116,8 +116,8 @@ def _advice(path: Path, lacking: Sequence[str]) -> str:
     also = f"; nor {size}" if _PIXEL & {*lacking} else ""
     options = " ".join(f"--{each} ..." for each in others)
     return (
-        f"the recording does not say its {', '.join(others)}: give them in {path.name}.toml beside it, or make it "
-        f"a sweep file by `speckle3d convert {path.name} OUT.h5 {options}`{also}"
+        f"the recording does not say its {', '.join(others)}: give that in {path.name}.toml, or make "
+        f"it a sweep file by `speckle3d convert {path.name} OUT.h5 {options}`{also}"
     )
 
 

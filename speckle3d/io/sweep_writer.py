@@ -41,6 +41,9 @@ from speckle3d.io.sweeps import (
 )
 
 Compression = Literal["gzip", "lzf"] | None
+COMPRESSIONS: dict[str, Compression] = {"gzip": "gzip", "lzf": "lzf", "none": None}
+"""By their names on the command line."""
+
 Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1

@@ -100,9 +100,8 @@ class DeviceSet:
             found = self.transform(self.image_frame, end)
             if found is not None:
                 return pixel_axes(found, f"{self.image_frame} to {end}")
-                is_of_size = self.scan.output_size is None or (
-                    size is not None and size[:2] == self.scan.output_size
-                )
+        made = self.scan.output_size
+        is_of_size = made is None or (size is not None and tuple(size[:2]) == made)
         return self.scan.output_mm if is_of_size else None
 
     def line_pitch_mm(self, path: PathLike, lines: int) -> float | None:
