@@ -204,19 +204,22 @@ class RawFrames(LazyFrames):
 
 class _OpenRaw:
     def __init__(self, frames: RawFrames) -> None:
-        self._frames, self._stream = frames, open_regular(frames.path)
+        self._frames = frames
 
     def read(self, i: int) -> npt.NDArray[Any]:
         frames = self._frames
         count = frames.shape[1] * frames.shape[2]
-        self._stream.seek(frames.start + i * frames.step)
-        content = self._stream.read(count * frames.stored.itemsize)
-        if len(content) != count * frames.stored.itemsize:
-            raise FileError(f"expected {count * frames.stored.itemsize} bytes, got {len(content)}: truncated")
+        expected = count * frames.stored.itemsize
+        with open_regular(frames.path) as stream:
+            stream.seek(frames.start + i * frames.step)
+            content = stream.read(expected)
+        if len(content) != expected:
+            where = f"{frames.path}: frame {i}"
+            raise FileError(f"{where}: expected {expected} bytes, got {len(content)}: truncated")
         return frames.turn([np.frombuffer(content, frames.stored)])
 
     def close(self) -> None:
-        self._stream.close()
+        """Nothing stays open between frames."""
 
 
 @dataclass(frozen=True)
