@@ -41,6 +41,31 @@ def rf_sweep(frames=6, vectors=5, samples=40, dtype=np.int16, seed=0):
     )
 
 
+class Pairs:
+    """I/Q in memory that a scanner recorded as pairs of int16, as a reader's frames give them."""
+
+    dtype = np.dtype(np.complex64)
+    stored_dtype = np.dtype(np.int16)
+
+    def __init__(self, pairs):
+        self.pairs, self.shape = pairs, pairs.shape[:3]
+
+    def __getitem__(self, index):
+        return self.pairs[index].astype(np.float32).view(np.complex64)[..., 0]
+
+
+def iq_sweep(paired=True, frames=6, vectors=5, samples=40, demodulation_frequency_hz=6e6, seed=0):
+    rng = np.random.default_rng(seed)
+    pairs = rng.integers(-32768, 32768, (frames, vectors, samples, 2)).astype(np.int16)
+    signal = replace(RF, sampling_rate_hz=10e6, demodulation_frequency_hz=demodulation_frequency_hz)
+    plain = rf_sweep(frames, vectors, samples, seed=seed)
+    grid = replace(plain.grid, sample_spacing_mm=signal.sample_spacing_mm)
+    held = Pairs(pairs)
+    if not paired:
+        held = (np.stack([held[i] for i in range(frames)]) / 7).astype(np.complex64)
+    return replace(plain, frames=held, grid=grid, signal=signal)
+
+
 def bmode_sweep(frames=4, columns=6, rows=9):
     data = np.random.default_rng(0).integers(0, 256, (frames, columns, rows)).astype(np.uint8)
     plain = rf_sweep(frames, columns, rows)

@@ -15,15 +15,13 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
 from speckle3d.io.hdf5_guard import plain_attribute
-from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import settings_for
-from speckle3d.io.load import IMAGE, kind_of
-from speckle3d.io.metaimage import image_orientation, image_type
+from speckle3d.io.load import kind_of
 from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
 
@@ -47,8 +45,7 @@ def describe(path: PathLike) -> list[Row]:
             known = ", ".join(sorted(_DESCRIBERS))
             raise InvalidInputError(f"{path}: expected a format among {known}, got {kind!r}")
         return [("format", kind, ""), *_told(reader, Path(path))]
-    rows = _DESCRIBERS[kind](path)
-    return rows if kind == IMAGE else [("format", kind, ""), *rows]
+    return [("format", kind, ""), *_DESCRIBERS[kind](path)]
 
 
 def _told(reader: Reader, path: Path) -> list[Row]:
@@ -75,7 +72,7 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
         ("frames", str(len(sweep)), ""),
         *_rate_rows("", sweep.frame_time_s, "frames/s"),
         ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
-        ("sample type", str(sweep.frames.dtype), ""),
+        ("sample type", _sample_type(sweep), ""),
         ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
         ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
         ("width", f"{grid.width_mm:.2f}", "mm"),
@@ -98,12 +95,30 @@ def _signal_rows(signal: RFSettings | BModeSettings) -> list[Row]:
         return [("signal", "B-mode", ""), ("dynamic range", f"{signal.dynamic_range_db:g}", "dB")]
     low, high = (f"{edge / 1e6:g}" for edge in signal.bandwidth_hz)
     return [
-        ("signal", "RF", ""),
+        *_kind_rows(signal.demodulation_frequency_hz),
         ("sampling rate", f"{signal.sampling_rate_hz / 1e6:g}", "MHz"),
         ("centre frequency", f"{signal.centre_frequency_hz / 1e6:g}", "MHz"),
         ("band", f"{low} to {high}", "MHz"),
         ("speed of sound", f"{signal.speed_of_sound_m_s:g}", "m/s"),
     ]
+
+
+def _kind_rows(demodulation_frequency_hz: float | None) -> list[Row]:
+    if demodulation_frequency_hz is None:
+        return [("signal", "RF", "")]
+    if demodulation_frequency_hz == 0:
+        return [("signal", "I/Q, not demodulated (the analytic signal)", "")]
+    return [
+        ("signal", "I/Q", ""),
+        ("demodulation frequency", f"{demodulation_frequency_hz / 1e6:g}", "MHz"),
+    ]
+
+
+def _sample_type(sweep: Sweep) -> str:
+    stored = stored_dtype(sweep.frames)
+    if sweep.frames.dtype == stored:
+        return str(stored)
+    return f"{sweep.frames.dtype}, stored as pairs of {stored}"
 
 
 def _sensor_rows(sweep: Sweep) -> list[Row]:
@@ -205,28 +220,10 @@ def _spoken(name: str) -> tuple[str, str]:
     return words, "" if found is None else _UNIT_NAMES[found]
 
 
-def _describe_header(path: PathLike) -> list[Row]:
-    header = read_header(path)
-    held = header.transforms
-    spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
-    return [
-        ("format", header.file_format, ""),
-        ("size", " x ".join(str(n) for n in header.size), ""),
-        ("frames", str(header.frame_count), ""),
-        ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
-        ("image type", image_type(header), ""),
-        ("image orientation", image_orientation(header), ""),
-        ("sample type", header.fields.get("ElementType") or header.fields.get("type", ""), ""),
-        ("transforms", ", ".join(held) or "none", ""),
-        ("time stamps", "yes" if any("Timestamp" in f for f in header.frames) else "no", ""),
-    ]
-
-
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
     sweeps.FORMAT: lambda path: sweep_rows(sweeps.read_sweep(path)),
     reconstructions.FORMAT: _describe_reconstruction,
     curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,
     challenge.FORMAT: _describe_scan,
-    IMAGE: _describe_header,
 }

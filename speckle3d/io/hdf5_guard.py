@@ -282,6 +282,11 @@ def inflate(packed: bytes, expected: int, offset: Offset) -> bytes:
     return found
 
 
+def is_filtered(node: h5py.Dataset) -> bool:
+    """Whether filters made a data set's chunks, whose length then says nothing."""
+    return bool(_pipeline(node))
+
+
 def is_only_deflated(node: h5py.Dataset) -> bool:
     """Whether `unpacked` can make a data set's chunks: of a plain type, deflated, shuffled before or not."""
     if h5py.h5t.py_create(node.dtype) != node.id.get_type():

@@ -58,6 +58,13 @@ class SequenceHeader:
         return self.size[2] if len(self.size) > 2 else 1
 
     @property
+    def is_volume(self) -> bool:
+        """Whether the third axis is of space, as ``Kinds`` says and frames' fields do not contradict."""
+        kinds = (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
+        in_space = len(kinds) == 3 and kinds[2] in ("domain", "space")
+        return in_space and self.frame_count > max(len(self.frames), 1)
+
+    @property
     def file_format(self) -> str:
         """``"NrrdImage"`` or ``"MetaImage"``."""
         return "NrrdImage" if "sizes" in self.fields else "MetaImage"

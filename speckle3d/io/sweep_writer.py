@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from types import TracebackType
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import h5py
 import numpy as np
@@ -25,6 +26,7 @@ from speckle3d.core.sweep import (
     Tracker,
     stored_dtype,
 )
+from speckle3d.io.deflate import DeflatingWriter
 from speckle3d.io.hdf5 import HDF5Writer, PathLike, atomic_path, has_member, open_hdf5, opened, reading
 from speckle3d.io.hdf5_guard import plain_attribute, require_own
 from speckle3d.io.sweeps import (
@@ -39,10 +41,21 @@ from speckle3d.io.sweeps import (
 )
 
 Compression = Literal["gzip", "lzf"] | None
+COMPRESSIONS: dict[str, Compression] = {"gzip": "gzip", "lzf": "lzf", "none": None}
+"""By their names on the command line."""
+
 Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1
-"""Speckle hardly compresses further at higher levels, which cost several times the time."""
+"""Told to readers; what packs is `speckle3d.io.deflate`."""
+
+
+@runtime_checkable
+class CarriesMore(Protocol):
+    """Frames of a recording that says more than a sweep holds."""
+
+    def write_more(self, file: h5py.File) -> None:
+        """Write that into groups of its own."""
 
 
 class SweepWriter(HDF5Writer):
@@ -57,7 +70,8 @@ class SweepWriter(HDF5Writer):
     dtype : dtype
         int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
     compression : {"gzip", "lzf", None}
-        HDF5 filter, with byte shuffling; lzf is faster and larger.
+        HDF5 filter, with byte shuffling. gzip packs in threads (see `speckle3d.io.deflate`), lzf does not and
+        is both slower and larger; None is as fast as the disk.
     """
 
     def __init__(
@@ -75,6 +89,7 @@ class SweepWriter(HDF5Writer):
         require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
         self._paired = self._name == "iq" and self._dtype == np.int16
         self._compression = compression
+        self._deflating: DeflatingWriter | None = None
         self._time_s: list[float] = []
 
     def _begin(self) -> None:
@@ -93,6 +108,17 @@ class SweepWriter(HDF5Writer):
         self._frames = node.id
         self._in_memory = h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
+        if self._compression == "gzip":
+            self._deflating = DeflatingWriter(self._frames, self._require_room)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            super().__exit__(kind, error, trace)
+        finally:
+            if self._deflating is not None:
+                self._deflating.close()
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
@@ -117,7 +143,8 @@ class SweepWriter(HDF5Writer):
         if self._paired:
             frame = _as_pairs(frame, where)
         self._write(i, np.ascontiguousarray(frame, self._dtype))
-        self._require_room()
+        if self._deflating is None:
+            self._require_room()
         self._time_s.append(float(time_s))
 
     def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
@@ -139,6 +166,10 @@ class SweepWriter(HDF5Writer):
             plain = isinstance(value, str | int | float)
             group.attrs[name] = value if plain else json.dumps(value, sort_keys=True)
 
+    def write_more(self, frames: CarriesMore) -> None:
+        """Write what frames carry beyond the format."""
+        frames.write_more(self._file)
+
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
         with reading(source), naming(str(source)), open_hdf5(source) as other:
@@ -150,6 +181,9 @@ class SweepWriter(HDF5Writer):
                     self._file.attrs[name] = plain_attribute(other, name)
 
     def _write(self, i: int, frame: npt.NDArray[Any]) -> None:
+        if self._deflating is not None:
+            self._deflating.append(frame)
+            return
         self._frames.set_extent((i + 1, *frame.shape))
         on_disk = self._frames.get_space()
         on_disk.select_hyperslab((i, *(0,) * frame.ndim), (1, *frame.shape))
@@ -158,6 +192,8 @@ class SweepWriter(HDF5Writer):
         self._on_disk = on_disk
 
     def _finish(self) -> None:
+        if self._deflating is not None:
+            self._deflating.finish()
         with naming(str(self._path)):
             times = require_increasing(np.asarray(self._time_s, dtype=float), "/frame_time_s")
             if times.size == 0:
@@ -215,6 +251,8 @@ def write_sweep(
             writer.write_probe(sweep.probe)
         if simulation is not None:
             writer.write_simulation(simulation)
+        if isinstance(sweep.frames, CarriesMore):
+            writer.write_more(sweep.frames)
         if type(sweep.frames) is HDF5Frames:
             writer.copy_unknown(sweep.frames.path)
 

@@ -49,7 +49,7 @@ from speckle3d.io.hdf5 import (
     reading,
     require_dataset,
 )
-from speckle3d.io.hdf5_guard import is_only_deflated, require_whole_chunk, unpacked
+from speckle3d.io.hdf5_guard import is_filtered, is_only_deflated, require_whole_chunk, unpacked
 from speckle3d.io.readers import Reader
 
 FORMAT = "speckle3d.sweep"
@@ -137,13 +137,15 @@ class _OpenFrames:
         self._in_memory = h5py.h5s.create_simple(self._frame_shape)
         self._kind = h5py.h5t.py_create(self._dtype)
         self._unpacks = self._data.chunks == (1, *self._frame_shape) and is_only_deflated(self._data)
+        # Chunks that no filter made were looked at when the data set was found.
+        self._checks = self._data.chunks is not None and is_filtered(self._data)
         self._checked: set[tuple[int, ...]] = set()
 
     def read(self, i: int) -> npt.NDArray[Any]:
         if self._unpacks:
             frame: npt.NDArray[Any] = unpacked(self._data, (i, *self._no_offset))[0]
             return frame
-        if self._data.chunks is not None:
+        if self._checks:
             self._check_chunks(i, self._data.chunks)
         frame = np.empty(self._frame_shape, self._dtype)
         self._on_disk.select_hyperslab((i, *self._no_offset), (1, *self._frame_shape))

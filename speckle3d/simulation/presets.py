@@ -22,6 +22,7 @@ from speckle3d.simulation.movement import (
     turned_about,
     world_from_medium,
 )
+from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
 from speckle3d.simulation.scan import SimulatedFrames
 from speckle3d.simulation.sensors import (
     OrientationModel,
@@ -119,7 +120,16 @@ class _Scene:
         image, snr_db = self.image, self.settings.snr_db
         frames = SimulatedFrames(self.beam, self.medium, poses, image, snr_db, _entropy(noise))
         truth = self.world_from_medium * poses
-        return Sweep(frames, image, self.beam.probe.signal, time_s, orientation, tracker, truth, name=name)
+        rf = Sweep(frames, image, self.beam.probe.signal, time_s, orientation, tracker, truth, name=name)
+        return _received(rf, self.settings)
+
+
+def _received(rf: Sweep, settings: SimulationSettings) -> Sweep:
+    if settings.signal == "iq":
+        return received_as_iq(rf, settings.demodulation_frequency_hz, settings.decimation)
+    if settings.signal == "bmode":
+        return received_as_bmode(rf, settings.dynamic_range_db, settings.decimation)
+    return rf
 
 
 def _motion(settings: SimulationSettings) -> HandMotion:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.sweep import Sweep
 from speckle3d.simulation.bath import Reflector
 
+Signal = Literal["rf", "iq", "bmode"]
 Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped", "plane"]
 
 
@@ -57,6 +58,15 @@ class SimulationSettings(BaseModel):
         Of `plane`: angle of the floor with the horizontal, in a random direction.
     sensor_noise : float
         Of `plane`: factor on the noise of both sensors; 0 for exact ones.
+    signal : {"rf", "iq", "bmode"}
+        What the scanner stores: echoes as they come, their I/Q, or 8-bit grey levels.
+    demodulation_frequency_hz : float, optional
+        Of `iq`: what the echoes are shifted down by; by default their centre frequency.
+    decimation : int, optional
+        Of `iq` and `bmode`: samples of the echoes in one that is stored; by default as many as leave I/Q a
+        quarter more than they need, and rows of 0.05 mm.
+    dynamic_range_db : float
+        Of `bmode`: from black to white, which is 20 dB over the mean of speckle.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -90,6 +100,10 @@ class SimulationSettings(BaseModel):
     depth_range_mm: tuple[float, float] = (12.0, 34.0)
     floor_slope_deg: float = Field(0.0, ge=0, le=60)
     sensor_noise: float = Field(1.0, ge=0, le=10)
+    signal: Signal = "rf"
+    demodulation_frequency_hz: float | None = Field(None, gt=0)
+    decimation: int | None = Field(None, ge=1)
+    dynamic_range_db: float = Field(60.0, gt=0, le=200)
 
     @field_validator("depth_range_mm")
     @classmethod

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+import zlib
 from dataclasses import replace
 
 import h5py
@@ -15,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
-from speckle3d.core.sweep import BModeSettings
+from speckle3d.core.sweep import BModeSettings, stored_dtype
+from speckle3d.io.describe import describe
 from speckle3d.io.sweep_writer import SweepWriter, write_sweep
 from speckle3d.io.sweeps import HDF5Frames, read_sweep
 
@@ -59,6 +61,129 @@ def test_everything_a_sweep_carries_comes_back(tmp_path, dtype, compression):
     sweep = sweep_examples.rf_sweep(dtype=dtype)
     write_sweep(tmp_path / "s.h5", sweep, compression=compression)
     assert_same_sweep(read_sweep(tmp_path / "s.h5"), sweep)
+
+
+@pytest.mark.parametrize("compression", ["gzip", "lzf", None])
+@pytest.mark.parametrize("paired", [True, False], ids=["int16 pairs", "complex64"])
+@pytest.mark.parametrize("demodulation_frequency_hz", [6e6, 0.0], ids=["baseband", "analytic"])
+def test_i_and_q_come_back_as_they_were_stored(tmp_path, paired, compression, demodulation_frequency_hz):
+    sweep = sweep_examples.iq_sweep(paired, demodulation_frequency_hz=demodulation_frequency_hz)
+    write_sweep(tmp_path / "s.h5", sweep, compression=compression)
+    for times in range(2):
+        got = read_sweep(tmp_path / "s.h5")
+        assert_same_sweep(got, sweep)
+        assert got.frames.dtype == np.complex64
+        assert (
+            stored_dtype(got.frames) == stored_dtype(sweep.frames) == (np.int16 if paired else np.complex64)
+        )
+        assert stored_dtype(got.part(1, 3).frames) == stored_dtype(sweep.frames)
+        if times == 0:
+            write_sweep(tmp_path / "s.h5", got, compression=compression)
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert file.attrs["version"] == 2
+        assert file["iq"].shape == ((6, 5, 40, 2) if paired else (6, 5, 40))
+        assert file["iq"].attrs["demodulation_frequency_hz"] == demodulation_frequency_hz
+
+
+def test_only_i_and_q_make_a_file_of_version_2(path, tmp_path):
+    with h5py.File(path) as file:
+        assert file.attrs["version"] == 1
+    write_sweep(tmp_path / "b.h5", sweep_examples.bmode_sweep())
+    with h5py.File(tmp_path / "b.h5", "r+") as file:
+        assert file.attrs["version"] == 1
+        file.attrs["version"] = 2
+    assert_same_sweep(read_sweep(tmp_path / "b.h5"), sweep_examples.bmode_sweep())
+
+
+@pytest.fixture
+def iq_path(tmp_path):
+    write_sweep(tmp_path / "iq.h5", sweep_examples.iq_sweep())
+    return tmp_path / "iq.h5"
+
+
+def replaced(data):
+    def change(file):
+        kept = dict(file["iq"].attrs)
+        del file["iq"]
+        file.create_dataset("iq", data=data).attrs.update(kept)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda file: file.attrs.__setitem__("version", 3), r"version 1 or 2, got 3$"),
+        (lambda file: file.attrs.__setitem__("version", 1), r"data set rf or bmode, got none"),
+        (lambda file: file.move("iq", "other"), r"data set rf, iq or bmode, got none"),
+        (lambda file: file.create_dataset("rf", data=np.zeros((6, 5, 40), "i2")), r"got rf and iq"),
+        (lambda file: file["iq"].attrs.__delitem__("demodulation_frequency_hz"), r"/iq .*demodulation_freq"),
+        (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", -6e6), r"zero or above"),
+        (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", 20e6), r"within half"),
+        (replaced(np.zeros((6, 5, 40, 3), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40, 3\)"),
+        (replaced(np.zeros((6, 5, 40), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40\)"),
+        (replaced(np.zeros((6, 5, 40, 2), "c8")), r"\(frame, vector, sample\), got \(6, 5, 40, 2\)"),
+        (replaced(np.zeros((6, 5, 40), "c16")), r"complex64 or int16, got complex128"),
+        (replaced(np.zeros((6, 5, 40), "f4")), r"complex64 or int16, got float32"),
+    ],
+)
+def test_what_is_wrong_with_i_and_q_is_named(iq_path, change, message):
+    with h5py.File(iq_path, "r+") as file:
+        change(file)
+    with pytest.raises(InvalidInputError, match=message):
+        read_sweep(iq_path)
+
+
+def test_i_and_q_written_by_hand_from_the_description_are_read(tmp_path):
+    pairs = np.arange(48).reshape(2, 3, 4, 2)
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file.attrs.update(format=np.bytes_(b"speckle3d.sweep"), version=2)
+        iq = file.create_dataset("iq", data=pairs.astype(">i2"))
+        iq.attrs.update(sampling_rate_hz=15_000_000, vector_pitch_mm=0.15, speed_of_sound_m_s=1540.0)
+        iq.attrs.update(first_sample_depth_mm=0, centre_frequency_hz=6e6, bandwidth_hz=[4e6, 8e6])
+        iq.attrs.update(demodulation_frequency_hz=6_500_000)
+        file["frame_time_s"] = [0.0, 0.04]
+    sweep = read_sweep(tmp_path / "s.h5")
+    np.testing.assert_array_equal(all_frames(sweep), pairs[..., 0] + 1j * pairs[..., 1])
+    assert sweep.signal.demodulation_frequency_hz == 6.5e6
+    rows = {name: value for name, value, _ in describe(tmp_path / "s.h5")}
+    assert rows["signal"] == "I/Q"
+    assert rows["demodulation frequency"] == "6.5"
+    assert rows["sample type"] == "complex64, stored as pairs of int16"
+
+
+@pytest.mark.parametrize("value", [0.5, 40_000, np.nan])
+def test_pairs_that_int16_does_not_hold_are_refused(tmp_path, value):
+    sweep = sweep_examples.iq_sweep()
+    frame = sweep.frames[0]
+    frame[1, 2] = 3 + 1j * value
+    with (
+        pytest.raises(InvalidInputError, match=r"/iq\[0\]"),
+        SweepWriter(tmp_path / "s.h5", sweep.grid, sweep.signal, np.int16) as writer,
+    ):
+        writer.append(frame, 0.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nan_in_complex_samples_is_named_when_the_frame_is_read(tmp_path):
+    write_sweep(tmp_path / "s.h5", sweep_examples.iq_sweep(paired=False))
+    with h5py.File(tmp_path / "s.h5", "r+") as file:
+        file["iq"][2, 1, 7] = 1 + 1j * np.nan
+    sweep = read_sweep(tmp_path / "s.h5")
+    with pytest.raises(InvalidInputError, match=r"/iq\[2\]\[\(1, 7\)\]"):
+        sweep.frames[2]
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_a_truncated_chunk_of_i_and_q_is_never_filled_from_memory(tmp_path, paired):
+    write_sweep(tmp_path / "s.h5", sweep_examples.iq_sweep(paired))
+    offset = (3, 0, 0, 0) if paired else (3, 0, 0)
+    with h5py.File(tmp_path / "s.h5", "r+") as file:
+        file["iq"].id.write_direct_chunk(offset, zlib.compress(bytes(399)))
+    sweep = read_sweep(tmp_path / "s.h5")
+    expected = 800 if paired else 1600
+    with pytest.raises(InvalidInputError, match=rf"/iq\[3\].*expected {expected} bytes, got 399"):
+        sweep.frames[3]
 
 
 def test_bmode_comes_back(tmp_path):
@@ -284,6 +409,7 @@ def append_all(path, frames, times, **options):
         ([np.full((5, 40), np.nan)], [0], {"dtype": np.float32}, r"/rf\[0\]\[\(0, 0\)\]"),
         ([np.zeros((5, 40), np.int16)] * 2, [1, 1], {}, r"/frame_time_s\[1\]"),
         ([], [], {"dtype": np.complex64}, r"complex64"),
+        ([np.zeros((5, 40), np.complex64)], [0], {}, r"/rf\[0\].*int16, got complex64"),
     ],
 )
 def test_the_writer_refuses_what_the_reader_would(tmp_path, frames, times, options, message):
