@@ -68,8 +68,10 @@ def main() -> None:
             shown = ", ".join(f"{e:+.2f} ({c:.2f})" for e, c in zip(error, claimed, strict=True))
             print(f"seed {seed}: error (claimed) about x, y, z: {shown} deg", flush=True)
     one, two = (100 * np.mean(np.array(ratios) < k) for k in (1.0, 2.0))
-    print(f"{given.reflector}, {given.seeds} scans: {statistics.median(sizes):.2f} deg in all, median; "
-          f"largest {max(sizes):.2f}; {one:.0f} % within one claimed deviation, {two:.0f} % within two")  # fmt: skip
+    print(
+        f"{given.reflector}, {given.seeds} scans: {statistics.median(sizes):.2f} deg in all, median; largest "
+        f"{max(sizes):.2f}; {one:.0f} % within one claimed deviation, {two:.0f} % within two"
+    )
 
 
 if __name__ == "__main__":
