@@ -93,6 +93,21 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     return rows
 
 
+def sensor_of(path: Path) -> tuple[imu.SensorSamples, imu.Fit | None]:
+    """Read the sensor's samples of a package, and what its quaternion means; None where nothing fits.
+
+    Raises
+    ------
+    InvalidInputError
+        If the package has no sensor, or its samples make no sense.
+    """
+    member = find_recording(path).sensor
+    if member is None:
+        raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
+    samples = imu.read_samples(member)
+    return samples, imu.meaning_of(imu.fits_of(samples))
+
+
 def package_files(path: Path) -> Sequence[Path]:
     """Other files on disk that the sweep's content depends on."""
     return sorted({each.path for each in find_recording(path).members} - {path})
@@ -219,8 +234,7 @@ def _signal(said: Description, values: dict[str, float]) -> RFSettings | BModeSe
 def _orientation(recording: Recording) -> OrientationSensor | None:
     if recording.sensor is None:
         return None
-    samples = imu.read_samples(recording.sensor)
-    fit = imu.meaning_of(imu.fits_of(samples))
+    samples, fit = sensor_of(recording.path)
     return None if fit is None else imu.orientation_sensor(samples, fit)
 
 
