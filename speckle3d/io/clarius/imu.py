@@ -100,8 +100,11 @@ class SensorSamples:
         return int(self.time_s.size)
 
     def accelerometer_m_s2(self, fit: Fit | None) -> FloatArray:
-        """Specific force, shape (m, 3): against what is measured where a quaternion's z tells it is gravity."""
-        return (1.0 if fit is None else fit.vertical) * G_M_S2 * self.accelerometer_g
+        """Specific force, shape (m, 3): what is measured, or against it, as the quaternion's z tells.
+
+        Against it where no quaternion fits, as in both public recordings.
+        """
+        return (-1.0 if fit is None else fit.vertical) * G_M_S2 * self.accelerometer_g
 
 
 @dataclass(frozen=True)
