@@ -248,6 +248,8 @@ def _curves(recording: Recording, chosen: _Chosen) -> tuple[Curve, ...] | None:
         if name not in recording.gains:
             continue
         curves = read_gains(recording.gains[name])
+        if not curves:
+            continue
         lacking = [int(t) for t in chosen.times_ns if int(t) not in curves]
         if not lacking:
             return tuple(curves[int(t)] or chosen.said.gain for t in chosen.times_ns)
