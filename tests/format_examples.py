@@ -108,8 +108,8 @@ def region(left, top, right, bottom, **changes):
     return made
 
 
-def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None, **elements):
-    """Write `images` (frame, row, column[, colour]) as an ultrasound scanner does."""
+def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None, claimed=None, **elements):
+    """Write `images` (frame, row, column[, colour]) as a scanner does, packed by `syntax` or `claimed` so."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.sequence import Sequence
     from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
@@ -136,6 +136,12 @@ def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None
     made.PixelData = images.tobytes()
     if syntax is not None:
         made.compress(syntax)
+    if claimed is not None:
+        from pydicom.encaps import encapsulate
+
+        made.PixelData = encapsulate([image.tobytes() for image in images])
+        made["PixelData"].is_undefined_length = True
+        meta.TransferSyntaxUID = claimed
     made.save_as(path, enforce_file_format=True)
     return path
 
@@ -227,6 +233,8 @@ def _put_73(file, group, name, value):
         return
     values = np.array([list(map(ord, value))], "u2") if isinstance(value, str) else np.atleast_2d(value)
     kind = {"f8": "double", "f4": "single", "i2": "int16", "u1": "uint8"}.get(values.dtype.str[1:], "double")
+    if isinstance(value, str):
+        kind = "char"
     if np.iscomplexobj(values):
         part = values.real.dtype
         pairs = np.empty(values.shape, [("real", part), ("imag", part)])

@@ -38,7 +38,7 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     lag, power = 0j, 0.0
     for i in sorted({0, frames.shape[0] // 2, frames.shape[0] - 1}):
         frame = np.asarray(frames[i], dtype=np.complex128)
-        lag += np.vdot(frame[:, :-1], frame[:, 1:])
+        lag += complex(np.vdot(frame[:, :-1], frame[:, 1:]))
         power += float((np.abs(frame) ** 2).sum())
     if not abs(lag) > _LEAST_COHERENCE * power:
         return None

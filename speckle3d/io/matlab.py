@@ -239,21 +239,20 @@ def _numbers(
         values = _scaled(file, name, arrays[name])
         wanted = 2 if name == "bandwidth_hz" else 1
         if values.size != wanted and not (wanted == 1 and values.size and (values == values[0]).all()):
-            raise InvalidInputError(
-                f"{file.path}: {name} = {printable(arrays[name])}: expected {wanted}, got {values.size} numbers"
-            )
+            where = f"{file.path}: {name} = {printable(arrays[name])}"
+            raise InvalidInputError(f"{where}: expected {wanted} number(s), got {values.size}")
         value = (float(values[0]), float(values[1])) if wanted == 2 else float(values[0])
         found[name] = Found(value, f"in {arrays[name]}")
     placed = {name: _scaled(file, name, arrays[name]) for name in _POSITIONS if name in arrays}
-    for (name, values), (spoken, length) in zip(
-        ((name, placed.get(name)) for name in _POSITIONS),
-        (("vectors", shape[1]), ("samples", shape[2]), ("frames", shape[0])),
-        strict=True,
-    ):
-        if values is not None and values.size != length:
+    lengths = dict(
+        zip(_POSITIONS, (("vectors", shape[1]), ("samples", shape[2]), ("frames", shape[0])), strict=True)
+    )
+    for name, values in placed.items():
+        spoken, length = lengths[name]
+        if values.size != length:
             raise InvalidInputError(
-                f"{file.path}: {name} = {printable(arrays[name])}: expected {length} numbers for {length} {spoken}, got "
-                f"{values.size}: are axes = {arrays['axes']} in this order?"
+                f"{file.path}: {name} = {printable(arrays[name])}: expected {length} numbers for {length} "
+                f"{spoken}, got {values.size}: are axes = {printable(arrays['axes'])} in this order?"
             )
     spacing = None
     if "x_mm" in placed:

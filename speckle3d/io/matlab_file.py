@@ -206,7 +206,12 @@ class _NewFile(MatFile):
             elif pending:
                 raise self._none(name)
             pending, node = index, member
-        if not isinstance(node, h5py.Dataset) or not _is_numeric(node.dtype) or pending:
+        if (
+            not isinstance(node, h5py.Dataset)
+            or not _is_numeric(node.dtype)
+            or _class(node) == "char"
+            or pending
+        ):
             raise self._none(name)
         return require_dataset(self._file, node.name)
 
