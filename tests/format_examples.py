@@ -108,8 +108,8 @@ def region(left, top, right, bottom, **changes):
     return made
 
 
-def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None, **elements):
-    """Write `images` (frame, row, column[, colour]) as an ultrasound scanner does."""
+def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None, claimed=None, **elements):
+    """Write `images` (frame, row, column[, colour]) as a scanner does, packed by `syntax` or `claimed` so."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.sequence import Sequence
     from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
@@ -136,5 +136,110 @@ def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None
     made.PixelData = images.tobytes()
     if syntax is not None:
         made.compress(syntax)
+    if claimed is not None:
+        from pydicom.encaps import encapsulate
+
+        made.PixelData = encapsulate([image.tobytes() for image in images])
+        made["PixelData"].is_undefined_length = True
+        meta.TransferSyntaxUID = claimed
     made.save_as(path, enforce_file_format=True)
     return path
+
+
+def write_zea(path, frames, kind="beamformed_data", home="", placed=True, scan=(), positions=None):
+    """Write `frames` (frame, vector, sample) as zea 0.0.12 does; not `placed`, as earlier versions did."""
+    turned = frames.transpose(0, 2, 1)
+    if kind == "beamformed_data":
+        parts = (turned.real, turned.imag) if np.iscomplexobj(frames) else (turned,)
+        turned = np.stack(parts, axis=-1).astype("f4")
+    x, z = axes(*frames.shape[1:])
+    if positions is None:
+        positions = np.stack([*np.broadcast_arrays(x[None], 0.0, z[:, None])], axis=-1)
+    given = {"sound_speed": 1480.0, "center_frequency": 6e6, "demodulation_frequency": 6e6} | dict(scan)
+    with h5py.File(path, "a") as file:
+        file.attrs.update({"zea_version": "0.0.12", "probe_name": "L11-4v"})
+        if placed:
+            group = file.create_group(f"{home}data/{kind}")
+            group.create_dataset("values", data=turned, compression="gzip", chunks=(1, *turned.shape[1:]))
+            group["coordinates"] = np.broadcast_to(positions, (len(frames), *positions.shape)).astype("f4")
+        else:
+            file[f"{home}data/{kind}"] = turned
+        for name, value in given.items():
+            if value is not None:
+                file[f"{home}scan/{name}"] = np.asarray(value, "f4")
+    return path
+
+
+def carrying(frequency_hz, sound_speed=1480.0, seed=0):
+    """Complex echoes of a frequency, of a band a fifth of it, on the examples' grid."""
+    rng = np.random.default_rng(seed)
+    white = rng.normal(size=(2, FRAMES, VECTORS, SAMPLES))
+    smooth = np.apply_along_axis(np.convolve, 3, white, np.hanning(9), "same")
+    turn = 2 * np.pi * frequency_hz * 2e-3 * SPACING_MM / sound_speed * np.arange(SAMPLES)
+    return ((smooth[0] + 1j * smooth[1]) * np.exp(1j * turn)).astype(np.complex64)
+
+
+def matlab_order(frames):
+    """Frames (frame, vector, sample) as MATLAB holds them: (sample, vector, frame)."""
+    return frames.transpose(2, 1, 0)
+
+
+def write_mat(path, new=False, **variables):
+    """Save variables as MATLAB does, dictionaries as structs, lists as cells; `new` is version 7.3."""
+    if new:
+        _write_mat_73(path, variables)
+        return path
+    from scipy.io import savemat
+
+    savemat(path, {name: _old(value) for name, value in variables.items()}, do_compression=True)
+    return path
+
+
+def _old(value):
+    if isinstance(value, dict):
+        return {name: _old(each) for name, each in value.items()}
+    if isinstance(value, list):
+        cell = np.empty((1, len(value)), dtype=object)
+        for i, each in enumerate(value):
+            cell[0, i] = _old(each)
+        return cell
+    return value
+
+
+def _write_mat_73(path, variables):
+    """Write HDF5 behind 512 bytes, axes in reverse, complex numbers as pairs, cells as references."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in variables.items():
+            _put_73(file, file, name, value)
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, HDF5 schema 1.00 .".ljust(124) + b"\0\2IM"
+    with path.open("r+b") as stream:
+        stream.write(head)
+
+
+def _put_73(file, group, name, value):
+    if isinstance(value, dict):
+        made = group.create_group(name)
+        made.attrs["MATLAB_class"] = np.bytes_("struct")
+        for field, each in value.items():
+            _put_73(file, made, field, each)
+        return
+    if isinstance(value, list):
+        held = file.require_group("#refs#")
+        names = [f"r{len(held) + i}" for i in range(len(value))]
+        for each, element in zip(names, value, strict=True):
+            _put_73(file, held, each, element)
+        data = np.array([[held[each].ref] for each in names], dtype=h5py.ref_dtype)
+        group.create_dataset(name, data=data).attrs["MATLAB_class"] = np.bytes_("cell")
+        return
+    values = np.array([list(map(ord, value))], "u2") if isinstance(value, str) else np.atleast_2d(value)
+    kind = {"f8": "double", "f4": "single", "i2": "int16", "u1": "uint8"}.get(values.dtype.str[1:], "double")
+    if isinstance(value, str):
+        kind = "char"
+    if np.iscomplexobj(values):
+        part = values.real.dtype
+        pairs = np.empty(values.shape, [("real", part), ("imag", part)])
+        pairs["real"], pairs["imag"] = values.real, values.imag
+        values, kind = pairs, "single"
+    chunks = (1, *values.T.shape[1:]) if values.ndim > 2 else None
+    node = group.create_dataset(name, data=values.T, chunks=chunks, compression="gzip" if chunks else None)
+    node.attrs["MATLAB_class"] = np.bytes_(kind)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperOption
 
 from speckle3d.cli.calibrations import fitted_pixels, mount, resize
 from speckle3d.cli.common import (
@@ -16,6 +17,7 @@ from speckle3d.cli.common import (
     emit,
     emit_rows,
     from_options,
+    note,
     progress_bar,
 )
 from speckle3d.cli.outputs import require_own_place
@@ -124,25 +126,53 @@ def _write(path: Path, simulated: SimulatedSweep) -> None:
         write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
 
 
-@app.command()
+Number = Annotated[float | None, typer.Option()]
+
+
+class _Importing(TyperCommand):
+    """A command with options of `ImportSettings`, whose help texts are those of its fields."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        from speckle3d.io.import_settings import ImportSettings
+
+        for param in self.params:
+            if isinstance(param, TyperOption) and param.name in ImportSettings.model_fields:
+                param.help = param.help or ImportSettings.model_fields[param.name].description
+        super().format_help(ctx, formatter)
+
+
+@app.command(cls=_Importing)
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="MetaImage, NRRD sequence or sweep file.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Sweep file to write.")],
-    sampling_rate_hz: Annotated[float | None, typer.Option(help="RF sampling rate.")] = None,
-    vector_pitch_mm: Annotated[float | None, typer.Option(help="Distance between vectors.")] = None,
-    centre_frequency_hz: Annotated[float | None, typer.Option(help="RF centre frequency.")] = None,
-    bandwidth_hz: Annotated[tuple[float, float] | None, typer.Option(help="RF band, low and high.")] = None,
-    column_pitch_mm: Annotated[float | None, typer.Option(help="B-mode: distance between columns.")] = None,
-    row_spacing_mm: Annotated[float | None, typer.Option(help="B-mode: distance between rows.")] = None,
-    dynamic_range_db: Annotated[float | None, typer.Option(help="B-mode: dynamic range.")] = None,
-    frame_rate_hz: Annotated[float | None, typer.Option(help="For sequences without time stamps.")] = None,
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", help="Any recording that holds a sweep: a file, or a folder.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .mhd, .nrrd), to write."
+        ),
+    ],
+    sampling_rate_hz: Number = None,
+    vector_pitch_mm: Number = None,
+    speed_of_sound_m_s: Number = None,
+    centre_frequency_hz: Number = None,
+    bandwidth_hz: Annotated[tuple[float, float] | None, typer.Option()] = None,
+    demodulation_frequency_hz: Number = None,
+    first_sample_depth_mm: Number = None,
+    column_pitch_mm: Number = None,
+    row_spacing_mm: Number = None,
+    dynamic_range_db: Number = None,
+    frame_rate_hz: Number = None,
+    probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
+    plus_config: Annotated[str | None, typer.Option(metavar="FILE")] = None,
     transform: Transform = None,
+    reference_transform: Annotated[str | None, typer.Option(metavar="NAME")] = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
         str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
     ] = "gzip",
 ) -> None:
-    """Turn an image sequence into a sweep file; options give what its header lacks.
+    """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
 
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
@@ -150,18 +180,29 @@ def convert(
     from speckle3d.cli.recordings import require_sequence
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
+    from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
 
+    options = locals()
+    suffix = out.suffix.lower()
+    if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
+        known = ", ".join((".h5", ".hdf5", *SUFFIXES))
+        raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
+    given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
+    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    names = ImportSettings.model_fields
-    require_own_place(out, "sweep", source, *(calibration or ()))
-    given = {k: v for k, v in locals().items() if k in names and v is not None}
     if transform is not None:
         require_sequence(source, transform)
-        given["tracker_transform"] = transform
-    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given}
-    sweep = resize(load_sweep(source, ImportSettings(**(fitted | given))), fitted)
+        options["tracker_transform"] = transform
+    given = from_options(ImportSettings, options)
+    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
+    sweep = resize(load_sweep(source, given.model_copy(update=fitted)), fitted)
     sweep = mount(sweep, calibration or ())
     with progress_bar(f"writing {out.name}") as progress:
-        write_sweep(out, sweep, progress, COMPRESSIONS[compression])
+        if suffix not in SUFFIXES:
+            write_sweep(out, sweep, progress, COMPRESSIONS[compression])
+            return
+        left_out = write_sequence(out, sweep, progress, compression != "none")
+    for each in left_out:
+        note(f"{out}: does not hold {each}")

@@ -8,7 +8,9 @@ from typing import Literal
 
 from speckle3d.core.errors import FileError, InvalidInputError
 
-Kind = Literal["calibration", "curves", "log", "picture", "simulation", "sweep", "trajectory", "volume"]
+Kind = Literal[
+    "calibration", "curves", "log", "picture", "sequence", "simulation", "sweep", "trajectory", "volume"
+]
 
 _FIRST_BYTES = 4096
 _PNG, _GZIP = b"\x89PNG\r\n\x1a\n", b"\x1f\x8b"
@@ -90,6 +92,14 @@ def _is_volume(path: Path) -> bool:
     return nifti or ((is_metaimage(start) or is_nrrd(start)) and b"Seq_Frame" not in start)
 
 
+def _is_sequence(path: Path) -> bool:
+    """Whether a file is a MetaImage or NRRD sequence of frames, or has no pixels of its own."""
+    from speckle3d.io.headers import is_metaimage, is_nrrd
+
+    start = _start(path)
+    return (is_metaimage(start) or is_nrrd(start)) and b"Seq_Frame" in start
+
+
 def _is_trajectory(path: Path) -> bool:
     from speckle3d.io.tum import is_tum
 
@@ -101,6 +111,7 @@ _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "curves": ("curves", _of_format("speckle3d.curves")),
     "log": ("a CSV of a sensor's log", _is_log),
     "picture": ("a PNG", _is_picture),
+    "sequence": ("an image sequence", _is_sequence),
     "simulation": ("a simulated sweep", _is_simulation),
     "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
     "trajectory": ("TUM text", _is_trajectory),

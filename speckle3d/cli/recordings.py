@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from calibration.job import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
 from speckle3d.io.metaimage import lacking_poses, read_poses
 from speckle3d.study.images import GreyImages
@@ -100,17 +101,23 @@ def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | Non
     try:
         return load_sweep(path, given)
     except MissingSettingsError as error:
-        raise InvalidInputError(f"{path}: {_advice(error.settings[0])}") from None
+        raise InvalidInputError(f"{path}: {_advice(path, error.settings)}") from None
 
 
-def _advice(lacking: str) -> str:
-    """Advise which option or command supplies a setting that a header lacks."""
-    if lacking in ("column_pitch_mm", "row_spacing_mm"):
-        return "the header does not say how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
-    option = lacking.replace("_", "-")
+_PIXEL = {"column_pitch_mm", "row_spacing_mm"}
+
+
+def _advice(path: Path, lacking: Sequence[str]) -> str:
+    """Advise which options or which file supply all that a recording does not say."""
+    size = "how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
+    others = [name.replace("_", "-") for name in lacking if name not in _PIXEL]
+    if not others:
+        return f"the recording does not say {size}"
+    also = f"; nor {size}" if _PIXEL & {*lacking} else ""
+    options = " ".join(f"--{each} ..." for each in others)
     return (
-        f"the header does not say its {option}: make it a sweep file first, by `speckle3d convert IN OUT "
-        f"--{option} ...` with what else that asks for"
+        f"the recording does not say its {', '.join(others)}: give that in {path.name}.toml, or make "
+        f"it a sweep file by `speckle3d convert {path.name} OUT.h5 {options}`{also}"
     )
 
 
@@ -163,7 +170,7 @@ def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | Timed
 def _readings_of(path: Path, sensor: str, transform: str | None) -> tuple[TimedPoses | TimedRotations, float]:
     if kind_of(path) != IMAGE:
         return _readings(load_sweep(path), path, sensor)
-    tracker = read_poses(path, ImportSettings(tracker_transform=transform))
+    tracker = read_poses(path, settings_for(path, ImportSettings(tracker_transform=transform)))
     if sensor == "orientation":
         turned = tracker.readings.world_from_sensor.rotation
         return TimedRotations(tracker.readings.time_s, turned), tracker.time_offset_s

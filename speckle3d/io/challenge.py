@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -45,8 +44,8 @@ from speckle3d.io.hdf5 import (
     reading,
     require_dataset,
 )
+from speckle3d.io.lazy import HDF5Slices, Layout, Real
 from speckle3d.io.readers import Reader
-from speckle3d.io.sweeps import HDF5Frames
 from speckle3d.io.text import numbers, text_lines
 
 FORMAT = "TUS-REC scan"
@@ -76,19 +75,6 @@ class Landmarks:
 
     def __len__(self) -> int:
         return int(self.frame.size)
-
-
-class ScanFrames(HDF5Frames):
-    """Frames of a scan, read one at a time and turned to (vector, sample)."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-        n, height, width = self.stored_shape
-        return n, width, height
-
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return np.ascontiguousarray(super().__getitem__(index).T)
 
 
 def is_challenge_scan(file: h5py.File) -> bool:
@@ -168,14 +154,16 @@ def companion_files(path: PathLike) -> list[Path]:
     return [each for each in found if each is not None]
 
 
-def _frames(scan: Path) -> ScanFrames:
+def _frames(scan: Path) -> HDF5Slices:
     with reading(scan), open_hdf5(scan) as file:
         node = require_dataset(file, "frames")
         if node.dtype != np.uint8 or node.ndim != 3 or 0 in node.shape:
             raise InvalidInputError(
                 f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
             )
-        return ScanFrames(scan, "frames", node.shape, node.dtype)
+        n, height, width = node.shape
+        turn = Real(Layout((height, width), (1, 0)))
+        return HDF5Slices(scan, ["frames"], 0, turn, (n, width, height), node.dtype)
 
 
 def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:

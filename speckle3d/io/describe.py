@@ -20,10 +20,8 @@ from speckle3d.io import calibrations, challenge, curves, reconstructions, sweep
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
 from speckle3d.io.hdf5_guard import plain_attribute
-from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import settings_for
-from speckle3d.io.load import IMAGE, kind_of
-from speckle3d.io.metaimage import image_orientation, image_type
+from speckle3d.io.load import kind_of
 from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
 
@@ -47,8 +45,7 @@ def describe(path: PathLike) -> list[Row]:
             known = ", ".join(sorted(_DESCRIBERS))
             raise InvalidInputError(f"{path}: expected a format among {known}, got {kind!r}")
         return [("format", kind, ""), *_told(reader, Path(path))]
-    rows = _DESCRIBERS[kind](path)
-    return rows if kind == IMAGE else [("format", kind, ""), *rows]
+    return [("format", kind, ""), *_DESCRIBERS[kind](path)]
 
 
 def _told(reader: Reader, path: Path) -> list[Row]:
@@ -223,28 +220,10 @@ def _spoken(name: str) -> tuple[str, str]:
     return words, "" if found is None else _UNIT_NAMES[found]
 
 
-def _describe_header(path: PathLike) -> list[Row]:
-    header = read_header(path)
-    held = header.transforms
-    spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
-    return [
-        ("format", header.file_format, ""),
-        ("size", " x ".join(str(n) for n in header.size), ""),
-        ("frames", str(header.frame_count), ""),
-        ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
-        ("image type", image_type(header), ""),
-        ("image orientation", image_orientation(header), ""),
-        ("sample type", header.fields.get("ElementType") or header.fields.get("type", ""), ""),
-        ("transforms", ", ".join(held) or "none", ""),
-        ("time stamps", "yes" if any("Timestamp" in f for f in header.frames) else "no", ""),
-    ]
-
-
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
     sweeps.FORMAT: lambda path: sweep_rows(sweeps.read_sweep(path)),
     reconstructions.FORMAT: _describe_reconstruction,
     curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,
     challenge.FORMAT: _describe_scan,
-    IMAGE: _describe_header,
 }

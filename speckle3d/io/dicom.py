@@ -8,11 +8,7 @@ patient are never loaded.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +19,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
-from speckle3d.io.hdf5 import one_line, reading
+from speckle3d.io.dicom_elements import read_header, reading_dicom, text_of, whole_of
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import LazyFrames, OpenFrames
 from speckle3d.io.readers import Reader, Row
@@ -32,18 +28,8 @@ from speckle3d.io.recordings import Found, Recording
 FORMAT = "DICOM"
 
 _MARK, _MARK_BYTE = b"DICM", 128
-_DEFLATED = "1.2.840.10008.1.2.1.99"
 _MOST_TIMES_PACKED = 256
 """As of image sequences: what is empty packs well."""
-
-_TAGS = (
-    "SOPClassUID", "Modality", "Manufacturer", "ManufacturerModelName", "TransducerData", "TransducerType",
-    "ProcessingFunction", "NumberOfFrames", "FrameIncrementPointer", "FrameTime", "FrameTimeVector",
-    "RecommendedDisplayFrameRate", "SamplesPerPixel", "PhotometricInterpretation", "Rows", "Columns",
-    "CineRate", "PlanarConfiguration", "BitsAllocated", "BitsStored", "PixelRepresentation", "PixelSpacing",
-    "LossyImageCompression", "SequenceOfUltrasoundRegions",
-)  # fmt: skip
-"""All that is loaded."""
 
 _SPATIAL = {0: "no image", 1: "2-D", 2: "M-mode", 3: "spectrum", 4: "wave form", 5: "graphics"}
 _DATA = {
@@ -92,14 +78,14 @@ class DicomFrames(LazyFrames):
 
 class _OpenImages:
     def __init__(self, frames: DicomFrames) -> None:
-        self._frames, self._stream = frames, open_regular(frames.path)
+        self._frames = frames
 
     def read(self, i: int) -> npt.NDArray[Any]:
         from pydicom.pixels.utils import pixel_array
 
-        region = self._frames.region
-        with _pydicom(""):
-            image = np.asarray(pixel_array(self._stream, index=i))
+        path, region = self._frames.path, self._frames.region
+        with reading_dicom(f"{path}: frame {i}"), open_regular(path) as stream:
+            image = np.asarray(pixel_array(stream, index=i))
         image = image[region.top : region.bottom + 1, region.left : region.right + 1]
         grey = _grey(image, self._frames.spread).T
         if self._frames.inverted:
@@ -107,7 +93,7 @@ class _OpenImages:
         return grey[:, ::-1] if region.delta_cm[1] < 0 else grey
 
     def close(self) -> None:
-        self._stream.close()
+        """Nothing stays open between frames."""
 
 
 def read_dicom(path: Path, settings: ImportSettings | None = None) -> Sweep:
@@ -135,21 +121,21 @@ def _describe(path: Path, settings: ImportSettings) -> list[Row]:
     except InvalidInputError:
         # Why there is no sweep is told beside these rows.
         with open_regular(path) as stream:
-            return list(_notes(*_header(path, stream)))
+            return list(_notes(*read_header(path, stream)))
 
 
 def _recording(path: Path) -> Recording:
     with open_regular(path) as stream:
-        header, syntax = _header(path, stream)
+        header, syntax = read_header(path, stream)
         _require_decoder(path, syntax)
         size = stream.seek(0, 2)
     count = _require_grey(path, header, syntax, size)
     region, found, notes = _place(path, header)
     times, rate = _clock(path, header, count)
-    lossy = _text(header, "LossyImageCompression") == "01" or "YBR" in _text(
+    lossy = text_of(header, "LossyImageCompression") == "01" or "YBR" in text_of(
         header, "PhotometricInterpretation"
     )
-    inverted = _text(header, "PhotometricInterpretation") == "MONOCHROME1"
+    inverted = text_of(header, "PhotometricInterpretation") == "MONOCHROME1"
     frames = DicomFrames(path, count, region, inverted, _LOSSY_SPREAD if lossy else 0)
     with naming(str(path)):
         _ = frames[count // 2]  # colour, and what cannot be unpacked, is told before a reconstruction begins
@@ -159,69 +145,32 @@ def _recording(path: Path) -> Recording:
     )
 
 
-def _header(path: Path, stream: BufferedReader) -> tuple[Any, Any]:
-    """Elements beside the pixels, and the transfer syntax."""
-    try:
-        import pydicom
-        from pydicom.filereader import read_file_meta_info
-    except ImportError as error:
-        raise FileError(
-            f'{path}: expected pydicom for DICOM, got none: pip install "speckle3d[dicom]"'
-        ) from error
-    with _pydicom(str(path)):
-        syntax = read_file_meta_info(path).get("TransferSyntaxUID")
-        if syntax is None:
-            raise InvalidInputError(f"{path}: expected a transfer syntax, got none")
-        if syntax == _DEFLATED:
-            raise InvalidInputError(f"{path}: expected pixels packed one by one, got {syntax.name}")
-        stream.seek(0)
-        header = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_TAGS))
-        # Elements are read from their bytes when first asked for.
-        for name in _TAGS:
-            header.get(name)
-    return header, syntax
-
-
-@contextmanager
-def _pydicom(where: str) -> Iterator[None]:
-    """Turn what pydicom raises on damaged files into one line, and keep its warnings to itself."""
-    import struct
-
-    import pydicom.config
-
-    prefix = f"{where}: " if where else ""
-    with reading(where or "image"), warnings.catch_warnings(), pydicom.config.disable_value_validation():
-        warnings.simplefilter("ignore")
-        try:
-            yield
-        except (AttributeError, IndexError, EOFError, AssertionError, struct.error) as error:
-            raise FileError(f"{prefix}cannot be read: {one_line(error)}") from error
-
-
 def _require_decoder(path: Path, syntax: Any) -> None:
     from pydicom.pixels.decoders.base import get_decoder
 
     try:
         decoder = get_decoder(syntax)
     except NotImplementedError:
-        raise FileError(
+        raise InvalidInputError(
             f"{path}: expected pixels that pydicom unpacks, got {printable(str(syntax.name))}"
         ) from None
     if not decoder.is_available:
         needs = ", or ".join(printable(each) for each in decoder.missing_dependencies)
-        raise FileError(f"{path}: {printable(str(syntax.name))}: expected a package that unpacks it: {needs}")
+        raise InvalidInputError(
+            f"{path}: {printable(str(syntax.name))}: expected a package that unpacks it: {needs}"
+        )
 
 
 def _require_grey(path: Path, header: Any, syntax: Any, file_bytes: int) -> int:
     """Refuse what is no sequence of grey images of eight bits; returns the number of frames."""
-    if (modality := _text(header, "Modality")) != "US":
+    if (modality := text_of(header, "Modality")) != "US":
         raise InvalidInputError(f"{path}: Modality: expected US, got {modality or 'none'}")
-    count = _whole(path, header, "NumberOfFrames", 1)
+    count = whole_of(path, header, "NumberOfFrames", 1)
     if count < 2:
         raise InvalidInputError(f"{path}: NumberOfFrames: expected several frames, got a single image")
-    rows, columns = (_whole(path, header, name, 0) for name in ("Rows", "Columns"))
-    samples = _whole(path, header, "SamplesPerPixel", 1)
-    kind = _text(header, "PhotometricInterpretation")
+    rows, columns = (whole_of(path, header, name, 0) for name in ("Rows", "Columns"))
+    samples = whole_of(path, header, "SamplesPerPixel", 1)
+    kind = text_of(header, "PhotometricInterpretation")
     greys = (
         ("MONOCHROME1", "MONOCHROME2")
         if samples == 1
@@ -232,28 +181,24 @@ def _require_grey(path: Path, header: Any, syntax: Any, file_bytes: int) -> int:
             f"{path}: PhotometricInterpretation: expected {' or '.join(greys)}, got {kind or 'none'}"
         )
     for name, expected in (("BitsAllocated", 8), ("BitsStored", 8), ("PixelRepresentation", 0)):
-        if (got := _whole(path, header, name, expected)) != expected:
+        if (got := whole_of(path, header, name, expected)) != expected:
             raise InvalidInputError(f"{path}: {name}: expected {expected}, got {got}")
     frame_bytes = rows * columns * samples
     if not frame_bytes:
         raise InvalidInputError(f"{path}: expected an image, got {columns} columns and {rows} rows")
-    packed = bool(syntax.is_compressed)
-    least, most = (
-        (0, plausible_bytes(file_bytes, _MOST_TIMES_PACKED))
-        if packed
-        else (count * frame_bytes * 2 // 3, file_bytes)
-    )
-    if least > file_bytes or frame_bytes > most or count > file_bytes:
-        raise FileError(
-            f"{path}: expected {count} frames of {columns} x {rows} x {samples} bytes, got {file_bytes} bytes"
-        )
+    # YBR_FULL_422 leaves out a third of its bytes.
+    needed = 0 if syntax.is_compressed else count * frame_bytes * 2 // 3
+    most = plausible_bytes(file_bytes, _MOST_TIMES_PACKED) if syntax.is_compressed else file_bytes
+    if max(needed, count) > file_bytes or frame_bytes > most:
+        asked = f"{count} frames of {columns} x {rows} x {samples} bytes"
+        raise FileError(f"{path}: expected {asked}, got {file_bytes} bytes")
     return count
 
 
 def _place(path: Path, header: Any) -> tuple[_Region, dict[str, Found], list[Row]]:
     """The part of the image to take, the size of its pixels, and what is to be said of it."""
     rows, columns = int(header.Rows), int(header.Columns)
-    with _pydicom(str(path)):
+    with reading_dicom(str(path)):
         regions = [
             _region(path, i, item) for i, item in enumerate(header.get("SequenceOfUltrasoundRegions") or ())
         ]
@@ -300,7 +245,7 @@ def _without_regions(
 ) -> tuple[_Region, dict[str, Found], list[Row]]:
     whole = _Region(1, 1, 0, 0, columns - 1, rows - 1, (_UNIT_CM, _UNIT_CM), (1.0, 1.0), None)
     found = {}
-    with _pydicom(str(path)):
+    with reading_dicom(str(path)):
         spacing = [float(value) for value in header.get("PixelSpacing") or ()]
     if len(spacing) == 2 and min(spacing) > 0 and np.isfinite(spacing).all():
         found = {
@@ -360,7 +305,7 @@ def _region(path: Path, index: int, item: Any) -> _Region:
 
 def _clock(path: Path, header: Any, count: int) -> tuple[npt.NDArray[np.float64] | None, Found]:
     """Times of the frames where each has its own, else their rate."""
-    with _pydicom(str(path)):
+    with reading_dicom(str(path)):
         vector = header.get("FrameTimeVector")
         steps = np.atleast_1d(np.asarray([] if vector is None else vector, dtype=float))
         frame_time = header.get("FrameTime")
@@ -408,30 +353,12 @@ def _notes(header: Any, syntax: Any) -> tuple[Row, ...]:
     }
     rows: list[Row] = []
     for spoken, names in named.items():
-        if text := " ".join(filter(None, (_text(header, name) for name in names))):
+        if text := " ".join(filter(None, (text_of(header, name) for name in names))):
             rows.append((spoken, text, ""))
     rows.append(("transfer syntax", printable(str(syntax.name)), ""))
-    if _text(header, "LossyImageCompression") == "01":
+    if text_of(header, "LossyImageCompression") == "01":
         rows.append(("pixels", "packed with loss, which smooths speckle", ""))
     return tuple(rows)
-
-
-def _text(header: Any, name: str) -> str:
-    value = header.get(name)
-    if value is None:
-        return ""
-    words = value if isinstance(value, list | tuple) or type(value).__name__ == "MultiValue" else [value]
-    return " ".join(printable(str(word)) for word in words).strip()
-
-
-def _whole(path: Path, header: Any, name: str, default: int) -> int:
-    value = header.get(name)
-    try:
-        return default if value is None else int(value)
-    except (TypeError, ValueError):
-        raise InvalidInputError(
-            f"{path}: {name}: expected a whole number, got {printable(str(value))}"
-        ) from None
 
 
 READER = Reader(FORMAT, _claims, read_dicom, _describe)

@@ -11,11 +11,13 @@ import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.io.lazy import HDF5Slices, Layout, Real, Slices
+from speckle3d.io.lazy import HDF5Slices, Layout, Slices
 
 ENVELOPE_RANGE_DB = 80.0
 """Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
 dB."""
+
+_NOTHING_DB = -1e6
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,17 @@ class Levels:
         return np.rint(np.clip(levels, 0.0, 255.0)).astype(np.uint8)
 
 
+@dataclass(frozen=True)
+class _Plain:
+    """Turns numbers as they are, but for the logarithm of no echo at all."""
+
+    layout: Layout
+
+    def __call__(self, slices: Slices) -> npt.NDArray[Any]:
+        values = self.layout.of(slices[0]).astype(np.float64)
+        return np.where(np.isneginf(values), _NOTHING_DB, values)
+
+
 def grey_frames(
     path: PathLike,
     names: Sequence[str],
@@ -63,7 +76,7 @@ def grey_frames(
     InvalidInputError
         If there is no echo at all.
     """
-    plain = HDF5Slices(path, names, axis, Real(layout), shape, np.float64)
+    plain = HDF5Slices(path, names, axis, _Plain(layout), shape, np.float64)
     top = max(float(plain[i].max()) for i in range(shape[0]))
     plain.close()
     if not (decibels or top > 0):

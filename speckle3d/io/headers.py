@@ -58,6 +58,13 @@ class SequenceHeader:
         return self.size[2] if len(self.size) > 2 else 1
 
     @property
+    def is_volume(self) -> bool:
+        """Whether the third axis is of space, as ``Kinds`` says and frames' fields do not contradict."""
+        kinds = (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
+        in_space = len(kinds) == 3 and kinds[2] in ("domain", "space")
+        return in_space and self.frame_count > max(len(self.frames), 1)
+
+    @property
     def file_format(self) -> str:
         """``"NrrdImage"`` or ``"MetaImage"``."""
         return "NrrdImage" if "sizes" in self.fields else "MetaImage"
@@ -144,7 +151,13 @@ def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
     while stream.tell() < _HEADER_LIMIT_BYTES and (line := stream.readline(2**16)):
-        yield line.decode("latin-1").rstrip("\r\n")
+        if b"\0" in line:
+            raise FileError(f"{stream.name}: expected text in the header, got a zero byte")
+        try:
+            text = line.decode("utf-8")
+        except UnicodeDecodeError:
+            text = line.decode("latin-1")
+        yield text.rstrip("\r\n")
 
 
 def _meta_header(path: PathLike, lines: dict[str, str], stream: BinaryIO) -> SequenceHeader:

@@ -54,10 +54,12 @@ class ImportSettings(BaseModel):
         None, description="depth of a line's first sample; 0 unless the scanner records later"
     )
     column_pitch_mm: float | None = Field(
-        None, gt=0, description="distance between columns, from the scanner's depth ruler or DICOM"
+        None,
+        gt=0,
+        description="distance between columns, from the scanner's depth ruler or --plus-config",
     )
     row_spacing_mm: float | None = Field(
-        None, gt=0, description="distance between rows, from the scanner's depth ruler or DICOM"
+        None, gt=0, description="distance between rows, from the scanner's depth ruler or --plus-config"
     )
     dynamic_range_db: float | None = Field(
         None, gt=0, description="decibels from black to white, beside the image on the scanner's screen"
@@ -73,11 +75,17 @@ class ImportSettings(BaseModel):
     reference_transform: str | None = Field(
         None, description="poses of the reference, as ReferenceToTracker; none for none"
     )
+    plus_config: str | None = Field(
+        None,
+        description="device set of PLUS, with the place of the image on the probe and the size of its "
+        "pixels; in TOML, a file of the same folder",
+    )
     image_to_probe: tuple[tuple[float, ...], ...] | None = Field(
         None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
     )
     arrays: dict[str, str] = Field(
-        default_factory=dict, description="arrays of a MATLAB file by what they are, as rf = 'RcvData'"
+        default_factory=dict,
+        description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
     )
 
     def over(self, path: PathLike, **found: Any) -> dict[str, Any]:
@@ -130,9 +138,20 @@ def settings_for(path: PathLike, given: ImportSettings | None = None) -> ImportS
     beside = settings_file(path)
     if beside is None:
         return given
-    return load_toml(ImportSettings, beside).model_copy(
-        update={name: getattr(given, name) for name in given.model_fields_set}
-    )
+    held = load_toml(ImportSettings, beside)
+    if held.plus_config is not None:
+        held = held.model_copy(update={"plus_config": str(_of_folder(beside, held.plus_config))})
+    said = {name: getattr(given, name) for name in given.model_fields_set}
+    return held.model_copy(update={name: value for name, value in said.items() if value is not None})
+
+
+def _of_folder(beside: Path, name: str) -> Path:
+    """Path of a file that a TOML file names, which must lie in its folder, symbolic links followed."""
+    folder = beside.parent.resolve()
+    found = (folder / name).resolve()
+    if Path(name).is_absolute() or not found.is_relative_to(folder):
+        raise InvalidInputError(f"{beside}: plus_config: expected a file of the same folder, got {name!r}")
+    return beside.parent / name
 
 
 def settings_file(path: PathLike) -> Path | None:

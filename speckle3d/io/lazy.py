@@ -1,4 +1,4 @@
-"""Frames that stay in the file of another's format and are read, and turned, one at a time."""
+"""Frames that stay in their file and are read, and turned, one at a time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
-from speckle3d.io.hdf5_guard import require_whole_chunk
+from speckle3d.io.hdf5_guard import is_filtered, is_only_deflated, require_whole_chunk, unpacked
 
 Slices: TypeAlias = Sequence[npt.NDArray[Any]]
 Turn: TypeAlias = Callable[[Slices], npt.NDArray[Any]]
@@ -53,6 +53,9 @@ class LazyFrames(ABC):
     @abstractmethod
     def _opened(self) -> OpenFrames: ...
 
+    def _where(self, i: int) -> str:
+        return f"{self.path}: frame {i}"
+
     def __len__(self) -> int:
         return self.shape[0]
 
@@ -61,7 +64,7 @@ class LazyFrames(ABC):
         if not -len(self) <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
         i %= len(self)
-        where = f"{self.path}: frame {i}"
+        where = self._where(i)
         with self._lock, reading(where), naming(where):
             if self._open is None:
                 self._open = self._opened()
@@ -114,13 +117,13 @@ class HDF5Slices(LazyFrames):
     def _opened(self) -> OpenFrames:
         return _OpenSlices(self)
 
+    def _where(self, i: int) -> str:
+        return f"{self.path}: /{self.names[0].lstrip('/')}[{i}]"
+
 
 class _OpenSlices:
-    """HDF5's handles to the data sets, made once: freeing one can lose a Ctrl-C (as in `HDF5Frames`)."""
-
     def __init__(self, frames: HDF5Slices) -> None:
-        self._file = open_hdf5(frames.path)
-        self._turn = frames.turn
+        self._file, self._turn = open_hdf5(frames.path), frames.turn
         try:
             self._parts = [_Part(require_dataset(self._file, name), frames) for name in frames.names]
         except BaseException:
@@ -135,35 +138,49 @@ class _OpenSlices:
 
 
 class _Part:
+    """An open data set and HDF5's handles to it, made once.
+
+    h5py frees a handle in a callback, and Python drops a Ctrl-C that is pending there: the one pressed while
+    a frame was read. So no handle is freed from frame to frame.
+    """
+
     def __init__(self, data: h5py.Dataset, frames: HDF5Slices) -> None:
         self._data, self._axis = data, frames.axis
         found = 1 if self._axis is None else data.shape[self._axis] if self._axis < data.ndim else 0
         if found != len(frames):
             raise InvalidInputError(
-                f"{data.name}: expected {len(frames)} frames on axis {self._axis}, got {data.shape}"
+                f"{data.name}: expected {len(frames)} frames on axis {self._axis}, got shape {data.shape}"
             )
+        self._start = [0] * data.ndim
         self._count = tuple(1 if axis == self._axis else n for axis, n in enumerate(data.shape))
         self._shape = tuple(n for axis, n in enumerate(data.shape) if axis != self._axis)
         self._dtype = data.dtype.newbyteorder("=")
         self._node, self._on_disk = data.id, data.id.get_space()
         self._in_memory = h5py.h5s.create_simple(self._shape or (1,))
         self._kind = h5py.h5t.py_create(self._dtype)
+        self._unpacks = self._axis == 0 and data.chunks == (1, *self._shape) and is_only_deflated(data)
+        # Chunks that no filter made were looked at when the data set was found.
+        self._checks = data.chunks is not None and is_filtered(data)
         self._checked: set[tuple[int, ...]] = set()
 
     def read(self, i: int) -> npt.NDArray[Any]:
-        start = tuple(i if axis == self._axis else 0 for axis in range(len(self._count)))
-        if self._data.chunks is not None:
+        if self._axis is not None:
+            self._start[self._axis] = i
+        if self._unpacks:
+            whole: npt.NDArray[Any] = unpacked(self._data, tuple(self._start))[0]
+            return whole
+        if self._checks:
             self._check_chunks(i, self._data.chunks)
         values = np.empty(self._shape or (1,), self._dtype)
-        self._on_disk.select_hyperslab(start, self._count)
+        self._on_disk.select_hyperslab(tuple(self._start), self._count)
         self._node.read(self._in_memory, self._on_disk, values, self._kind)
         return values.reshape(self._shape)
 
     def _check_chunks(self, i: int, chunks: tuple[int, ...]) -> None:
-        starts = [
-            range(i // step * step, i + 1, step) if axis == self._axis else range(0, n, step)
+        starts = (
+            [i // step * step] if axis == self._axis else range(0, n, step)
             for axis, (n, step) in enumerate(zip(self._data.shape, chunks, strict=True))
-        ]
+        )
         for offset in itertools.product(*starts):
             if offset not in self._checked:
                 require_whole_chunk(self._data, offset)
@@ -204,19 +221,22 @@ class RawFrames(LazyFrames):
 
 class _OpenRaw:
     def __init__(self, frames: RawFrames) -> None:
-        self._frames, self._stream = frames, open_regular(frames.path)
+        self._frames = frames
 
     def read(self, i: int) -> npt.NDArray[Any]:
         frames = self._frames
         count = frames.shape[1] * frames.shape[2]
-        self._stream.seek(frames.start + i * frames.step)
-        content = self._stream.read(count * frames.stored.itemsize)
-        if len(content) != count * frames.stored.itemsize:
-            raise FileError(f"expected {count * frames.stored.itemsize} bytes, got {len(content)}: truncated")
+        expected = count * frames.stored.itemsize
+        with open_regular(frames.path) as stream:
+            stream.seek(frames.start + i * frames.step)
+            content = stream.read(expected)
+        if len(content) != expected:
+            where = f"{frames.path}: frame {i}"
+            raise FileError(f"{where}: expected {expected} bytes, got {len(content)}: truncated")
         return frames.turn([np.frombuffer(content, frames.stored)])
 
     def close(self) -> None:
-        self._stream.close()
+        """Nothing stays open between frames."""
 
 
 @dataclass(frozen=True)

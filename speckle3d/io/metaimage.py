@@ -1,76 +1,89 @@
 """Image sequences in MetaImage and NRRD files, as PLUS, ITK and ultrasound machines write them.
 
-PLUS's names stay in this module and `headers`: ``ImageToProbe`` in pixels, ``ProbeToTracker``,
-orientations such as ``MF`` (x towards the marked side, y far from the probe).
+PLUS's names stay in this module, in `headers` and in `plus`.
 """
 
 from __future__ import annotations
 
-import math
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
 from speckle3d.core.printable import printable
-from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import (
+    BModeSettings,
+    ImageGrid,
+    OrientationSensor,
+    RFSettings,
+    Sweep,
+    Tracker,
+)
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings, MissingSettingsError
-from speckle3d.io.pixels import read_pixels
-from speckle3d.io.readers import Reader
-from speckle3d.io.text import numbers
+from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
+from speckle3d.io.plus.device_set import DeviceSet, read_device_set
+from speckle3d.io.plus.frames import SequenceFrames
+from speckle3d.io.plus.layout import Layout, layout_of
+from speckle3d.io.plus.own_fields import own_values
+from speckle3d.io.plus.record import SequenceRecord, record_of
+from speckle3d.io.plus.transforms import (
+    IMAGE,
+    ORIENTATION,
+    Poses,
+    fixed_transform,
+    pixel_axes,
+    sensor_from_image,
+    time_stamps,
+    tracked_orientation,
+    tracked_poses,
+)
+from speckle3d.io.readers import Reader, Row
 
-SKEW_TOLERANCE = 0.1
-"""How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
-published calibrations reach 0.05, an error of the calibration and not of the image."""
-
-ROUNDING_TOLERANCE = 2e-3
-"""How far R^T R of a pose in a header may be from the identity before it is made rigid. An electromagnetic
-tracker that rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
-
-Value = TypeVar("Value")
-
-_RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
+_SIZE_TOLERANCE = 0.1
+"""How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured
+one were seen to differ by 8 %."""
 
 
 def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> Sweep:
-    """Read an image sequence with the poses in its header; the frames are held in memory.
+    """Read an image sequence with the poses in its header; the frames stay on disk.
 
     Frames are turned so that vectors run from the unmarked to the marked side and samples away from the
-    probe. Frames whose status is not OK are left out. I and Q become one analytic (complex64) signal.
+    probe. Frames whose image status is not OK are left out; their fields are kept with the others'.
 
     Raises
     ------
     FileError
         If the file cannot be read.
     InvalidInputError
-        Naming the field, or the setting to give where the header lacks one.
+        Naming the field that is wrong, or why the file is no sweep.
+    MissingSettingsError
+        Naming all that the file does not say.
     """
-    settings = overrides or ImportSettings()
-    header = read_header(path)
-    if 0 in header.size:
-        raise InvalidInputError(f"{path}: expected pixels, got an image of size {header.size}")
-    kept = _frames_kept(header)
-    pixels = _read_pixels(header)
-    frames = _to_samples(header, pixels if kept.all() else pixels[kept])
-    grid, signal = _geometry(header, settings, frames)
-    return Sweep(
-        frames=cast(Frames, frames),
-        grid=grid,
-        signal=signal,
-        frame_time_s=_frame_times(header, settings)[kept],
-        tracker=_tracker(header, settings),
-        name=printable(Path(path).name.split(".")[0]),
-    )
+    source = _Source.open(path, overrides or ImportSettings())
+    chosen = source.require_images()
+    values = source.settings.over(path, **source.wanted())
+    frames = SequenceFrames(source.header, source.layout, source.record(), chosen)
+    if values.get("demodulation_frequency_hz") == 0 and _turns_backwards(frames[0]):
+        frames.record = source.record(conjugated=True)
+    with naming(str(path)):
+        grid, signal = source.geometry(values, frames.shape)
+        return Sweep(
+            frames=frames,
+            grid=grid,
+            signal=signal,
+            frame_time_s=source.frame_times(values)[chosen],
+            orientation=source.orientation(),
+            tracker=source.tracker(grid),
+            name=printable(Path(path).name.split(".")[0]),
+            probe=source.probe,
+        )
 
 
 def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Tracker:
@@ -81,279 +94,227 @@ def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Track
     InvalidInputError
         If the header names no such transform, or no sample of it is valid.
     """
-    header = read_header(path)
-    tracker = _tracker(header, overrides or ImportSettings())
-    if tracker is None:
+    source = _Source.open(path, overrides or ImportSettings())
+    poses = source.poses()
+    if poses is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
         )
-    return tracker
+    return Tracker(poses.readings)
 
 
 def lacking_poses(path: PathLike) -> str:
     """Say which transforms an image sequence holds, if not those of the usual names."""
     header = read_header(path)
-    return f"{', '.join(header.transforms) or 'none'}{_any_of(header)}"
-
-
-def _any_of(header: SequenceHeader) -> str:
-    return ": name the sensor's with --transform" if header.transforms else ""
-
-
-def _geometry(
-    header: SequenceHeader, settings: ImportSettings, frames: npt.NDArray[Any]
-) -> tuple[ImageGrid, RFSettings | BModeSettings]:
-    _, vectors, samples = frames.shape
-    lateral_mm, axial_mm = _header_spacing(header)
-    with naming(header.path):
-        if image_type(header) in _RF_TYPES:
-            rf = _rf_settings(header, settings, axial_mm)
-            pitch = _need(header, "vector_pitch_mm", settings.vector_pitch_mm, lateral_mm)
-            spacing = rf.sample_spacing_mm
-            return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm or 0.0), rf
-        if settings.image_to_probe is not None:
-            lateral_mm, axial_mm = np.linalg.norm(_calibration(settings)[:3, :2], axis=0).tolist()
-        pitch = _need(header, "column_pitch_mm", settings.column_pitch_mm, lateral_mm)
-        spacing = _need(header, "row_spacing_mm", settings.row_spacing_mm, axial_mm)
-        bmode = BModeSettings(_need(header, "dynamic_range_db", settings.dynamic_range_db, None))
-        return ImageGrid(vectors, samples, pitch, spacing, settings.first_sample_depth_mm or 0.0), bmode
-
-
-def _rf_settings(header: SequenceHeader, settings: ImportSettings, axial_mm: float | None) -> RFSettings:
-    speed = settings.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
-    implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
-    rate = _need(header, "sampling_rate_hz", settings.sampling_rate_hz, implied)
-    centre = _need(header, "centre_frequency_hz", settings.centre_frequency_hz, None)
-    # I and Q become the analytic signal, which still carries its frequency, unless settings give another.
-    analytic = None if image_type(header) == "RF_REAL" else settings.demodulation_frequency_hz or 0.0
-    return RFSettings(
-        rate, speed, centre, _need(header, "bandwidth_hz", settings.bandwidth_hz, None), analytic
-    )
-
-
-def _need(header: SequenceHeader, name: str, given: Value | None, read: Value | None) -> Value:
-    value = read if given is None else given
-    if value is None:
-        raise MissingSettingsError(header.path, (name,))
-    return value
-
-
-def _header_spacing(header: SequenceHeader) -> tuple[float | None, float | None]:
-    """Lateral and axial spacing, mm."""
-    if header.spacing_mm is None:
-        return None, None
-    x, y = header.spacing_mm
-    return (y, x) if image_orientation(header).startswith(("F", "N")) else (x, y)
-
-
-def _frames_kept(header: SequenceHeader) -> npt.NDArray[np.bool_]:
-    if not header.frames:
-        return np.ones(header.frame_count, dtype=bool)
-    if len(header.frames) != header.frame_count:
-        raise InvalidInputError(
-            f"{header.path}: expected the fields of {header.frame_count} frames, got {len(header.frames)}"
-        )
-    kept = np.array([_status(frame, "ImageStatus", "Status") for frame in header.frames])
-    if not kept.any():
-        raise InvalidInputError(f"{header.path}: ImageStatus: expected a valid frame, got none")
-    return kept
-
-
-def _status(frame: dict[str, str], *names: str) -> bool:
-    return all(frame.get(name, "OK") == "OK" for name in names)
-
-
-def _frame_times(header: SequenceHeader, settings: ImportSettings) -> FloatArray:
-    if settings.frame_rate_hz is not None:
-        if not settings.frame_rate_hz > 0:
-            raise InvalidInputError(f"frame_rate_hz: expected above zero, got {settings.frame_rate_hz}")
-        return np.arange(header.frame_count) / settings.frame_rate_hz
-    return _timestamps(header) if header.frames else _need(header, "frame_rate_hz", None, None)
-
-
-def _timestamps(header: SequenceHeader) -> FloatArray:
-    where = f"{header.path}: Timestamp"
-    texts = [frame.get("Timestamp", "") for frame in header.frames]
-    times = [numbers(text, 1, f"{where}[{i}]")[0] for i, text in enumerate(texts)]
-    return require_increasing(times, where)
-
-
-def _tracker(header: SequenceHeader, settings: ImportSettings) -> Tracker | None:
-    sensor = _transform(header, settings.tracker_transform, "ProbeToTracker")
-    if sensor is None:
-        return None
-    # Poses may be asked for by any name; a reference counts if both are tracked in the same world.
-    moving, world = _ends(sensor.name)
-    usual = "none" if moving == "Reference" else f"ReferenceTo{world}"
-    reference = _transform(header, settings.reference_transform, usual)
-    both = (sensor,) if reference is None else (sensor, reference)
-    valid = np.array(
-        [_status(frame, *(f"{one.held}TransformStatus" for one in both)) for frame in header.frames]
-    )
-    if not valid.any():
-        raise InvalidInputError(
-            f"{header.path}: {sensor.held}TransformStatus: expected a valid one, got none"
-        )
-    poses = _poses(header, sensor, valid)
-    if reference is not None:
-        poses = _poses(header, reference, valid).inv() * poses
-    calibration = None if settings.image_to_probe is None else _probe_from_image(settings)
-    return Tracker(TimedPoses(_timestamps(header)[valid], poses[valid]), calibration)
+    advice = ": name the sensor's with --transform" if header.transforms else ""
+    return f"{', '.join(header.transforms) or 'none'}{advice}"
 
 
 @dataclass(frozen=True)
-class _Transform:
-    """A tracked transform by the name asked for, and the one the header holds: that, or its inverse."""
+class _Source:
+    """A header, and what else says how its images are to be read."""
 
-    name: str
-    held: str
+    header: SequenceHeader
+    settings: ImportSettings
+    device: DeviceSet
+    own: dict[str, Any]
+    layout: Layout
 
+    @classmethod
+    def open(cls, path: PathLike, settings: ImportSettings) -> _Source:
+        header = read_header(path)
+        device = DeviceSet() if settings.plus_config is None else read_device_set(settings.plus_config)
+        own = own_values(str(path), header.fields)
+        return cls(header, settings, device, own, layout_of(header, device.image_orientation))
 
-def _transform(header: SequenceHeader, given: str | None, default: str) -> _Transform | None:
-    """Find ``XToY``, which takes points of X to Y, or ``YToX``, its inverse."""
-    name = default if given is None else given.removesuffix("Transform")
-    if name == "none":
-        return None
-    moving, world = _ends(name)
-    for held in (name, f"{world}To{moving}"):
-        if any(f"{held}Transform" in frame for frame in header.frames):
-            return _Transform(name, held)
-    if given is not None:
-        there = ", ".join(header.transforms) or "none"
-        raise InvalidInputError(f"{header.path}: expected a transform {name}, got {there}")
-    return None
+    @property
+    def path(self) -> str:
+        return self.header.path
 
+    @property
+    def has_times(self) -> bool:
+        return any("Timestamp" in frame for frame in self.header.frames)
 
-def _ends(name: str) -> tuple[str, str]:
-    """Split ``XToY`` as PLUS does, before a capital: ``ToolToTracker`` is of ``Tool`` in ``Tracker``."""
-    found = re.fullmatch(r"(.+?)To([A-Z].*)", name)
-    return (found[1], found[2]) if found else (name, "")
+    @property
+    def probe(self) -> str:
+        return self.settings.probe or self.own.get("probe") or self.device.scan.probe
 
+    def require_images(self) -> npt.NDArray[np.intp]:
+        """Numbers of the frames that are images, or why there are none."""
+        header, size = self.header, self.header.size
+        what = " a tracker's recording, for --poses" if header.transforms else ""
+        if 0 in size:
+            raise InvalidInputError(
+                f"{self.path}: expected pixels, got images of size {size[0]} x {size[1]}:{what}"
+            )
+        if max(size[:2]) == 1:
+            raise InvalidInputError(f"{self.path}: expected images, got a single pixel each:{what}")
+        if header.is_volume and not self.settings.frame_rate_hz:
+            raise InvalidInputError(
+                f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space"
+            )
+        if header.pixels.count != size[0] * size[1] * header.frame_count:
+            raise InvalidInputError(
+                f"{self.path}: expected grey pixels {size}, got {header.pixels.count} numbers"
+            )
+        self.layout.check(self.path, size, header.pixels.dtype.newbyteorder("="))
+        if not header.frames:
+            return np.arange(header.frame_count)
+        if len(header.frames) != header.frame_count:
+            raise InvalidInputError(
+                f"{self.path}: expected the fields of {header.frame_count} frames, got {len(header.frames)}"
+            )
+        chosen = np.flatnonzero(self.record().has_image)
+        if not chosen.size:
+            raise InvalidInputError(f"{self.path}: ImageStatus: expected a valid frame, got none")
+        return chosen
 
-def _poses(header: SequenceHeader, asked: _Transform, valid: npt.NDArray[np.bool_]) -> RigidTransform:
-    where = f"{header.path}: {asked.held}Transform"
-    matrices = np.tile(np.eye(4), (len(header.frames), 1, 1))
-    for i in np.flatnonzero(valid):
-        text = header.frames[i].get(f"{asked.held}Transform", "")
-        matrices[i] = np.reshape(numbers(text, 16, f"{where}[{i}]"), (4, 4))
-    poses = transforms_from_matrices(_squared(matrices), where)
-    return poses if asked.held == asked.name else poses.inv()
+    def record(self, conjugated: bool = False) -> SequenceRecord:
+        poses = self.poses()
+        return record_of(self.header, self.layout, () if poses is None else poses.names, conjugated)
 
-
-def _squared(matrices: FloatArray) -> FloatArray:
-    """Make rounded rotations exact; matrices farther off stay, for `transforms_from_matrices` to refuse."""
-    r = matrices[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
-    rounded[rounded] = np.linalg.det(r[rounded]) > 0
-    squared = matrices.copy()
-    squared[rounded, :3, :3] = nearest_rotation(r[rounded])
-    return squared
-
-
-def _probe_from_image(settings: ImportSettings) -> RigidTransform:
-    """Nearest rigid transform to PLUS's image calibration, by singular values."""
-    matrix = _calibration(settings)
-    axes = matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)
-    cosine = float(axes[:, 0] @ axes[:, 1])
-    if abs(cosine) > SKEW_TOLERANCE:
-        raise InvalidInputError(f"image_to_probe: expected square axes, got cosine {cosine:.3f}")
-    return RigidTransform.from_components(matrix[:3, 3], Rotation.from_matrix(nearest_rotation(axes)))
-
-
-def _calibration(settings: ImportSettings) -> FloatArray:
-    matrix = np.asarray(settings.image_to_probe, dtype=float)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InvalidInputError(f"image_to_probe: expected a finite 4x4 matrix, got shape {matrix.shape}")
-    if not (np.linalg.norm(matrix[:3, :2], axis=0) > 0).all():
-        raise InvalidInputError("image_to_probe: expected axes of some length, got zero")
-    return matrix
-
-
-def image_type(header: SequenceHeader) -> str:
-    """PLUS's image type, told from the pixels where the header does not say."""
-    named = header.fields.get("UltrasoundImageType")
-    if named is not None:
-        return named
-    pixel = header.fields.get("ElementType") or header.fields.get("type", "")
-    return "BRIGHTNESS" if pixel in ("MET_UCHAR", "uint8", "unsigned char", "uchar") else "RF_REAL"
-
-
-def image_orientation(header: SequenceHeader) -> str:
-    """PLUS's image orientation, its defaults where the header does not say: MF for B-mode, FM for RF."""
-    default = "FM" if image_type(header) in _RF_TYPES else "MF"
-    return header.fields.get("UltrasoundImageOrientation", default).upper()
-
-
-def _read_pixels(header: SequenceHeader) -> npt.NDArray[Any]:
-    """Pixels as (frame, second axis, first axis)."""
-    expected = (header.frame_count, header.size[1], header.size[0])
-    if header.pixels.count != math.prod(expected):
-        raise InvalidInputError(
-            f"{header.path}: expected grey pixels {expected}, got {header.pixels.count} numbers"
+    def wanted(self) -> dict[str, Any]:
+        """What a sweep of this kind needs, as far as file or device set have it; else None."""
+        own, device = self.own, self.device
+        first = {"first_sample_depth_mm": own.get("first_sample_depth_mm", 0.0)}
+        times = {} if self.has_times else {"frame_rate_hz": None}
+        lateral_mm, axial_mm = self.pixel_mm()
+        if not self.layout.is_rf:
+            sizes = {"column_pitch_mm": lateral_mm, "row_spacing_mm": axial_mm}
+            return sizes | {"dynamic_range_db": own.get("dynamic_range_db")} | first | times
+        speed = self.settings.speed_of_sound_m_s or own.get("speed_of_sound_m_s", SPEED_OF_SOUND_M_S)
+        implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
+        vectors, _ = self.layout.shape(self.header.size)
+        middle = (
+            {"demodulation_frequency_hz": own.get("demodulation_frequency_hz")}
+            if self.layout.is_complex
+            else {}
         )
-    return read_pixels(header.pixels).reshape(expected)
+        return {
+            "sampling_rate_hz": own.get("sampling_rate_hz", implied),
+            "vector_pitch_mm": lateral_mm or device.line_pitch_mm(self.path, vectors),
+            "centre_frequency_hz": own.get("centre_frequency_hz"),
+            "bandwidth_hz": own.get("bandwidth_hz"),
+            "speed_of_sound_m_s": speed,
+            **middle,
+            **first,
+            **times,
+        }
 
+    def pixel_mm(self) -> tuple[float | None, float | None]:
+        """Lateral and axial distance of samples as far as known, mm."""
+        own = self.own
+        lateral = own.get("vector_pitch_mm", own.get("column_pitch_mm"))
+        if lateral is not None:
+            return lateral, own.get("row_spacing_mm")
+        held = self.header.spacing_mm
+        if held is not None and self.layout.has_lines_in_rows:
+            held = held[::-1]
+        calibrated = self._calibrated_pixel_mm()
+        if (
+            held is not None
+            and calibrated is not None
+            and self.settings.image_to_probe is None
+            and not np.allclose(held, calibrated, rtol=_SIZE_TOLERANCE, atol=0)
+        ):
+            given, got = (" x ".join(f"{size:g}" for size in sizes) for sizes in (held, calibrated))
+            raise InvalidInputError(
+                f"{self.path}: expected an image calibration for pixels of {given} mm, as ElementSpacing "
+                f"says, got one for {got} mm"
+            )
+        return calibrated or held or self.device.pixel_mm(self.header.size) or (None, None)
 
-def _to_samples(header: SequenceHeader, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Turn pixels into frames (frame, vector, sample): marked side last, far side last.
+    def _calibrated_pixel_mm(self) -> tuple[float, float] | None:
+        found = self.image_to_probe()
+        return None if found is None else pixel_axes(*found)
 
-    Returns
-    -------
-    ndarray
-        uint8 for B-mode, int16 or float32 for RF, complex64 for I and Q.
-    """
-    kind, orientation = image_type(header), image_orientation(header)
-    if kind not in (*_RF_TYPES, "BRIGHTNESS"):
-        raise InvalidInputError(f"{header.path}: expected a grey B-mode or RF image, got type {kind}")
-    if kind == "BRIGHTNESS" and pixels.dtype != np.uint8:
-        raise InvalidInputError(f"{header.path}: expected B-mode of type uint8, got {pixels.dtype}")
-    if kind == "RF_REAL":
-        pixels = _narrowed(pixels)
-    elif kind in _RF_TYPES:
-        pixels = _analytic(header.path, pixels, orientation, kind)
-    frames = _oriented(header.path, pixels, orientation)
-    return _positive_carrier(frames) if np.iscomplexobj(frames) else frames
+    def image_to_probe(self) -> tuple[FloatArray, str] | None:
+        """Transform of this image's pixels to mm on the tracked tool, and where it is from."""
+        if self.settings.image_to_probe is not None:
+            return np.asarray(self.settings.image_to_probe, dtype=float), "image_to_probe"
+        header, name = self.header, f"{IMAGE}To{self.tool}"
+        found = fixed_transform(self.path, header.fields, header.frames, name)
+        if found is not None:
+            return found, f"{self.path}: {name}Transform"
+        # The device set's is for the image that the machine shows, not for the lines it was made of.
+        if self.layout.is_rf:
+            return None
+        found = self.device.transform(IMAGE, self.tool)
+        return None if found is None else (found, f"{self.settings.plus_config}: {name}")
 
+    def sources(self) -> list[Row]:
+        """Rows that tell where values which the header does not say come from."""
+        given, own = self.settings, self.own
+        calibrated = self.image_to_probe()
+        rows = [("image calibration", "none" if calibrated is None else calibrated[1], "")]
+        if given.plus_config is not None:
+            rows.append(("device set", given.plus_config, ""))
+        if given.first_sample_depth_mm is None and "first_sample_depth_mm" not in own:
+            rows.append(("first sample depth", "0 (assumed)", "mm"))
+        if self.layout.is_rf and given.speed_of_sound_m_s is None and "speed_of_sound_m_s" not in own:
+            rows.append(("speed of sound", f"{SPEED_OF_SOUND_M_S:g} (assumed)", "m/s"))
+        return rows
 
-def _oriented(path: str, pixels: npt.NDArray[Any], orientation: str) -> npt.NDArray[Any]:
-    """Turn (frame, y, x) into (frame, vector, sample), marked side last, far side last."""
-    x, y = (*orientation, "", "")[:2]
-    if not ((x in "MU" and y in "FN") or (x in "FN" and y in "MU")) or not (x and y):
-        raise InvalidInputError(
-            f"{path}: UltrasoundImageOrientation: expected as MF or FM, got {orientation}"
+    @property
+    def tool(self) -> str:
+        """Frame of the tracked tool, as Probe."""
+        poses = self.poses()
+        return self.device.probe_frame if poses is None else poses.tool
+
+    def geometry(
+        self, values: dict[str, Any], shape: tuple[int, int, int]
+    ) -> tuple[ImageGrid, RFSettings | BModeSettings]:
+        _, vectors, samples = shape
+        first_mm = values["first_sample_depth_mm"]
+        if not self.layout.is_rf:
+            sizes = values["column_pitch_mm"], values["row_spacing_mm"]
+            signal = BModeSettings(values["dynamic_range_db"], self.own.get("full_scale", 255.0))
+            return ImageGrid(vectors, samples, *sizes, first_mm), signal
+        rf = RFSettings(
+            values["sampling_rate_hz"],
+            values["speed_of_sound_m_s"],
+            values["centre_frequency_hz"],
+            values["bandwidth_hz"],
+            values.get("demodulation_frequency_hz"),
         )
-    if x in "MU":
-        pixels, x, y = pixels.transpose(0, 2, 1), y, x
-    if x == "N":
-        pixels = pixels[:, :, ::-1]
-    if y == "U":
-        pixels = pixels[:, ::-1]
-    return np.ascontiguousarray(pixels)
+        return ImageGrid(vectors, samples, values["vector_pitch_mm"], rf.sample_spacing_mm, first_mm), rf
+
+    def frame_times(self, values: dict[str, Any]) -> FloatArray:
+        rate = values.get("frame_rate_hz", self.settings.frame_rate_hz)
+        if rate is not None:
+            return np.asarray(np.arange(self.header.frame_count) / rate)
+        return time_stamps(self.path, self.header.frames)
+
+    def poses(self) -> Poses | None:
+        given = self.settings
+        return tracked_poses(
+            self.path,
+            self.header.frames,
+            given.tracker_transform,
+            given.reference_transform,
+            f"{self.device.probe_frame}To{self.device.tracker_frame}",
+        )
+
+    def tracker(self, grid: ImageGrid) -> Tracker | None:
+        poses = self.poses()
+        return None if poses is None else Tracker(poses.readings, self._mounting(grid))
+
+    def _mounting(self, grid: ImageGrid) -> RigidTransform | None:
+        found = self.image_to_probe()
+        return None if found is None else sensor_from_image(found[0], grid.first_sample_depth_mm, found[1])
+
+    def orientation(self) -> OrientationSensor | None:
+        readings = tracked_orientation(self.path, self.header.frames)
+        if readings is None:
+            return None
+        header, name = self.header, f"{IMAGE}To{ORIENTATION}"
+        found = fixed_transform(self.path, header.fields, header.frames, name)
+        mounting = None if found is None else sensor_from_image(found, 0.0, f"{self.path}: {name}").rotation
+        return OrientationSensor(readings, mounting)
 
 
-def _narrowed(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """RF as int16 where that loses nothing, else as float32."""
-    limits = np.iinfo(np.int16)
-    if pixels.dtype.kind in "iu" and pixels.min() >= limits.min and pixels.max() <= limits.max:
-        return pixels.astype(np.int16, copy=False)
-    return pixels.astype(np.float32)
-
-
-def _analytic(path: str, pixels: npt.NDArray[Any], orientation: str, kind: str) -> npt.NDArray[np.complex64]:
-    axis = 2 if orientation.startswith(("F", "N")) else 1
-    if kind == "RF_I_LINE_Q_LINE":
-        axis = 3 - axis
-    if pixels.shape[axis] % 2:
-        raise InvalidInputError(f"{path}: expected I and Q in pairs, got {pixels.shape[axis]}")
-    turned = np.moveaxis(pixels, axis, 0)
-    analytic = np.empty(turned[0::2].shape, dtype=np.complex64)
-    analytic.real, analytic.imag = turned[0::2], turned[1::2]
-    return np.moveaxis(analytic, 0, axis)
-
-
-def _positive_carrier(frames: npt.NDArray[np.complex64]) -> npt.NDArray[np.complex64]:
-    """Conjugate where the carrier turns backwards, as it does in a reversed line or with the other sign of Q.
+def _turns_backwards(frame: npt.NDArray[Any]) -> bool:
+    """Whether the carrier turns backwards, as it does in a reversed line or with the other sign of Q.
 
     The phase between neighbouring samples is the carrier's mean turn, the first moment of the spectrum [1]_.
 
@@ -362,13 +323,45 @@ def _positive_carrier(frames: npt.NDArray[np.complex64]) -> npt.NDArray[np.compl
     .. [1] C. Kasai et al., "Real-time two-dimensional blood flow imaging using an autocorrelation
        technique", IEEE Trans. Sonics Ultrason. 32, 1985.
     """
-    first = frames[0]
-    turn = np.angle(np.vdot(first[:, :-1], first[:, 1:]))
-    return np.conj(frames) if turn < 0 else frames
+    return bool(np.angle(np.vdot(frame[:, :-1], frame[:, 1:])) < 0)
+
+
+def describe_sequence(path: PathLike, settings: ImportSettings) -> list[Row]:
+    """Tell what a header says, and what is taken from elsewhere or assumed."""
+    source = _Source.open(path, settings)
+    header, layout = source.header, source.layout
+    spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
+    poses = source.poses()
+    return [
+        ("container", header.file_format, ""),
+        ("size", " x ".join(str(n) for n in header.size), ""),
+        ("images", str(header.frame_count), ""),
+        ("images not valid", str(np.count_nonzero(~source.record().has_image)), ""),
+        ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
+        ("image type", _said(header, "UltrasoundImageType", layout.kind), ""),
+        ("image orientation", _said(header, "UltrasoundImageOrientation", layout.orientation), ""),
+        ("pixel type", header.pixels.dtype.name, ""),
+        ("packing", header.pixels.packing, ""),
+        ("transforms", ", ".join(header.transforms) or "none", ""),
+        ("tracker of", "none" if poses is None else " and ".join(poses.names), ""),
+        ("time stamps", "yes" if source.has_times else "no", ""),
+        *source.sources(),
+    ]
+
+
+def _said(header: SequenceHeader, name: str, used: str) -> str:
+    return used if name in header.fields else f"{used} (assumed)"
+
+
+def _companions(path: Path) -> Sequence[Path]:
+    pixels = read_header(path).pixels.path
+    return () if pixels == path else (pixels,)
 
 
 READER = Reader(
     "image",
     lambda _, start: is_metaimage(start) or is_nrrd(start),
-    lambda path, settings: read_metaimage(path, settings),
+    read_metaimage,
+    describe_sequence,
+    _companions,
 )

@@ -52,6 +52,24 @@ _NRRD_PACKINGS = {
 }  # fmt: skip
 
 
+def meta_type(dtype: np.dtype[Any]) -> str:
+    """Word for a type of numbers behind MetaImage's MET_."""
+    return next(word for word, kind in _META_TYPES.items() if np.dtype(kind) == dtype.newbyteorder("="))
+
+
+def type_of_word(word: str) -> np.dtype[Any]:
+    """Type of numbers by MetaImage's word, as MET_SHORT.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    kind = _META_TYPES.get(word.removeprefix("MET_"))
+    if kind is None:
+        raise InvalidInputError(f"ElementType: expected as MET_SHORT, got {word}")
+    return np.dtype(kind)
+
+
 @dataclass(frozen=True)
 class Pixels:
     """Where the pixels of an image file lie, and how.

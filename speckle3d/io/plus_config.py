@@ -13,7 +13,6 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -21,17 +20,13 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.hdf5 import one_line, reading
-from speckle3d.io.text import numbers
+from speckle3d.io.plus.xml import read_xml, vector
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 """How many wires a pattern of each type has."""
-
-_SIZE_LIMIT_BYTES = 2**22
-"""Five hundred times the size of a device set; in memory a document takes many times its length."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +60,7 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
         Naming the element that is missing or wrong. A document with a type declaration is refused, because
         the entities it may declare can grow without bounds.
     """
-    root = _read_xml(path)
+    root = read_xml(path)
     with naming(str(path)):
         phantom = _phantom(root)
         segmentation = root.find(".//Segmentation")
@@ -85,7 +80,7 @@ def _phantom(root: Element) -> WirePhantom:
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
         for i, wire in enumerate(wires):
             names.append(wire.get("Name") or f"{number + 1}.{i + 1}")
-            ends.append([_vector(wire, f"EndPoint{end}", 3) for end in ("Front", "Back")])
+            ends.append([vector(wire, f"EndPoint{end}", 3) for end in ("Front", "Back")])
     if not names:
         raise InvalidInputError(
             "PhantomDefinition/Geometry: expected an element Pattern with wires, got none"
@@ -104,12 +99,6 @@ def _pattern_wires(pattern: Element, where: str) -> list[Element]:
     return wires
 
 
-def _vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
-    label = element.get("Name") or element.get("From") or ""
-    where = f"{element.tag}{f' {label}' if label else ''}: {attribute}"
-    return numbers(element.get(attribute, ""), count, where)
-
-
 def _phantom_pose(root: Element) -> RigidTransform | None:
     """Find the phantom in PLUS's reference frame, whichever way round the file has it."""
     algorithm = root.find(".//vtkPlusProbeCalibrationAlgo")
@@ -119,7 +108,7 @@ def _phantom_pose(root: Element) -> RigidTransform | None:
     for transform in root.iterfind(".//CoordinateDefinitions/Transform"):
         ends = (transform.get("From"), transform.get("To"))
         if set(ends) == {phantom, reference}:
-            matrix = np.reshape(_vector(transform, "Matrix", 16), (1, 4, 4))
+            matrix = np.reshape(vector(transform, "Matrix", 16), (1, 4, 4))
             pose = transforms_from_matrices(matrix, f"Transform {ends[0]} to {ends[1]}: Matrix")[0]
             return pose if ends[0] == phantom else pose.inv()
     return None
@@ -128,7 +117,7 @@ def _phantom_pose(root: Element) -> RigidTransform | None:
 def _pixel_mm(segmentation: Element) -> float | None:
     if "ApproximateSpacingMmPerPixel" not in segmentation.attrib:
         return None
-    (spacing,) = _vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
+    (spacing,) = vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
     if spacing <= 0:
         raise InvalidInputError(
             f"Segmentation: ApproximateSpacingMmPerPixel: expected above zero, got {spacing:g}"
@@ -139,28 +128,10 @@ def _pixel_mm(segmentation: Element) -> float | None:
 def _clip_px(segmentation: Element) -> FloatArray | None:
     if not {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
         return None
-    left, top = map(int, _vector(segmentation, "ClipRectangleOrigin", 2))
-    columns, rows = map(int, _vector(segmentation, "ClipRectangleSize", 2))
+    left, top = map(int, vector(segmentation, "ClipRectangleOrigin", 2))
+    columns, rows = map(int, vector(segmentation, "ClipRectangleSize", 2))
     if min(left, top) < 0 or min(columns, rows) < 1:
         got = f"{columns} x {rows} from {left}, {top}"
         raise InvalidInputError(f"Segmentation: clip: expected a rectangle inside an image, got {got}")
     right, bottom = left + columns - 1, top + rows - 1
     return np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
-
-
-def _read_xml(path: PathLike) -> Element:
-    with reading(path), open_regular(path) as stream:
-        text = stream.read(_SIZE_LIMIT_BYTES + 1)
-    if len(text) > _SIZE_LIMIT_BYTES:
-        raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")
-    try:
-        return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InvalidInputError(f"{path}: expected well-formed XML, got: {one_line(error)}") from error
-
-
-class _PlainTree(ElementTree.TreeBuilder):
-    """The tree of a document without a type declaration, so that it has no entities of its own."""
-
-    def doctype(self, name: str, *_: object) -> None:
-        raise ValueError(f"a document type declaration ({name})")

@@ -23,7 +23,10 @@ Row = tuple[str, str, str]
 GROUP = "speckle3d.readers"
 START_BYTES = 4096
 
-_OWN = ("sweeps", "challenge", "uff", "dicom", "metaimage", "ultrasonix")
+_OWN = (
+    "sweeps", "challenge", "uff", "zea", "dicom", "matlab", "metaimage", "plus.documents", "ultrasonix",
+    "clarius",
+)  # fmt: skip
 """Modules of this package that have a reader, in the order in which they are asked."""
 
 

@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import h5py
 import numpy as np
@@ -48,6 +48,14 @@ Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1
 """Told to readers; what packs is `speckle3d.io.deflate`."""
+
+
+@runtime_checkable
+class CarriesMore(Protocol):
+    """Frames of a recording that says more than a sweep holds."""
+
+    def write_more(self, file: h5py.File) -> None:
+        """Write that into groups of its own."""
 
 
 class SweepWriter(HDF5Writer):
@@ -158,6 +166,10 @@ class SweepWriter(HDF5Writer):
             plain = isinstance(value, str | int | float)
             group.attrs[name] = value if plain else json.dumps(value, sort_keys=True)
 
+    def write_more(self, frames: CarriesMore) -> None:
+        """Write what frames carry beyond the format."""
+        frames.write_more(self._file)
+
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
         with reading(source), naming(str(source)), open_hdf5(source) as other:
@@ -239,6 +251,8 @@ def write_sweep(
             writer.write_probe(sweep.probe)
         if simulation is not None:
             writer.write_simulation(simulation)
+        if isinstance(sweep.frames, CarriesMore):
+            writer.write_more(sweep.frames)
         if type(sweep.frames) is HDF5Frames:
             writer.copy_unknown(sweep.frames.path)
 

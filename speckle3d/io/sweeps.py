@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import operator
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -39,17 +36,15 @@ from speckle3d.io.hdf5 import (
     has_member,
     hdf5_claim,
     locate,
-    open_hdf5,
     opened,
     read_attribute,
     read_checked,
     read_text,
     read_transforms,
     read_vector_attribute,
-    reading,
     require_dataset,
 )
-from speckle3d.io.hdf5_guard import is_filtered, is_only_deflated, require_whole_chunk, unpacked
+from speckle3d.io.lazy import HDF5Slices, Slices
 from speckle3d.io.readers import Reader
 
 FORMAT = "speckle3d.sweep"
@@ -70,94 +65,25 @@ RF_NUMBERS = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
 """Attributes of /rf that are a number each of `RFSettings`."""
 
 
-class HDF5Frames:
-    """Frames of a sweep file, read one at a time; pairs of int16 (I/Q) as complex64.
-
-    The file is opened at the first frame asked for and stays open until `close`, which may be called at any
-    time: the next frame opens it again. A copy sent to another process opens the file there.
-    """
+class HDF5Frames(HDF5Slices):
+    """Frames of a sweep file, read one at a time; pairs of int16 (I/Q) as complex64."""
 
     def __init__(self, path: PathLike, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        self.path = Path(path).absolute()
-        self.name, self.stored_shape, self.stored_dtype = name, shape, dtype
-        self.dtype = np.dtype(np.complex64) if len(shape) == 4 else dtype
-        self._open: _OpenFrames | None = None
-        self._lock = threading.Lock()
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-        n, vectors, samples = self.stored_shape[:3]
-        return n, vectors, samples
-
-    def __len__(self) -> int:
-        return self.stored_shape[0]
-
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        i = operator.index(index)
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"frame {i} of {len(self)}")
-        i %= len(self)
-        where = f"{self.path}: /{self.name}[{i}]"
-        with self._lock, reading(where), naming(where):
-            if self._open is None:
-                self._open = _OpenFrames(self)
-            frame = self._open.read(i)
-        if frame.dtype.kind in "fc":
-            require_finite(frame, where)
-        return from_pairs(frame) if frame.ndim == 3 else frame
-
-    def close(self) -> None:
-        """Close the file if it is open."""
-        with self._lock:
-            if self._open is not None:
-                self._open.file.close()
-                self._open = None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, self.name, self.stored_shape, self.stored_dtype)
+        in_pairs = len(shape) == 4
+        n, vectors, samples = shape[:3]
+        turn = complex_of_pairs if in_pairs else as_stored
+        super().__init__(path, [name], 0, turn, (n, vectors, samples), np.complex64 if in_pairs else dtype)
+        self.stored_dtype = dtype
 
 
-class _OpenFrames:
-    """The open data set and HDF5's handles to it, made once.
+def as_stored(slices: Slices) -> npt.NDArray[Any]:
+    """Frame as the file has it."""
+    return slices[0]
 
-    h5py frees a handle in a callback, and Python drops a Ctrl-C that is pending there: the one pressed while
-    a frame was read or written. So no handle is freed from frame to frame.
-    """
 
-    def __init__(self, frames: HDF5Frames) -> None:
-        self.file = open_hdf5(frames.path)
-        self._frame_shape, self._dtype = frames.stored_shape[1:], frames.stored_dtype
-        self._no_offset = (0,) * len(self._frame_shape)
-        self._data = require_dataset(self.file, frames.name)
-        if self._data.shape != frames.stored_shape:
-            raise InvalidInputError(f"expected shape {frames.stored_shape}, got {self._data.shape}")
-        self._node = self._data.id
-        self._on_disk = self._node.get_space()
-        self._in_memory = h5py.h5s.create_simple(self._frame_shape)
-        self._kind = h5py.h5t.py_create(self._dtype)
-        self._unpacks = self._data.chunks == (1, *self._frame_shape) and is_only_deflated(self._data)
-        # Chunks that no filter made were looked at when the data set was found.
-        self._checks = self._data.chunks is not None and is_filtered(self._data)
-        self._checked: set[tuple[int, ...]] = set()
-
-    def read(self, i: int) -> npt.NDArray[Any]:
-        if self._unpacks:
-            frame: npt.NDArray[Any] = unpacked(self._data, (i, *self._no_offset))[0]
-            return frame
-        if self._checks:
-            self._check_chunks(i, self._data.chunks)
-        frame = np.empty(self._frame_shape, self._dtype)
-        self._on_disk.select_hyperslab((i, *self._no_offset), (1, *self._frame_shape))
-        self._node.read(self._in_memory, self._on_disk, frame, self._kind)
-        return frame
-
-    def _check_chunks(self, i: int, chunks: tuple[int, ...]) -> None:
-        starts = (range(0, n, step) for n, step in zip(self._frame_shape, chunks[1:], strict=True))
-        for offset in itertools.product([i // chunks[0] * chunks[0]], *starts):
-            if offset not in self._checked:
-                require_whole_chunk(self._data, offset)
-                self._checked.add(offset)
+def complex_of_pairs(slices: Slices) -> npt.NDArray[Any]:
+    """Frame of I and Q in pairs, the last axis."""
+    return from_pairs(slices[0])
 
 
 def read_sweep(path: PathLike) -> Sweep:

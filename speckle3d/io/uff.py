@@ -68,7 +68,7 @@ def read_uff(path: Path, settings: ImportSettings | None = None) -> Sweep:
 
 def is_uff(file: h5py.File) -> bool:
     """Whether an open file holds objects of USTB."""
-    return any(kind.startswith("uff.") for kind in _objects(file).values())
+    return "format" not in file.attrs and any(kind.startswith("uff.") for kind in _objects(file).values())
 
 
 def _describe(path: Path, settings: ImportSettings) -> list[Row]:

@@ -66,14 +66,16 @@ def test_values_beyond_16_bits_become_float(tmp_path):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orientation, kind, sign):
     depth = np.arange(64)
+    given = RF.model_copy(update={"demodulation_frequency_hz": 0.0})
     signal = np.round(1000 * np.exp(0.6j * depth) * np.arange(1, 4)[:, None])
     stored = signal[:, ::-1] if orientation == "NM" else signal
     axis = 1 if kind == "RF_I_LINE_Q_LINE" else 2
     pairs = np.stack([stored.real, sign * stored.imag], axis)
     pixels = pairs.reshape(1, *((6, 64) if axis == 1 else (3, 128))).astype(np.int16)
     fields = {"UltrasoundImageOrientation": orientation, "UltrasoundImageType": kind}
-    sweep = read_metaimage(write_mha(tmp_path / "a.mha", pixels, fields), RF)
+    sweep = read_metaimage(write_mha(tmp_path / "a.mha", pixels, fields), given)
     assert sweep.frames.dtype == np.complex64
+    assert sweep.signal.demodulation_frequency_hz == 0
     np.testing.assert_array_equal(frames_of(sweep)[0], signal)
 
 
@@ -286,7 +288,8 @@ def test_mouse_liver_rf(realdata):
 
 @pytest.mark.realdata
 def test_ultrasonix_i_and_q_lines(realdata):
-    sweep = read_metaimage(realdata / "plus" / "UltrasonixLinearRfData.igs.mha", RF)
+    analytic = RF.model_copy(update={"demodulation_frequency_hz": 0.0})
+    sweep = read_metaimage(realdata / "plus" / "UltrasonixLinearRfData.igs.mha", analytic)
     assert sweep.frames.shape == (1, 128, 2080)
     assert sweep.frames.dtype == np.complex64
     frame = sweep.frames[0]

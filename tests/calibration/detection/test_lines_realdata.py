@@ -66,6 +66,9 @@ def test_the_front_of_every_floor_lies_one_part_of_a_pulse_above(frames, plus, r
     assert np.median(np.abs(beneath - np.median(beneath))) < 1.0
     assert np.median(np.abs(turned)) < 0.3
     # A floor that is not quite flat: errors of about a pixel and half a degree in the worst tenth of frames.
-    few = [detect_line(frame, PIXEL_MM, LineSettings(place="front"), region) for frame in frames[::10]]
+    few = [
+        detect_line(frames[i], PIXEL_MM, LineSettings(place="front"), region)
+        for i in range(0, len(frames), 10)
+    ]
     assert np.percentile([line.point_sd_mm for line in few], 90) < 0.12
     assert np.percentile([line.direction_sd_rad for line in few], 90) < np.radians(0.6)

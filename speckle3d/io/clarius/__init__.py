@@ -1,0 +1,10 @@
+"""Raw packages of Clarius handheld scanners: RF, I/Q or envelope, with the sensor inside the probe.
+
+What is read, what is assumed and why is in ``docs/clarius.md``, and with the code of each part.
+"""
+
+from speckle3d.io.clarius.package import is_package
+from speckle3d.io.clarius.reader import FORMAT, describe_package, package_files, read_package
+from speckle3d.io.readers import Reader
+
+READER = Reader(FORMAT, is_package, read_package, describe_package, package_files)

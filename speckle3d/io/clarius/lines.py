@@ -1,0 +1,182 @@
+"""Where the samples of a frame lie: pitch of the lines, first line and first sample, what is left out.
+
+Trusted for the line pitch is the yml's ``rx element``, the place of a line in elements of the array, times
+the distance between elements. That is given by ``vector_pitch_mm``, by the yml's probe where it says, or by
+the probe's model. Lines that are steered, unevenly spaced, or repeated (several packets a line, as in
+Doppler modes) are refused. The first line is taken as the left of the image.
+
+The first sample's depth is (``delay samples`` / ``sampling rate`` - 1 us) x c / 2. The maker calls the
+samples "leading samples before the first valid sample (acquisition delay)" [1]_. In every B-mode recording
+at hand they are 1.00 to 1.07 us, whatever the sampling rate, while the samples after them alone make up the
+imaging depth (780 of its region of interest x 0.0513 mm = 40.04 mm of 40; 585: 30.03 of 30; RF, 3120: 40.04
+of 40): depth is counted from the first sample, and 1 us passes before, as in the lens. A Doppler recording
+has 7.2 us: its region begins at 4.8 mm. That the microsecond is not depth is concluded from these, not
+documented: were it depth, all samples lay 0.77 mm deeper. Lengths do not depend on it;
+``first_sample_depth_mm`` replaces it.
+
+References
+----------
+.. [1] clariusdev/research, "Raw Data Format" (docs/raw-data-format.md).
+.. [2] clariusdev/research, "Beamformed RF Acquisition" (docs/rf-frame-rate.md), "Probe reference".
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.clarius.sidecars import Description
+
+ELEMENT_PITCH_MM = {"L20HD3": 0.13, "L15HD3": 0.26, "L7HD3": 0.2, "PALHD3": 0.26}
+"""Of the linear arrays in the maker's table of HD3 probes [2]_; of the PAL, its linear side."""
+
+CONVEX = ("C3", "C7", "EC7", "PH", "PA2", "PA", "TV")
+"""Models whose lines are not parallel."""
+
+BEFORE_DEPTH_S = 1e-6
+"""Delay that is not depth; see above."""
+
+_EVEN = 1e-3
+"""How far a line may be from its place, in pitches; places are written to 17 digits."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the kept part of a frame lies.
+
+    Attributes
+    ----------
+    lines, samples : slice
+        Kept, of those in the file.
+    first_element : float
+        Place of the first kept line in the array.
+    elements_per_line : float
+        Distance between lines, in elements.
+    first_sample : float
+        Samples between transmission and the first kept one.
+    """
+
+    lines: slice
+    samples: slice
+    first_element: float
+    elements_per_line: float
+    first_sample: float
+
+    def first_depth_mm(self, sampling_rate_hz: float, speed_of_sound_m_s: float) -> float:
+        """Depth of the first kept sample."""
+        after_s = max(self.first_sample / sampling_rate_hz - BEFORE_DEPTH_S, 0.0)
+        return after_s * speed_of_sound_m_s * 1e3 / 2
+
+
+def place_of(said: Description, cropped: bool) -> Place:
+    """Find where the lines and samples lie, in elements and samples.
+
+    Parameters
+    ----------
+    cropped : bool
+        Whether what is outside the region of interest is left out.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the line that is steered, unevenly spaced or repeated, or a curved array.
+    """
+    if said.radius_mm:
+        raise InvalidInputError(_polar(said.where, f"a curved array of {said.radius_mm:g} mm radius"))
+    _require_straight(said)
+    lines, samples = slice(0, said.lines), slice(0, said.samples)
+    if cropped and said.roi is not None:
+        roi = said.roi
+        lines, samples = slice(roi.start_line, roi.end_line + 1), slice(roi.start_sample, roi.end_sample + 1)
+    elements = said.geometry.receive_element[lines]
+    step = _step(said, elements, lines.start)
+    return Place(lines, samples, float(elements[0]), step, said.delay_samples + samples.start)
+
+
+def require_roi(said: Description) -> None:
+    """Refuse a region of interest that is not inside the frame.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the field.
+    """
+    roi = said.roi
+    if roi is None:
+        return
+    for what, first, last, count in (
+        ("line", roi.start_line, roi.end_line, said.lines),
+        ("sample", roi.start_sample, roi.end_sample, said.samples),
+    ):
+        if not first < last < count:
+            raise InvalidInputError(
+                f"{said.where}: roi: expected {what}s from 0 to {count - 1}, got {first} to {last}"
+            )
+
+
+def element_pitch_mm(said: Description, probe: str | None) -> tuple[float | None, str]:
+    """Distance between elements and where it is from; None where neither yml nor model tells.
+
+    Raises
+    ------
+    InvalidInputError
+        If the model's lines are not parallel, or it is not known.
+    """
+    if said.element_pitch_mm is not None:
+        return said.element_pitch_mm, "its yml"
+    named = probe or said.probe
+    if not named:
+        return None, ""
+    model = re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
+    if model in ELEMENT_PITCH_MM:
+        return ELEMENT_PITCH_MM[model], f"the maker's table, {model}"
+    if model.startswith(CONVEX):
+        raise InvalidInputError(_polar(said.where, f"the probe {named}"))
+    known = ", ".join(ELEMENT_PITCH_MM)
+    raise InvalidInputError(
+        f"{said.where}: --probe: expected a model whose element pitch is published ({known}), got {named!r}: "
+        "give --vector-pitch-mm"
+    )
+
+
+def _require_straight(said: Description) -> None:
+    angles = said.geometry.angle_deg
+    if (steered := np.flatnonzero(angles)).size:
+        i = int(steered[0])
+        raise InvalidInputError(
+            f"{said.where}: lines[{i}]: angle: expected 0 (lines that are not steered), got {angles[i]:g} "
+            f"deg, and {steered.size} of {angles.size} lines steered: record without steering and Doppler"
+        )
+
+
+def _step(said: Description, elements: FloatArray, first: int) -> float:
+    """Distance between lines, in elements."""
+    where = f"{said.where}: lines"
+    if elements.size < 2:
+        raise InvalidInputError(f"{where}: expected two lines or more, got {elements.size}")
+    steps = np.diff(elements)
+    if (again := np.flatnonzero(steps == 0)).size:
+        raise InvalidInputError(
+            f"{where}[{first + int(again[0]) + 1}]: rx element: expected one line a place, got several at "
+            f"{elements[again[0]]:g}: packets of a Doppler mode are no image"
+        )
+    step = float((elements[-1] - elements[0]) / (elements.size - 1))
+    off = np.abs(elements - elements[0] - step * np.arange(elements.size))
+    if step <= 0 or off.max() > _EVEN * step:
+        i = int(np.argmax(off)) if step > 0 else 1
+        raise InvalidInputError(
+            f"{where}[{first + i}]: rx element: expected evenly spaced lines of rising place, got "
+            f"{elements[i]:g} where {elements[0] + step * i:g} is even"
+        )
+    return step
+
+
+def _polar(where: str, what: str) -> str:
+    return (
+        f"{where}: expected parallel lines, got {what}: its lines fan out, and a sweep has one distance "
+        "between them. Needed would be the radius of the array, the angle between its lines, and resampling"
+    )

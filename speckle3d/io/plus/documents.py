@@ -1,0 +1,77 @@
+"""XML documents of PLUS as recordings: told what they are, and which option takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import Sweep
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.plus.device_set import read_device_set
+from speckle3d.io.plus.xml import read_xml, vector
+from speckle3d.io.readers import Reader, Row
+
+_CONFIG = "--plus-config of convert"
+
+
+def _device_rows(path: Path, root: Element) -> list[Row]:
+    device = read_device_set(path)
+    pixel = device.pixel_mm(device.scan.output_size)
+    devices = [f"{each.get('Id', '?')} ({each.get('Type', '?')})" for each in root.iterfind(".//Device")]
+    wires = len(root.findall(".//PhantomDefinition/Geometry/Pattern/Wire"))
+    rows = [
+        ("devices", ", ".join(devices) or "none", ""),
+        *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
+        ("pixel", *(("unknown", "") if pixel is None else (" x ".join(f"{mm:.5f}" for mm in pixel), "mm"))),
+        ("image orientation", device.image_orientation or "not said", ""),
+        ("transducer", " ".join((device.scan.probe, device.scan.geometry)).strip() or "not said", ""),
+        ("wires of a phantom", str(wires), ""),
+    ]
+    return [*rows, ("for", _CONFIG + (", --phantom of calibrate wires" if wires else ""), "")]
+
+
+def _lag_rows(_: Path, root: Element) -> list[Row]:
+    """Rows of a delay, whose sign PLUS has the other way round: a tracker that lags is there negative."""
+    (lag_s,) = vector(root, "TrackerLagSec", 1)
+    return [("time offset of the tracker", f"{-lag_s:+.4f}", "s"), ("for", "--time-offset of calibrate", "")]
+
+
+def _line_rows(_: Path, root: Element) -> list[Row]:
+    found = sum(each.get("SegmentationStatus") == "OK" for each in root.iterfind("Frame"))
+    return [("lines found", str(found), "frames"), ("for", "comparison alone, as lines are found anew", "")]
+
+
+_KINDS: dict[str, tuple[str, Callable[[Path, Element], list[Row]]]] = {
+    "PlusConfiguration": ("a device set", _device_rows),
+    "ProbeCalibrationResult": ("the result of a probe calibration", _device_rows),
+    "TemporalCalibrationResults": ("a tracker's delay", _lag_rows),
+    "LineSegmentationResults": ("lines found in images", _line_rows),
+}
+
+
+def _claims(_: Path, start: bytes) -> bool:
+    text = start.lstrip(b"\xef\xbb\xbf \t\r\n")
+    return text.startswith(b"<") and any(f"<{name}".encode() in text for name in _KINDS)
+
+
+def _told(path: Path) -> tuple[str, list[Row]]:
+    root = read_xml(path)
+    if root.tag not in _KINDS:
+        raise InvalidInputError(f"{path}: expected a document of PLUS ({', '.join(_KINDS)}), got {root.tag}")
+    what, rows = _KINDS[root.tag]
+    return what, rows(path, root)
+
+
+def _describe(path: Path, _: ImportSettings) -> list[Row]:
+    what, rows = _told(path)
+    return [("content", what, ""), *rows]
+
+
+def _read(path: Path, _: ImportSettings) -> Sweep:
+    what, rows = _told(path)
+    raise InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {rows[-1][1]}")
+
+
+READER = Reader("PLUS document", _claims, _read, _describe)

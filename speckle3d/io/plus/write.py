@@ -1,0 +1,231 @@
+"""Writing of a sweep as a sequence of PLUS, image by image.
+
+References
+----------
+.. [1] PLUS user manual, "Sequence file".
+.. [2] G. Kindlmann, "Definition of NRRD File Format", teem.sourceforge.net.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.files import PathLike
+from speckle3d.core.sweep import Sweep
+from speckle3d.io.fileset import FileSet
+from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.pixels import meta_type, type_of_word
+from speckle3d.io.plus.layout import Layout
+from speckle3d.io.plus.rows import Rows, rows_of
+
+Progress = Callable[[int, int], None]
+
+SUFFIXES = (".mha", ".mhd", ".nrrd")
+"""Of the files that `write_sequence` writes, as .igs.mha."""
+
+_LEVEL = 1
+"""Speckle hardly compresses further at higher levels, which cost several times the time."""
+
+_PLACE = 20
+"""Characters kept in a header for the size of the packed pixels, which is known after them."""
+
+_NRRD_WORDS = {"u1": "uint8", "i1": "int8", "i2": "int16", "u2": "uint16", "i4": "int32", "u4": "uint32",
+               "i8": "int64", "u8": "uint64", "f4": "float", "f8": "double"}  # fmt: skip
+_NRRD_NAMES = {
+    "UltrasoundImageOrientation": "ultrasound image orientation",
+    "UltrasoundImageType": "ultrasound image type",
+}
+_META_ONLY = ("NDims", "ElementType", "ElementSpacing")
+
+
+def write_sequence(
+    path: PathLike, sweep: Sweep, progress: Progress | None = None, compressed: bool = True
+) -> list[str]:
+    """Write a sweep as a sequence of PLUS, of the container that the suffix names; memory stays flat.
+
+    A sweep that was read from a sequence gets all of its fields back: transforms, status, times and custom
+    fields of every frame, also of those without a valid image, which are written as black. Of others, a
+    tracker becomes ``ProbeToTrackerTransform`` and an orientation sensor
+    ``OrientationSensorToWorldTransform``, interpolated at the frames' times, with status INVALID where
+    readings do not reach.
+
+    Parameters
+    ----------
+    path : path
+        With a suffix of `SUFFIXES`; pixels of .mhd go to a .raw or .zraw file beside it.
+    progress : callable, optional
+        Called with the number of images written and their total.
+    compressed : bool
+        Whether pixels are packed with deflate.
+
+    Returns
+    -------
+    list of str
+        What of the sweep a sequence does not hold, a line each.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is another.
+    FileError
+        If the file cannot be written.
+    """
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}, got {suffix!r}")
+    rows = rows_of(sweep)
+    images = _Images.of(sweep, rows, progress)
+    if suffix == ".mhd":
+        beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
+        with FileSet(target.name, (beside,)).replaced(target.parent) as part:
+            with (part / beside).open("wb") as file:
+                size = images.write(file, 15 if compressed else None)
+            with (part / target.name).open("wb") as file:
+                file.write(_meta_header(images, rows, beside, size if compressed else None))
+        return rows.left_out
+    with atomic_path(target) as part, part.open("wb") as file:
+        if suffix == ".nrrd":
+            file.write(_nrrd_header(images, rows, "gzip" if compressed else "raw"))
+            images.write(file, 31 if compressed else None)
+            return rows.left_out
+        head = _meta_header(images, rows, "LOCAL", 0 if compressed else None)
+        file.write(head)
+        size = images.write(file, 15 if compressed else None)
+        if compressed:
+            at = head.index(_SIZE_FIELD) + len(_SIZE_FIELD)
+            file.seek(at)
+            file.write(str(size).encode().ljust(_PLACE))
+    return rows.left_out
+
+
+_SIZE_FIELD = b"CompressedDataSize = "
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Pixels to write."""
+
+    sweep: Sweep
+    rows: Rows
+    layout: Layout
+    dtype: np.dtype[Any]
+    shape: tuple[int, int]
+    progress: Progress | None
+
+    @classmethod
+    def of(cls, sweep: Sweep, rows: Rows, progress: Progress | None) -> _Images:
+        layout = Layout(rows.fields["UltrasoundImageType"], rows.fields["UltrasoundImageOrientation"])
+        dtype = _narrowest(sweep)
+        word = rows.fields.get("ElementType", "")
+        if word and np.can_cast(dtype, type_of_word(word), "safe"):
+            dtype = type_of_word(word)
+        shape = layout.pixels(sweep.frames[0]).shape
+        return cls(sweep, rows, layout, dtype, (shape[0], shape[1]), progress)
+
+    def __iter__(self) -> Iterator[npt.NDArray[Any]]:
+        written = 0
+        for number in self.rows.images:
+            if number is None:
+                yield np.zeros(self.shape, self.dtype)
+                continue
+            frame = self.sweep.frames[number]
+            yield self.layout.pixels(np.conj(frame) if self.rows.conjugated else frame)
+            written += 1
+            if self.progress is not None:
+                self.progress(written, len(self.sweep))
+
+    def write(self, file: BinaryIO, window: int | None) -> int:
+        """Write all images, packed if there is a window, and return how many bytes that took."""
+        packer = None if window is None else zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
+        size = 0
+        for image in self:
+            raw = image.astype(self.dtype.newbyteorder("<"), order="C").data.cast("B")
+            size += file.write(raw if packer is None else packer.compress(raw))
+        return size if packer is None else size + file.write(packer.flush())
+
+
+def _narrowest(sweep: Sweep) -> np.dtype[Any]:
+    """Type that holds all samples; of I and Q, int16 if all are whole numbers within it."""
+    if sweep.frames.dtype.kind != "c":
+        return sweep.frames.dtype
+    limit = np.iinfo(np.int16)
+    for i in range(len(sweep)):
+        parts = np.ascontiguousarray(sweep.frames[i]).view(np.float32)
+        if parts.min() < limit.min or parts.max() > limit.max or (parts != np.rint(parts)).any():
+            return np.dtype(np.float32)
+    return np.dtype(np.int16)
+
+
+def _lengths(images: _Images, rows: Rows) -> str:
+    y, x = images.shape
+    return f"{x} {y}" if rows.is_plane else f"{x} {y} {len(rows.images)}"
+
+
+def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> bytes:
+    fields = dict(rows.fields)
+    fields.pop("NDims", None)
+    spacing = fields.pop("ElementSpacing")
+    fields.pop("ElementType", None)
+    lines = [
+        "ObjectType = Image",
+        f"NDims = {2 if rows.is_plane else 3}",
+        "BinaryData = True",
+        "BinaryDataByteOrderMSB = False",
+        f"CompressedData = {packed is not None}",
+        *([] if packed is None else [f"{_SIZE_FIELD.decode()}{str(packed).ljust(_PLACE)}"]),
+        f"DimSize = {_lengths(images, rows)}",
+        f"Kinds = {'domain domain' if rows.is_plane else 'domain domain list'}",
+        f"ElementSpacing = {spacing}",
+        f"ElementType = MET_{meta_type(images.dtype)}",
+        *(f"{name} = {value}" for name, value in fields.items()),
+        *(
+            f"Seq_Frame{i:04d}_{name} = {value}"
+            for i, frame in enumerate(rows.frames)
+            for name, value in frame.items()
+        ),
+        f"ElementDataFile = {data}",
+    ]
+    return _encoded(lines)
+
+
+def _nrrd_header(images: _Images, rows: Rows, encoding: str) -> bytes:
+    x, y, *_ = rows.fields["ElementSpacing"].split()
+    apart = "" if rows.is_plane else " none"
+    lines = [
+        "NRRD0004",
+        f"type: {_NRRD_WORDS[images.dtype.str[1:]]}",
+        f"dimension: {2 if rows.is_plane else 3}",
+        "space dimension: 2",
+        f"sizes: {_lengths(images, rows)}",
+        f"space directions: ({x},0) (0,{y}){apart}",
+        f"kinds: {'domain domain' if rows.is_plane else 'domain domain list'}",
+        "endian: little",
+        f"encoding: {encoding}",
+        f"space origin: ({','.join(rows.fields.get('Offset', '0 0').split()[:2])})",
+        *(
+            f"{_NRRD_NAMES.get(name, name)}:={value}"
+            for name, value in rows.fields.items()
+            if name not in _META_ONLY
+        ),
+        *(
+            f"Seq_Frame{i:04d}_{name}:={value}"
+            for i, frame in enumerate(rows.frames)
+            for name, value in frame.items()
+        ),
+        "",
+    ]
+    return _encoded(lines)
+
+
+def _encoded(lines: list[str]) -> bytes:
+    """Text of a header, as bytes that are read back as the same text."""
+    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")

@@ -1,0 +1,49 @@
+"""XML documents of PLUS: read with bounds, and told by their first element."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.io.hdf5 import one_line, reading
+from speckle3d.io.text import numbers
+
+_SIZE_LIMIT_BYTES = 2**22
+"""Five hundred times the size of a device set; in memory a document takes many times its length."""
+
+
+def read_xml(path: PathLike) -> Element:
+    """Read a document's first element.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is no XML, or too long. A document with a type declaration is refused, because the entities it
+        may declare can grow without bounds.
+    """
+    with reading(path), open_regular(path) as stream:
+        text = stream.read(_SIZE_LIMIT_BYTES + 1)
+    if len(text) > _SIZE_LIMIT_BYTES:
+        raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")
+    try:
+        return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InvalidInputError(f"{path}: expected well-formed XML, got: {one_line(error)}") from error
+
+
+def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
+    """Read an attribute of `count` numbers."""
+    label = element.get("Name") or element.get("From") or ""
+    where = f"{element.tag}{f' {label}' if label else ''}: {attribute}"
+    return numbers(element.get(attribute, ""), count, where)
+
+
+class _PlainTree(ElementTree.TreeBuilder):
+    """The tree of a document without a type declaration, so that it has no entities of its own."""
+
+    def doctype(self, name: str, *_: object) -> None:
+        raise ValueError(f"a document type declaration ({name})")

@@ -1,0 +1,200 @@
+"""Clarius raw packages of any sweep, as the scanner writes them: for tests.
+
+The layout, units and conventions are those of the maker's documents and of two public recordings, as told in
+``speckle3d/io/clarius``; the writer shares no code with the reader.
+"""
+
+import io
+import struct
+import tarfile
+import zlib
+
+import lzallright
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.streams import TimedRotations
+from speckle3d.core.sweep import BModeSettings, OrientationSensor
+
+NAME = "2024-05-01T10-00-00+0000"
+ELEMENT_MM = 0.2
+"""Of an L7 HD3."""
+
+BLOCK_BYTES = 256 * 1024
+G = 9.80665
+
+
+def write_package(target, sweep, *, packed=False, sensor=True, name=NAME, others=(), **fields):
+    """Write a folder, or a tar file where the target's name says so; `others` are further files by name."""
+    files = package_files(sweep, packed=packed, sensor=sensor, name=name, **fields) | dict(others)
+    return write_files(target, files)
+
+
+def write_files(target, files):
+    if target.suffix == ".tar":
+        with tarfile.open(target, "w") as archive:
+            for name, content in files.items():
+                entry = tarfile.TarInfo(name)
+                entry.size = len(content)
+                archive.addfile(entry, io.BytesIO(content))
+        return target
+    target.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (target / name).write_bytes(content)
+    return target
+
+
+def package_files(
+    sweep, *, packed=False, sensor=True, name=NAME, tgc=None, stamps=None, imu_text=None,
+    element_mm=ELEMENT_MM, kind=None, yml_kind=None, delay=None, yml=None,
+):  # fmt: skip
+    """Content of a package's files by name; `tgc` has a curve for each frame, None for an empty file."""
+    kind = kind or kind_of(sweep)
+    times = frame_times_ns(sweep) if stamps is None else stamps
+    raw = raw_bytes(sweep, times)
+    files = {
+        f"{name}_{kind}.raw{'.lzo' if packed else ''}": lzop_bytes(raw) if packed else raw,
+        f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm, yml_kind or kind, delay)).encode(),
+        f"{name}_{kind}.tgc": tgc_text(times, tgc).encode(),
+    }
+    if sensor and sweep.orientation is not None:
+        files[f"{name}_imu.yml"] = (imu_text or sensor_text(sweep.orientation)).encode()
+    return files
+
+
+def kind_of(sweep):
+    if isinstance(sweep.signal, BModeSettings):
+        return "env"
+    return "rf" if sweep.signal.demodulation_frequency_hz is None else "iq"
+
+
+def frame_times_ns(sweep):
+    return np.round(sweep.frame_time_s * 1e9).astype(np.int64)
+
+
+def raw_bytes(sweep, times_ns):
+    n, lines, samples = sweep.frames.shape
+    frames = [sweep.frames[i] for i in range(n)]
+    parts = [struct.pack("<5I", 1, n, lines, samples, sample_bytes(sweep))]
+    for time_ns, frame in zip(times_ns, frames, strict=True):
+        if np.iscomplexobj(frame):
+            frame = np.stack([frame.real, frame.imag], axis=-1)
+        stored = np.uint8 if kind_of(sweep) == "env" else "<i2"
+        parts += [struct.pack("<Q", int(time_ns)), np.round(frame).astype(stored).tobytes()]
+    return b"".join(parts)
+
+
+def sample_bytes(sweep):
+    return {"rf": 2, "iq": 4, "env": 1}[kind_of(sweep)]
+
+
+def yml_text(sweep, element_mm=ELEMENT_MM, kind=None, delay=None):
+    """The description; the delay has the microsecond that passes before depth 0."""
+    n, lines, samples = sweep.frames.shape
+    grid, signal = sweep.grid, sweep.signal
+    rate_hz = getattr(signal, "sampling_rate_hz", 1540e3 / (2 * grid.sample_spacing_mm))
+    if delay is None:
+        delay = rate_hz * (grid.first_sample_depth_mm * 2e-3 / 1540.0 + 1e-6)
+    step = grid.vector_pitch_mm / element_mm
+    centre_mhz = getattr(signal, "centre_frequency_hz", 10e6) / 1e6
+    lists = "".join(
+        f"  - {{rx element: {i * step!r}, tx element: {(i // 2 * 2 + 0.5) * step!r}, angle: 0 °}}\n"
+        for i in range(lines)
+    )
+    spoken = {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}[kind or kind_of(sweep)]
+    shift = getattr(signal, "demodulation_frequency_hz", None)
+    focus = ""
+    if shift:
+        ends = f"shallowfreq: {shift / 1e6!r} MHz, deepfreq: {shift / 1e6!r} MHz, filterdepth: 40 mm"
+        focus = f"focus:\n  - depth: 20 mm\n    receive:\n      - {{{ends}}}\n"
+    return (
+        "# raw data parameters\n\n"
+        f"frames: {n}\nframe rate: 11 Hz\ntransmit frequency: {centre_mhz!r} MHz\nimaging depth: 40 mm\n"
+        "focal depth: 20 mm\ntgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }\n"
+        f"size: {{samples per line: {samples}, number of lines: {lines}, "
+        f"sample size: {sample_bytes(sweep)} bytes}}\n"
+        f"type: {spoken}\ncompression: none\nsampling rate: {rate_hz / 1e6!r} MHz\ndelay samples: {delay!r}\n"
+        f"lines:\n{lists}{focus}"
+    )
+
+
+def tgc_text(times_ns, curves=None):
+    rows = [
+        f"timestamp: {t} " + "".join(f"{{ {d:.2f}mm, {g:.2f}dB }}" for d, g in (curves[i] if curves else ()))
+        for i, t in enumerate(times_ns)
+    ]
+    return f"# tgc curves per frame\n\nframes: {len(rows)}\n\n" + "\n".join(rows) + " "
+
+
+def sensor_text(sensor, quaternions=None, times_ns=None):
+    """Samples of the sensor, documents of YAML: accelerometer in g, against the specific force."""
+    if quaternions is None:
+        quaternions = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
+    times = np.round(sensor.readings.time_s * 1e9).astype(np.int64) if times_ns is None else times_ns
+    rows = zip(
+        times.tolist(), (-sensor.accelerometer_m_s2 / G).tolist(), sensor.gyroscope_rad_s.tolist(),
+        sensor.magnetometer_au.tolist(), np.asarray(quaternions).tolist(), strict=True,
+    )  # fmt: skip
+    return "---\n".join(sample_text(*row) for row in rows)
+
+
+def sample_text(time_ns, accelerometer, gyroscope, magnetometer, quaternion):
+    vectors = zip(
+        ("gyroscope", "accelerometer", "magnetometer"), (gyroscope, accelerometer, magnetometer), strict=True
+    )
+    lines = [
+        f"{name} {axis}: {value!r}\n"
+        for name, values in vectors
+        for axis, value in zip("xyz", values, strict=True)
+    ]
+    turn = ", ".join(f"q{i}: {value!r}" for i, value in enumerate(quaternion))
+    return (
+        f"timestamp: {time_ns}\n{''.join(lines)}temperature: 31\norientation: {{{turn}}}\nstationary: false\n"
+    )
+
+
+def sensor_of(rotations, time_s, seed=0):
+    """Stream of a sensor that turns so in the package's world, with the vectors that it measures."""
+    rng = np.random.default_rng(seed)
+    shape = (len(rotations), 3)
+    into = rotations.inv()
+    turns = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / np.diff(time_s)[:, None]
+    rate = np.vstack([turns[:1], 0.5 * (turns[1:] + turns[:-1]), turns[-1:]])
+    return OrientationSensor(
+        TimedRotations(time_s, rotations),
+        accelerometer_m_s2=into.apply([0.0, 0.0, G]) + rng.normal(0, 0.05, shape),
+        gyroscope_rad_s=rate + rng.normal(0, 0.001, shape),
+        magnetometer_au=into.apply([0.4, 0.0, -1.0]) + rng.normal(0, 0.01, shape),
+    )
+
+
+def swayed(time_s, degrees=8.0):
+    """Rotations of a hand that tilts slowly."""
+    phase = 2 * np.pi * np.asarray(time_s)[:, None] * [0.31, 0.23, 0.17]
+    return Rotation.from_euler("zyx", np.array([70.0, 20.0, 80.0]) + degrees * np.sin(phase), degrees=True)
+
+
+def bursts_s(start_s, stop_s, step_s=0.012, burst=3, pause_s=0.05):
+    """Times of samples that come in bursts."""
+    times, t = [], start_s
+    while t < stop_s:
+        times += [t + step_s * k for k in range(burst)]
+        t += step_s * (burst - 1) + pause_s
+    return np.round(np.array(times), 9)
+
+
+def lzop_bytes(content, *, block=BLOCK_BYTES, flags=0x3000001, name=b"x.raw"):
+    """Content packed as by lzop: Adler-32 of the unpacked blocks, or what `flags` say."""
+    head = struct.pack(">HHHBBIIII", 0x1040, 0x20A0, 0x0940, 1, 5, flags, 0x81A4, 0, 0)
+    head += bytes([len(name)]) + name
+    parts = [b"\x89LZO\x00\r\n\x1a\n", head, struct.pack(">I", zlib.adler32(head))]
+    compressor = lzallright.LZOCompressor()
+    for at in range(0, len(content), block):
+        plain = content[at : at + block]
+        packed = compressor.compress(plain)
+        packed = packed if len(packed) < len(plain) else plain
+        sums = [zlib.adler32(plain)] * bool(flags & 1) + [zlib.crc32(plain)] * bool(flags & 0x100)
+        if len(packed) < len(plain):
+            sums += [zlib.adler32(packed)] * bool(flags & 2) + [zlib.crc32(packed)] * bool(flags & 0x200)
+        parts += [struct.pack(f">II{len(sums)}I", len(plain), len(packed), *sums), packed]
+    return b"".join([*parts, struct.pack(">I", 0)])

@@ -1,0 +1,313 @@
+"""Packages of any sweep, written as the scanner writes them, are read back equal in every field."""
+
+from dataclasses import replace
+
+import clarius_examples as examples
+import numpy as np
+import pytest
+from sweep_examples import rf_sweep
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.load import companion_files, load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+
+GIVEN = ImportSettings(probe="Clarius L7 HD3", bandwidth_hz=(4e6, 8e6), dynamic_range_db=60)
+
+
+SECOND = f"{{rx element: {0.3 / examples.ELEMENT_MM!r}"
+
+
+def sweep_of(kind, frames=4, vectors=5, samples=40):
+    made = rf_sweep(frames, vectors, samples)
+    times = examples.bursts_s(9.9, 10.4)
+    sensor = examples.sensor_of(examples.swayed(times), times)
+    # At 11 frames/s and every third frame left out, as RF is interleaved.
+    clock = 10.0 + np.delete(np.arange(3 * frames), slice(None, None, 3))[:frames] / 11
+    made = replace(made, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
+    if kind == "rf":
+        return made
+    rng = np.random.default_rng(1)
+    if kind == "env":
+        data = rng.integers(0, 256, made.frames.shape).astype(np.uint8)
+        return replace(made, frames=data, signal=BModeSettings(60.0))
+    pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
+    signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
+    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm, 2.0)
+    return replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
+
+
+def require_equal(found, expected):
+    assert found.frames.shape == expected.frames.shape
+    for i in range(len(expected)):
+        assert found.frames[i].dtype == found.frames.dtype == expected.frames.dtype
+        np.testing.assert_array_equal(found.frames[i], expected.frames[i])
+    np.testing.assert_array_equal(found.frame_time_s, expected.frame_time_s)
+    # Places are printed in elements and samples, and come back to rounding.
+    for name, value in vars(expected.grid).items():
+        assert getattr(found.grid, name) == pytest.approx(value, rel=1e-12), name
+    assert found.signal == expected.signal
+    require_equal_sensor(found.orientation, expected.orientation)
+
+
+def require_equal_sensor(found, expected):
+    np.testing.assert_array_equal(found.readings.time_s, expected.readings.time_s)
+    apart = found.readings.world_from_sensor.inv() * expected.readings.world_from_sensor
+    assert apart.magnitude().max() < 1e-9
+    for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12, atol=1e-14)
+    assert found.sensor_from_image is None
+    assert found.time_offset_s == 0.0
+
+
+@pytest.mark.parametrize("kind", ["rf", "iq", "env"])
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("place", ["package.tar", "folder"])
+def test_what_is_written_is_read(tmp_path, kind, packed, place):
+    sweep = sweep_of(kind)
+    package = examples.write_package(tmp_path / place, sweep, packed=packed)
+    found = load_sweep(package, GIVEN)
+    require_equal(found, sweep)
+    assert found.probe == "Clarius L7 HD3"
+    assert found.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
+
+
+def test_tar_with_sub_folders_and_hidden_files(tmp_path):
+    sweep = sweep_of("rf")
+    files = {f"./exam/{name}": content for name, content in examples.package_files(sweep).items()}
+    files[f"./exam/._{examples.NAME}_rf.raw"] = b"of a file manager"
+    require_equal(load_sweep(examples.write_files(tmp_path / "x.tar", files), GIVEN), sweep)
+
+
+def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
+    rf, iq = sweep_of("rf"), sweep_of("iq")
+    files = examples.package_files(iq) | examples.package_files(rf)
+    folder = examples.write_files(tmp_path / "both", files)
+    require_equal(load_sweep(folder, GIVEN), rf)
+    raw = folder / f"{examples.NAME}_iq.raw"
+    require_equal(load_sweep(raw, GIVEN), iq)
+    assert {each.name.split("_")[1] for each in companion_files(raw)} == {
+        "iq.yml",
+        "iq.tgc",
+        "rf.tgc",
+        "imu.yml",
+    }
+    rows = dict(row[:2] for row in describe(folder))
+    assert (rows["sweep is made from"], rows["other raw files"]) == ("rf", "iq")
+
+
+def test_the_type_decides_not_the_name(tmp_path):
+    """Newer software may call I/Q rf.raw."""
+    sweep = sweep_of("iq")
+    package = examples.write_package(tmp_path / "p", sweep, kind="rf", yml_kind="iq")
+    require_equal(load_sweep(package, GIVEN), sweep)
+
+
+def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(examples.write_package(tmp_path / "rf", sweep_of("rf")))
+    assert caught.value.settings == ("vector_pitch_mm", "bandwidth_hz")
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(examples.write_package(tmp_path / "env", sweep_of("env")))
+    assert caught.value.settings == ("vector_pitch_mm", "dynamic_range_db")
+
+
+def test_settings_replace_what_the_package_says(tmp_path):
+    package = examples.write_package(tmp_path / "p", sweep_of("iq"))
+    given = ImportSettings(
+        vector_pitch_mm=0.4, bandwidth_hz=(3e6, 7e6), demodulation_frequency_hz=5e6,
+        centre_frequency_hz=5.5e6, speed_of_sound_m_s=1500.0, first_sample_depth_mm=1.25,
+        sampling_rate_hz=14e6,
+    )  # fmt: skip
+    found = load_sweep(package, given)
+    assert found.signal == RFSettings(14e6, 1500.0, 5.5e6, (3e6, 7e6), 5e6)
+    spacing = found.signal.sample_spacing_mm
+    assert vars(found.grid) == vars(ImageGrid(5, 40, 0.4, spacing, 1.25))
+
+
+def curve(gain):
+    return ((0.0, 20.0), (40.0, gain))
+
+
+def test_the_same_gain_leaves_the_samples_as_they_are(tmp_path):
+    sweep = sweep_of("rf")
+    package = examples.write_package(tmp_path / "p", sweep, tgc=[curve(30.0)] * len(sweep))
+    require_equal(load_sweep(package, GIVEN), sweep)
+    assert "same in all frames" in dict(row[:2] for row in describe(package))["gain by frame"]
+
+
+@pytest.mark.parametrize("kind", ["rf", "iq"])
+def test_differing_gain_is_undone_relative_to_the_first_frame(tmp_path, kind):
+    sweep = sweep_of(kind, frames=3)
+    depth_mm = sweep.grid.first_sample_depth_mm + sweep.grid.sample_spacing_mm * np.arange(40)
+    gains = [20 + depth_mm / 40 * (last - 20) for last in (30.0, 36.0, 24.0)]
+    louder = [10 ** ((gain - gains[0]) / 20) for gain in gains]
+    recorded = replace(sweep, frames=np.stack([sweep.frames[i] * louder[i] for i in range(3)]))
+    curves = [curve(last) for last in (30.0, 36.0, 24.0)]
+    package = examples.write_package(tmp_path / "p", recorded, tgc=curves)
+    found = load_sweep(package, GIVEN)
+    assert found.frames.dtype == (np.float32 if kind == "rf" else np.complex64)
+    for i in range(3):
+        # The scanner rounds to whole numbers, which is then divided by the gain.
+        np.testing.assert_allclose(found.frames[i], sweep.frames[i], atol=0.75)
+    assert "undone" in dict(row[:2] for row in describe(package))["gain by frame"]
+
+
+def test_gain_of_another_kind_serves_all(tmp_path):
+    sweep = sweep_of("rf", frames=2)
+    files = examples.package_files(sweep, tgc=[curve(30.0), curve(50.0)])
+    files = {name.replace("_rf.tgc", "_env.tgc.yml"): content for name, content in files.items()}
+    package = examples.write_files(tmp_path / "p", files)
+    assert load_sweep(package, GIVEN).frames.dtype == np.float32
+
+
+def test_gain_of_other_times_is_named(tmp_path):
+    sweep = sweep_of("rf")
+    files = examples.package_files(sweep)
+    files[f"{examples.NAME}_rf.tgc"] = examples.tgc_text(examples.frame_times_ns(sweep)[1:]).encode()
+    with pytest.raises(
+        InvalidInputError, match=r"rf\.tgc: expected the gain of the frame at \d+ ns, got none"
+    ):
+        load_sweep(examples.write_files(tmp_path / "p", files), GIVEN)
+
+
+def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
+    sweep = sweep_of("rf")
+    frames = np.zeros_like(sweep.frames)
+    frames[:, 1:4, 8:30] = sweep.frames[:, 1:4, 8:30]
+    padded = replace(sweep, frames=frames)
+    roi = "roi: {start line: 1, end line: 3, start sample: 8, end sample: 29}\n"
+    package = examples.write_package(tmp_path / "p", padded, yml=examples.yml_text(padded) + roi)
+    found = load_sweep(package, GIVEN)
+    np.testing.assert_array_equal(found.frames[2], sweep.frames[2][1:4, 8:30])
+    first_mm = sweep.grid.first_sample_depth_mm + 8 * sweep.grid.sample_spacing_mm
+    assert found.grid.first_sample_depth_mm == pytest.approx(first_mm, rel=1e-12)
+    rows = dict(row[:2] for row in describe(package))
+    assert rows["first line at element"].startswith("1.5,")  # 0.3 mm of 0.2 mm elements
+
+
+def test_data_beyond_the_region_of_interest_is_kept(tmp_path):
+    sweep = sweep_of("rf")
+    yml = examples.yml_text(sweep) + "roi: {start line: 0, end line: 4, start sample: 0, end sample: 35}\n"
+    found = load_sweep(examples.write_package(tmp_path / "p", sweep, yml=yml), GIVEN)
+    require_equal(found, sweep)
+
+
+def test_roi_outside_the_frame_is_named(tmp_path):
+    sweep = sweep_of("rf")
+    yml = examples.yml_text(sweep) + "roi: {start line: 0, end line: 4, start sample: 0, end sample: 40}\n"
+    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    with pytest.raises(InvalidInputError, match="roi: expected samples from 0 to 39, got 0 to 40"):
+        load_sweep(package, GIVEN)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("frames: 4", "frames: 5", "header: expected frames 5 as in the yml, got 4"),
+        ("number of lines: 5", "number of lines: 6", "lines: expected 6 lines, got 5"),
+        ("samples per line: 40", "samples per line: 41", "samples per line 41 as in the yml, got 40"),
+        ("sample size: 2 bytes", "sample size: 4 bytes", "expected sample size 4 as in the yml, got 2"),
+        ("type: RF", "type: IQ", "expected 4 bytes a sample of type IQ, got 2"),
+        ("type: RF", "type: M", "type: expected RF, IQ or B pre-scan, got 'M'"),
+        ("compression: none", "compression: jpeg", "compression: expected none, got 'jpeg'"),
+        ("40.0 MHz", "40.0", "sampling rate: expected a number of Hz, got '40.0'"),
+        ("40.0 MHz", "40.0 mm", "sampling rate: expected a number of Hz, got '40.0 mm'"),
+        ("40.0 MHz", "-40.0 MHz", "sampling rate: expected above zero"),
+        ("angle: 0 °}\n  - {rx", "angle: 7 °}\n  - {rx", r"lines\[0\]: angle: expected 0 .*got 7 deg"),
+        (SECOND, "{rx element: 0.0", r"lines\[1\]: rx element: expected one line a place"),
+        (SECOND, "{rx element: 1.9", r"lines\[1\]: rx element: expected evenly spaced lines"),
+        ("{ 40.00mm, 26.00dB }", "{ 40.00, 26.00dB }", "expected a gain as"),
+        ("type: RF", "type: &a RF", "line 10: expected no anchors and aliases"),
+        ("type: RF", "type: [", "expected YAML, got an error"),
+        ("type: RF", "type: RF\nprobe: {radius: 45 mm}", "parallel lines, got a curved array of 45 mm"),
+    ],
+)  # fmt: skip
+def test_contradictions_are_named(tmp_path, old, new, message):
+    sweep = sweep_of("rf")
+    text = examples.yml_text(sweep)
+    assert old in text
+    package = examples.write_package(tmp_path / "p", sweep, yml=text.replace(old, new, 1))
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        load_sweep(package, GIVEN)
+    assert "\n" not in str(caught.value)
+    assert "_rf." in str(caught.value)
+
+
+def test_lines_given_by_the_first_and_last(tmp_path):
+    sweep = sweep_of("rf")
+    rows = examples.yml_text(sweep).split("\n")
+    first = next(i for i, row in enumerate(rows) if "rx element" in row)
+    text = "\n".join(rows[: first + 1] + rows[first + 4 :])
+    require_equal(load_sweep(examples.write_package(tmp_path / "p", sweep, yml=text), GIVEN), sweep)
+
+
+@pytest.mark.parametrize(
+    ("probe", "message"),
+    [("C3 HD3", "expected parallel lines"), ("L7", "expected a model whose element pitch")],
+)
+def test_probes_without_a_published_pitch_or_parallel_lines_are_refused(tmp_path, probe, message):
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"))
+    with pytest.raises(InvalidInputError, match=message):
+        load_sweep(package, ImportSettings(probe=probe))
+
+
+def test_frame_times_that_do_not_rise_are_named(tmp_path):
+    sweep = sweep_of("rf")
+    stamps = examples.frame_times_ns(sweep)
+    stamps[2] = stamps[1]
+    package = examples.write_package(tmp_path / "p", sweep, stamps=stamps)
+    with pytest.raises(
+        InvalidInputError, match=r"rf\.raw: frame 2: expected a time after \d+ ns, got \d+ ns"
+    ):
+        load_sweep(package, GIVEN)
+
+
+@pytest.mark.parametrize("change", [lambda raw: raw[:-1], lambda raw: raw + b"x", lambda raw: raw[:10]])
+def test_raw_files_of_another_length_are_named(tmp_path, change):
+    files = examples.package_files(sweep_of("rf"))
+    name = f"{examples.NAME}_rf.raw"
+    package = examples.write_files(tmp_path / "p", files | {name: change(files[name])})
+    with pytest.raises(FileError, match=r"rf\.raw: expected"):
+        load_sweep(package, GIVEN)
+
+
+def test_a_package_without_raw_files_is_described(tmp_path):
+    files = examples.package_files(sweep_of("rf"))
+    files = {name: content for name, content in files.items() if not name.endswith(".raw")}
+    package = examples.write_files(tmp_path / "p.tar", files)
+    rows = dict(row[:2] for row in describe(package))
+    assert rows["rf: frames"] == "4"
+    assert rows["rf: raw file"] == "none"
+    assert "expected a raw file" in rows["sweep"]
+    with pytest.raises(InvalidInputError, match="expected a raw file"):
+        load_sweep(package)
+
+
+def test_a_package_becomes_a_sweep_file(tmp_path):
+    sweep = sweep_of("rf")
+    package = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, packed=True), GIVEN)
+    write_sweep(tmp_path / "sweep.h5", package)
+    require_equal(load_sweep(tmp_path / "sweep.h5"), sweep)
+
+
+@pytest.mark.realdata
+def test_real_packages(realdata):
+    for name, frames in (("carotid", "17"), ("wirephantom", "13")):
+        rows = dict(row[:2] for row in describe(realdata / "clarius" / name))
+        assert rows["rf: frames"] == frames
+        assert rows["quaternion"].startswith("scalar first, world from sensor")
+        assert "expected a raw file" in rows["sweep"]
+    doppler = realdata / "clarius" / "carotid" / "doppler"
+    with pytest.raises(InvalidInputError, match="got 15 deg, and 1248 of 1248 lines steered"):
+        load_sweep(doppler)
+    envelope = load_sweep(
+        doppler / "carotid_env.raw", ImportSettings(vector_pitch_mm=0.1, dynamic_range_db=60.0)
+    )
+    assert envelope.frames.shape == (1, 304, 592)
+    assert envelope.frames[0].max() == 255
+    assert envelope.frame_time_s[0] == pytest.approx(272.547324170, abs=1e-9)
+    # 592 samples of 0.0513 mm; the depth is counted from the first but for one of its 16 delay samples.
+    assert envelope.grid.depth_mm == pytest.approx(0.051 + 591 * 0.051333, abs=0.01)

@@ -1,0 +1,101 @@
+"""What the page on formats shows is run as it stands there."""
+
+import importlib
+import json
+import re
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+from format_examples import matlab_order, rf, write_mat
+
+from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.io import readers
+from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.load import companion_files, load_sweep
+
+
+@pytest.fixture(scope="module")
+def page(project):
+    return (project / "docs" / "formats.md").read_text(encoding="utf-8")
+
+
+def blocks(page, language):
+    return re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
+
+
+def block(page, language, holding):
+    (found,) = (text for text in blocks(page, language) if holding in text)
+    return found
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch, page):
+    """The page's package, as pip leaves it."""
+    place = tmp_path / "site"
+    project = tomllib.loads(block(page, "toml", "entry-points"))["project"]
+    ((group, entries),) = project["entry-points"].items()
+    ((name, target),) = entries.items()
+    information = place / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
+    module = target.partition(":")[0]
+    (place / f"{module}.py").write_text(block(page, "python", "READER = "))
+    monkeypatch.syspath_prepend(str(place))
+    importlib.invalidate_caches()
+    readers.readers.cache_clear()
+    yield place
+    readers.readers.cache_clear()
+    sys.modules.pop(module, None)
+
+
+def test_a_reader_of_ones_own(tmp_path, installed, page):
+    said = {"rig": 1, "frames": 4, "vectors": 6, "samples": 40, "rate_hz": 40e6, "transmit_hz": 6e6}
+    said |= {"time_s": [0.0, 0.1, 0.2, 0.3], "pitch_mm": 0.3}
+    (tmp_path / "arm.json").write_text(json.dumps(said))
+    (tmp_path / "arm.bin").write_bytes(rf().tobytes())
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(tmp_path / "arm.json")
+    assert caught.value.settings == ("bandwidth_hz",)
+    sweep = load_sweep(tmp_path / "arm.json", ImportSettings(bandwidth_hz=(4e6, 8e6)))
+    np.testing.assert_array_equal(np.stack([sweep.frames[i] for i in range(4)]), rf())
+    assert sweep.signal == RFSettings(40e6, 1540.0, 6e6, (4e6, 8e6))
+    assert sweep.grid == ImageGrid(6, 40, 0.3, sweep.signal.sample_spacing_mm)
+    np.testing.assert_array_equal(sweep.frame_time_s, said["time_s"])
+    assert companion_files(tmp_path / "arm.json") == [tmp_path / "arm.bin"]
+    (tmp_path / "import.toml").write_text("bandwidth_hz = [4e6, 8e6]\n")
+    rows = {name: value for name, value, _ in describe(tmp_path / "arm.json")}
+    assert (rows["format"], rows["frames"]) == ("our rig", "4")
+    assert len([line for line in block(page, "python", "READER = ").splitlines() if line.strip()]) <= 36
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_the_mapping_of_matlab_arrays(tmp_path, page, new):
+    path = write_mat(
+        tmp_path / "scan.mat",
+        new,
+        RData=[matlab_order(rf())],
+        TimeTag=np.arange(4) / 25,
+        Trans={"spacingMm": 0.3, "frequency": 6.0},
+        Receive={"decimSampleRate": 40.0},
+    )
+    (tmp_path / "scan.mat.toml").write_text(block(page, "toml", "[arrays]"))
+    sweep = load_sweep(path)
+    np.testing.assert_array_equal(np.stack([sweep.frames[i] for i in range(4)]), rf())
+    assert sweep.signal == RFSettings(40e6, 1540.0, 6e6, (4e6, 8e6))
+    assert sweep.grid.vector_pitch_mm == 0.3
+    np.testing.assert_array_equal(sweep.frame_time_s, np.arange(4) / 25)
+
+
+def test_the_settings_shown_are_settings(page):
+    for text in blocks(page, "toml"):
+        if "entry-points" not in text:
+            ImportSettings.model_validate(tomllib.loads(text))
+
+
+def test_every_format_is_in_the_table(page):
+    for reader in readers.readers():
+        assert re.search(rf"^\| `?{re.escape(reader.format)}`? \|", page, flags=re.MULTILINE), reader.format

@@ -1,0 +1,244 @@
+import tracemalloc
+import zlib
+
+import h5py
+import numpy as np
+import pytest
+from format_examples import FRAMES, SAMPLES, VECTORS, grey, iq, matlab_order, rf, write_mat
+
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.load import load_sweep
+
+TIMES = 0.1 * np.arange(FRAMES)
+AXES = "sample, vector, frame"
+VERSIONS = pytest.mark.parametrize("new", [False, True], ids=["version 5", "version 7.3"])
+
+
+def saved(tmp_path, new=False, **more):
+    return write_mat(
+        tmp_path / "a.mat",
+        new,
+        RData=matlab_order(rf()),
+        Cells=[matlab_order(rf(5)), np.arange(3.0)],
+        Trans={"spacingMm": 0.3, "frequency": 6.25, "kind": "linear"},
+        band=np.array([4.0, 8.0]),
+        t=TIMES,
+        **more,
+    )
+
+
+def mapped(**arrays):
+    given = {"axes": AXES, "vector_pitch_mm": "Trans.spacingMm", "time_s": "t"} | arrays
+    given |= {"centre_frequency_hz": "Trans.frequency * 1e6", "bandwidth_hz": "band * 1e6"}
+    return ImportSettings(sampling_rate_hz=40e6, arrays={k: v for k, v in given.items() if v is not None})
+
+
+def read(sweep):
+    return np.stack([sweep.frames[i] for i in range(len(sweep))])
+
+
+@VERSIONS
+@pytest.mark.parametrize(("array", "frames"), [("RData", rf()), ("Cells{1}", rf(5))])
+def test_rf_by_its_mapping(tmp_path, new, array, frames):
+    sweep = load_sweep(saved(tmp_path, new), mapped(rf=array))
+    np.testing.assert_array_equal(read(sweep), frames)
+    assert sweep.frames.dtype == np.int16
+    assert sweep.signal == RFSettings(40e6, 1540.0, 6.25e6, (4e6, 8e6))
+    assert sweep.grid == ImageGrid(VECTORS, SAMPLES, 0.3, 1540.0 / 80e3, 0.0)
+    np.testing.assert_array_equal(sweep.frame_time_s, TIMES)
+    assert sweep.name == "a"
+
+
+@VERSIONS
+@pytest.mark.parametrize("axes", ["vector, frame, sample", "frame, sample, -, vector"])
+def test_axes_in_any_order(tmp_path, new, axes):
+    names = [name.strip() for name in axes.split(",")]
+    order = [("frame", "vector", "sample").index(name) for name in names if name != "-"]
+    data = rf().transpose(order).reshape([1 if name == "-" else rf().shape[order.pop(0)] for name in names])
+    sweep = load_sweep(saved(tmp_path, new, data=data), mapped(rf="data", axes=axes))
+    np.testing.assert_array_equal(read(sweep), rf())
+
+
+@VERSIONS
+def test_iq_as_complex_numbers_and_as_two_arrays(tmp_path, new):
+    turned = matlab_order(iq())
+    path = saved(tmp_path, new, IQ=turned, I=turned.real, Q=turned.imag)
+    given = {"demodulation_frequency_hz": "Trans.frequency * 1e6"}
+    for mapping in (mapped(iq="IQ", **given), mapped(i="I", q="Q", **given)):
+        sweep = load_sweep(path, mapping)
+        np.testing.assert_array_equal(read(sweep), iq())
+        assert sweep.signal.demodulation_frequency_hz == 6.25e6
+
+
+@VERSIONS
+def test_grey_levels_saved_as_double_with_positions(tmp_path, new):
+    x, z = 0.2 * np.arange(VECTORS) - 0.5, 1e-3 * (3 + 0.1 * np.arange(SAMPLES))
+    path = saved(tmp_path, new, image=matlab_order(grey()).astype(float), x=x, z=z)
+    arrays = {"bmode": "image", "axes": AXES, "x_mm": "x", "z_mm": "z * 1e3", "time_s": "t"}
+    sweep = load_sweep(path, ImportSettings(arrays=arrays, dynamic_range_db=55.0))
+    np.testing.assert_array_equal(read(sweep), grey())
+    assert sweep.frames.dtype == np.uint8
+    assert sweep.signal == BModeSettings(55.0)
+    expected = ImageGrid(VECTORS, SAMPLES, 0.2, 0.1, 3.0)
+    assert np.allclose(list(vars(sweep.grid).values()), list(vars(expected).values()), rtol=1e-12)
+
+
+@VERSIONS
+def test_one_frame_needs_no_axis_and_no_rate(tmp_path, new):
+    path = saved(tmp_path, new, one=matlab_order(rf())[..., 0])
+    np.testing.assert_array_equal(
+        read(load_sweep(path, mapped(rf="one", axes="sample, vector", time_s=None))), rf()[:1]
+    )
+    sweep = load_sweep(path, mapped(rf="one", axes=AXES, time_s=None))
+    np.testing.assert_array_equal(read(sweep), rf()[:1])
+
+
+def test_an_element_of_an_array_of_structs(tmp_path):
+    from scipy.io import savemat
+
+    receive = np.zeros((1, 3), dtype=[("rate", object), ("data", object)])
+    for k in range(3):
+        receive[0, k] = (np.array([[10.0 * (k + 1)]]), matlab_order(rf(k)))
+    savemat(tmp_path / "a.mat", {"Receive": receive, "t": TIMES})
+    given = mapped(rf="Receive(2).data", vector_pitch_mm=None)
+    arrays = {name: text for name, text in given.arrays.items() if "Trans" not in text and "band" not in text}
+    settings = ImportSettings(
+        arrays={**arrays, "sampling_rate_hz": "Receive(3).rate * 1e6"},
+        vector_pitch_mm=0.3,
+        centre_frequency_hz=6e6,
+        bandwidth_hz=(4e6, 8e6),
+    )
+    sweep = load_sweep(tmp_path / "a.mat", settings)
+    np.testing.assert_array_equal(read(sweep), rf(1))
+    assert sweep.signal.sampling_rate_hz == 30e6
+    unsaid = settings.model_copy(update={"arrays": {**settings.arrays, "rf": "Receive.data"}})
+    with pytest.raises(
+        InvalidInputError, match=r"Receive.data: expected a number in brackets up to 3, got none"
+    ):
+        load_sweep(tmp_path / "a.mat", unsaid)
+
+
+def test_an_element_of_an_array_of_structs_in_the_new_version(tmp_path):
+    """Each field is a list of references, as MATLAB writes them."""
+    path = saved(tmp_path, True)
+    with h5py.File(path, "r+") as file:
+        for k in range(3):
+            file[f"#refs#/s{k}"] = rf(k)
+        references = np.array([[file[f"#refs#/s{k}"].ref] for k in range(3)], dtype=h5py.ref_dtype)
+        file["Receive/data"] = references
+    np.testing.assert_array_equal(read(load_sweep(path, mapped(rf="Receive(2).data"))), rf(1))
+
+
+@VERSIONS
+def test_without_a_mapping_the_arrays_are_listed_in_one_line(tmp_path, new):
+    path = saved(tmp_path, new)
+    with pytest.raises(InvalidInputError) as caught:
+        load_sweep(path)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert "write rf (or iq, or i and q, or bmode)" in said
+    for name in ("RData 40 x 6 x 4 int16", "Cells{1} 40 x 6 x 4 int16", "Trans.spacingMm 1 x 1", "t 1 x 4"):
+        assert name in said
+    assert "linear" not in said
+    assert "kind" not in said
+    assert ("array RData", "40 x 6 x 4", "int16") in describe(path)
+
+
+@VERSIONS
+def test_the_mapping_lies_beside_the_file(tmp_path, new):
+    path = saved(tmp_path, new)
+    lines = [f'{name} = "{text}"' for name, text in mapped(rf="RData").arrays.items()]
+    (tmp_path / "a.mat.toml").write_text("\n".join(["sampling_rate_hz = 40e6", "[arrays]", *lines]))
+    np.testing.assert_array_equal(read(load_sweep(path)), rf())
+    assert ("axes", AXES, "") in describe(path)
+
+
+def test_what_is_missing_is_asked_for_at_once(tmp_path):
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(saved(tmp_path), ImportSettings(arrays={"rf": "RData", "axes": AXES}))
+    missing = ("vector_pitch_mm", "sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz", "frame_rate_hz")
+    assert caught.value.settings == missing
+
+
+WRONG = {
+    "no axes": ({"axes": None}, r"RData is 40 x 6 x 4: say which of its axes is which"),
+    "two axes": ({"axes": "sample, vector"}, "axes: expected 3 of 40 x 6 x 4"),
+    "an axis twice": ({"axes": "sample, sample, vector"}, "once each"),
+    "another axis": ({"axes": "row, column, frame"}, "axes: expected sample, vector, frame"),
+    "no vectors": ({"axes": "sample, frame, -"}, "expected sample and vector"),
+    "an axis left out": ({"axes": "sample, vector, -"}, "expected - for an axis of length 1, got 4"),
+    "contradicting axes": (
+        {"axes": "vector, frame, sample"},
+        "time_s = t: expected 6 numbers for 6 frames, got 4",
+    ),
+    "none of the name": ({"rf": "Data"}, "expected an array Data, got .*RData 40 x 6 x 4 int16"),
+    "a struct": ({"rf": "Trans"}, "expected an array Trans, got"),
+    "a text": ({"rf": "Trans.kind"}, "expected an array Trans.kind, got"),
+    "past the end": ({"rf": "Cells{3}"}, "up to 2, got 3"),
+    "counted from 0": ({"rf": "Cells{0}"}, "expected a name as"),
+    "no name": ({"rf": "../etc"}, "expected a name as"),
+    "two kinds": ({"bmode": "RData"}, "write rf"),
+    "real for complex": ({"rf": None, "iq": "RData"}, "iq: expected complex, got real"),
+    "unknown": ({"colour": "RData"}, "got colour"),
+    "many numbers": ({"vector_pitch_mm": "t"}, r"vector_pitch_mm = t: expected 1 number\(s\), got 4"),
+    "a formula": ({"vector_pitch_mm": "Trans.spacingMm * x"}, "expected as NAME"),
+    "falling positions": ({"time_s": "t * -1"}, "time_s"),
+    "grey of RF": ({"rf": None, "bmode": "RData"}, "bmode: expected grey levels"),
+}
+
+
+@VERSIONS
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_mapping_is_refused_in_one_line(tmp_path, new, name):
+    changes, said = WRONG[name]
+    settings = mapped(**{"rf": "RData"} | changes)
+    if name == "grey of RF":
+        settings = settings.model_copy(
+            update={"column_pitch_mm": 1.0, "row_spacing_mm": 1.0, "dynamic_range_db": 60.0}
+        )
+    with pytest.raises(InvalidInputError, match=said) as caught:
+        read(load_sweep(saved(tmp_path, new), settings))
+    assert "\n" not in str(caught.value)
+
+
+@VERSIONS
+@pytest.mark.parametrize("left", [0.3, 0.7, 0.95])
+def test_a_truncated_file_is_an_error_of_one_line(tmp_path, new, left):
+    path = saved(tmp_path, new)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(left * len(content))])
+    with pytest.raises(Speckle3DError) as caught:
+        read(load_sweep(path, mapped(rf="RData")))
+    assert "\n" not in str(caught.value)
+
+
+@VERSIONS
+def test_echoes_that_are_no_numbers_are_refused(tmp_path, new):
+    data = matlab_order(rf()).astype(float)
+    data[3, 2, 1] = np.nan
+    with pytest.raises(InvalidInputError, match=r"(frame 1|data\[1\])\[.*expected a finite value, got nan"):
+        read(load_sweep(saved(tmp_path, new, data=data), mapped(rf="data")))
+
+
+def test_a_variable_that_unpacks_to_far_more_than_the_file_is_refused_in_little_memory(tmp_path):
+    packed = zlib.compress(bytes(2**27), 9)
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
+    path = tmp_path / "a.mat"
+    path.write_bytes(head + np.array([15, len(packed)], "<u4").tobytes() + packed)
+    tracemalloc.start()
+    with pytest.raises(InvalidInputError, match="expected at most 67108864 bytes of variables"):
+        load_sweep(path, mapped(rf="RData"))
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
+
+
+def test_elsewhere_is_not_gone_to(tmp_path):
+    path = saved(tmp_path, True)
+    with h5py.File(path, "r+") as file:
+        del file["RData"]
+        file["RData"] = h5py.ExternalLink("other.mat", "/RData")
+    with pytest.raises(InvalidInputError, match="another file"):
+        load_sweep(path, mapped(rf="RData"))
