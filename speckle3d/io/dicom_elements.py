@@ -52,12 +52,14 @@ def read_header(path: Path, stream: BufferedReader) -> tuple[Any, Any]:
 def reading_dicom(where: str) -> Iterator[None]:
     """Turn what pydicom raises on damaged files into one line, and keep its warnings to itself."""
     import pydicom.config
+    from pydicom.errors import BytesLengthException, InvalidDicomError
 
+    damage = (AttributeError, IndexError, EOFError, AssertionError, struct.error)
     with reading(where), warnings.catch_warnings(), pydicom.config.disable_value_validation():
         warnings.simplefilter("ignore")
         try:
             yield
-        except (AttributeError, IndexError, EOFError, AssertionError, struct.error) as error:
+        except (*damage, BytesLengthException, InvalidDicomError) as error:
             raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
