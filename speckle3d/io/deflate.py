@@ -7,6 +7,7 @@ have. What is written is the filters' format: shuffled bytes in a zlib stream, r
 from __future__ import annotations
 
 import os
+import struct
 import zlib
 from collections import deque
 from collections.abc import Callable
@@ -19,6 +20,12 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import ByteArray
 
+_HEADER, _LAST_BLOCK = b"\x78\x01", b"\x03\x00"
+"""Of a zlib stream, and of one whose last block is empty."""
+
+_MOST_STORED = 0xFFFF
+"""Bytes in a block that is not packed; its length is told twice, once with all bits turned."""
+
 _MOST_THREADS = 4
 _AHEAD = 2
 """Frames that may wait for each thread."""
@@ -30,20 +37,46 @@ def shuffled(frame: npt.NDArray[Any]) -> ByteArray:
     return np.array(by_sample.T, order="C")
 
 
+def deflated(planes: ByteArray) -> bytes:
+    """Pack shuffled bytes, a run for each byte of the samples, into a zlib stream [1]_.
+
+    Each run has codes of its own: the last bytes of echoes are noise, stored as they are, and the first ones
+    take few values.
+
+    References
+    ----------
+    .. [1] P. Deutsch, RFC 1950 and RFC 1951, 1996: blocks that end on a byte follow one another.
+    """
+    pack = _packer()
+    runs = ((plane, pack(plane)) for plane in planes)
+    blocks = (packed if len(packed) < plane.size else _stored(plane) for plane, packed in runs)
+    return b"".join((_HEADER, *blocks, _LAST_BLOCK, struct.pack(">I", zlib.adler32(planes.data))))
+
+
 @cache
-def deflate() -> Callable[[ByteArray], bytes]:
-    """Function that packs bytes into a zlib stream: ISA-L's, or zlib's where that has no wheel."""
+def _packer() -> Callable[[ByteArray], bytes]:
+    """Function that packs a run into blocks that end on a byte: ISA-L's, or zlib's where it is missing."""
     try:
         from isal import isal_zlib
     except ImportError:
-        return deflated_by_zlib
-    return lambda data: bytes(isal_zlib.compress(data, 1))
+        return packed_by_zlib
+
+    def packed_by_isal(run: ByteArray) -> bytes:
+        packer = isal_zlib.compressobj(1, isal_zlib.DEFLATED, -zlib.MAX_WBITS)
+        return bytes(packer.compress(run) + packer.flush(zlib.Z_FULL_FLUSH))
+
+    return packed_by_isal
 
 
-def deflated_by_zlib(data: ByteArray) -> bytes:
-    """Pack bytes; of the repetitions in echoes, only those of single bytes are worth their search."""
-    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, zlib.Z_RLE)
-    return packer.compress(data.data) + packer.flush()
+def packed_by_zlib(run: ByteArray) -> bytes:
+    """Pack a run; of the repetitions in echoes, only those of single bytes are worth their search."""
+    packer = zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, zlib.Z_RLE)
+    return packer.compress(run.data) + packer.flush(zlib.Z_FULL_FLUSH)
+
+
+def _stored(run: ByteArray) -> bytes:
+    pieces = (run[first : first + _MOST_STORED].tobytes() for first in range(0, run.size, _MOST_STORED))
+    return b"".join(struct.pack("<BHH", 0, len(p), _MOST_STORED - len(p)) + p for p in pieces)
 
 
 class DeflatingWriter:
@@ -68,7 +101,7 @@ class DeflatingWriter:
 
     def append(self, frame: npt.NDArray[Any]) -> None:
         """Append a frame, shape (vector, sample) or (vector, sample, 2)."""
-        self._ahead.append(self._pool.submit(deflate(), shuffled(frame)))
+        self._ahead.append(self._pool.submit(deflated, shuffled(frame)))
         while len(self._ahead) > _AHEAD * self._threads:
             self._write_next()
 

@@ -151,7 +151,13 @@ def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
     while stream.tell() < _HEADER_LIMIT_BYTES and (line := stream.readline(2**16)):
-        yield line.decode("latin-1").rstrip("\r\n")
+        if b"\0" in line:
+            raise FileError(f"{stream.name}: expected text in the header, got a zero byte")
+        try:
+            text = line.decode("utf-8")
+        except UnicodeDecodeError:
+            text = line.decode("latin-1")
+        yield text.rstrip("\r\n")
 
 
 def _meta_header(path: PathLike, lines: dict[str, str], stream: BinaryIO) -> SequenceHeader:

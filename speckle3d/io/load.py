@@ -70,7 +70,10 @@ def companion_files(path: PathLike) -> list[Path]:
     reader, beside = find_reader(path), settings_file(path)
     if reader is None:
         return []
-    return [*reader.companions(Path(path)), *(() if beside is None else (beside,))]
+    if beside is None:
+        return [*reader.companions(Path(path))]
+    config = settings_for(path).plus_config
+    return [*reader.companions(Path(path)), beside, *([] if config is None else [Path(config)])]
 
 
 def recording_files(path: PathLike) -> list[Path]:

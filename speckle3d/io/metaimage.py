@@ -28,9 +28,8 @@ from speckle3d.core.sweep import (
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
-from speckle3d.io.pixel_pieces import PixelPieces
 from speckle3d.io.plus.device_set import DeviceSet, read_device_set
-from speckle3d.io.plus.frames import SequenceFrames, sample_type
+from speckle3d.io.plus.frames import SequenceFrames
 from speckle3d.io.plus.layout import Layout, layout_of
 from speckle3d.io.plus.own_fields import own_values
 from speckle3d.io.plus.record import SequenceRecord, record_of
@@ -68,12 +67,9 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
         Naming all that the file does not say.
     """
     source = _Source.open(path, overrides or ImportSettings())
-    layout, chosen = source.layout, source.require_images()
+    chosen = source.require_images()
     values = source.settings.over(path, **source.wanted())
-    pieces = PixelPieces(source.header.pixels, source.header.size[0] * source.header.size[1])
-    dtype = sample_type(pieces, layout, chosen)
-    x, y = source.header.size[:2]
-    frames = SequenceFrames(pieces, (x, y), layout, source.record(), chosen, dtype)
+    frames = SequenceFrames(source.header, source.layout, source.record(), chosen)
     if values.get("demodulation_frequency_hz") == 0 and _turns_backwards(frames[0]):
         frames.record = source.record(conjugated=True)
     with naming(str(path)):

@@ -1,7 +1,7 @@
 """Pixels of image files piece by piece, in memory that does not grow with their number.
 
 Raw pixels are read where they lie. Packed ones are unpacked from the front; places on the way are kept, at
-most `_MOST_PLACES` of some 50 KB each, so that going back costs a bounded part of the file. Pixels packed
+most `_MOST_PLACES` of some 60 KB each, so that going back costs a bounded part of the file. Pixels packed
 with bzip2 have no such places and are unpacked from the start again; those written as text are held in
 memory.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import bz2
 import operator
-import threading
 import weakref
 import zlib
 from dataclasses import dataclass
@@ -25,22 +24,26 @@ from speckle3d.core.files import open_regular
 from speckle3d.io.pixels import Pixels, read_pixels
 
 _MOST_PLACES = 64
-_PACKED_BYTES = 2**18
+_PACKED_BYTES = 2**14
 
 
 class PixelPieces:
-    """Pieces of `length` numbers each; indexing reads one.
+    """Pieces of `length` numbers each of an open file; indexing reads one.
 
-    The file is opened at the first piece asked for and stays open until `close`, which may be called at any
-    time. A copy sent to another process opens the file there.
+    Raises
+    ------
+    FileError
+        On indexing, naming the piece, if the file is damaged or holds fewer bytes than its header said.
     """
 
     def __init__(self, pixels: Pixels, length: int) -> None:
         self.pixels, self.length = pixels, length
-        self._lock = threading.Lock()
-        self._stream: BufferedReader | None = None
-        self._unpacking: _Unpacking | None = None
-        self._text: npt.NDArray[Any] | None = None
+        self._piece_bytes = length * pixels.dtype.itemsize
+        self._text = read_pixels(pixels) if pixels.packing == "text" else None
+        self._stream = open_regular(pixels.path)
+        self._unpacking = _Unpacking(pixels, self._stream, self._piece_bytes)
+        # Where nobody closes it, as with frames that a command has done with.
+        self._closed = weakref.finalize(self, self._stream.close)
 
     def __len__(self) -> int:
         return self.pixels.count // self.length
@@ -49,52 +52,27 @@ class PixelPieces:
         i = operator.index(index)
         if not 0 <= i < len(self):
             raise IndexError(f"piece {i} of {len(self)}")
-        with self._lock:
-            if self.pixels.packing == "text":
-                return self._from_text(i)
-            read = self._raw if self.pixels.packing == "raw" else self._unpacked
-            values = np.frombuffer(read(i), dtype=self.pixels.dtype)
+        if self._text is not None:
+            return self._text[i * self.length : (i + 1) * self.length]
+        if self.pixels.packing == "raw":
+            found = self._raw(i)
+        else:
+            found = self._unpacking.piece(i, is_last=i == len(self) - 1)
+        values = np.frombuffer(found, dtype=self.pixels.dtype)
         return values.astype(self.pixels.dtype.newbyteorder("="), copy=False)
 
     def close(self) -> None:
-        """Close the file if it is open."""
-        with self._lock:
-            if self._stream is not None:
-                self._stream.close()
-            self._stream = self._unpacking = self._text = None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.pixels, self.length)
-
-    @property
-    def _piece_bytes(self) -> int:
-        return self.length * self.pixels.dtype.itemsize
-
-    def _opened(self) -> BufferedReader:
-        if self._stream is None:
-            self._stream = open_regular(self.pixels.path)
-            weakref.finalize(self, self._stream.close)
-        return self._stream
+        """Close the file."""
+        self._closed()
 
     def _raw(self, i: int) -> bytes:
-        stream = self._opened()
-        stream.seek(self.pixels.start + i * self._piece_bytes)
-        found = stream.read(self._piece_bytes)
+        self._stream.seek(self.pixels.start + i * self._piece_bytes)
+        found = self._stream.read(self._piece_bytes)
         if len(found) != self._piece_bytes:
             raise FileError(
                 f"{self.pixels.path}: frame {i}: expected {self._piece_bytes} bytes, got {len(found)}"
             )
         return found
-
-    def _unpacked(self, i: int) -> bytes:
-        if self._unpacking is None:
-            self._unpacking = _Unpacking(self.pixels, self._opened(), self._piece_bytes)
-        return self._unpacking.piece(i, is_last=i == len(self) - 1)
-
-    def _from_text(self, i: int) -> npt.NDArray[Any]:
-        if self._text is None:
-            self._text = read_pixels(self.pixels)
-        return self._text[i * self.length : (i + 1) * self.length]
 
 
 @dataclass

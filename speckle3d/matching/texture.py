@@ -89,7 +89,9 @@ def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[
             # Bright structure counts no more than speckle: images are equalised before they are correlated.
             energy = np.abs(spectrum) ** 2
             power[row] += (energy / np.maximum(energy.sum(axis=1, keepdims=True), 1e-30)).mean(axis=0)
-    noise = np.quantile(power, _NOISE_QUANTILE, axis=1, keepdims=True)
+    # I/Q hold little beside the band, and nothing where their filter has cut them off.
+    quantile = 0.0 if signal.are_complex else _NOISE_QUANTILE
+    noise = np.quantile(power, quantile, axis=1, keepdims=True)
     return frequency_hz, np.maximum(power - noise, 1e-12 * power.max())
 
 

@@ -8,14 +8,14 @@ import pytest
 import sweep_examples
 
 from speckle3d.io import deflate
-from speckle3d.io.deflate import deflated_by_zlib, shuffled
+from speckle3d.io.deflate import deflated, packed_by_zlib, shuffled
 from speckle3d.io.sweep_writer import SweepWriter
 
 
 @pytest.fixture(params=["as installed", "zlib"])
 def packer(request, monkeypatch):
     if request.param == "zlib":
-        monkeypatch.setattr(deflate, "deflate", lambda: deflated_by_zlib)
+        monkeypatch.setattr(deflate, "_packer", lambda: packed_by_zlib)
 
 
 def frames_of(kind, count=25):
@@ -48,7 +48,21 @@ def test_hdf5_reads_what_threads_packed(tmp_path, kind):
 def test_packing_is_a_zlib_stream_of_shuffled_bytes():
     frame = np.array([[0x0102, 0x0304], [0x0506, 0x0708]], ">i2")
     assert shuffled(frame).tolist() == [[1, 3, 5, 7], [2, 4, 6, 8]]
-    assert zlib.decompress(deflate.deflate()(shuffled(frame))) == bytes([1, 3, 5, 7, 2, 4, 6, 8])
+    assert zlib.decompress(deflated(shuffled(frame))) == bytes([1, 3, 5, 7, 2, 4, 6, 8])
+
+
+@pytest.mark.parametrize("count", [1, 3, 65535, 65536, 200_000])
+@pytest.mark.parametrize("kind", ["noise", "zeros"])
+@pytest.mark.usefixtures("packer")
+def test_runs_of_any_length_come_back(count, kind):
+    """Noise is stored, in blocks of 65,535 bytes at most; what is alike is packed."""
+    rng = np.random.default_rng(0)
+    planes = rng.integers(0, 256 if kind == "noise" else 1, (2, count)).astype(np.uint8)
+    packed = deflated(planes)
+    assert zlib.decompress(packed) == planes.tobytes()
+    # 5 bytes a block, 8 of the stream.
+    assert len(packed) <= 2 * (count + 5 * (count // 65535 + 1)) + 8
+    assert kind == "noise" or count < 100 or len(packed) < 0.02 * planes.size
 
 
 def test_few_frames_wait_whatever_the_disk_does(tmp_path):

@@ -105,6 +105,6 @@ def test_an_image_sequence_is_described_from_its_header(tmp_path):
     rows = values(write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2]))
     assert rows["size"] == ("5 x 4 x 3", "")
     assert rows["spacing"] == ("unknown", "")
-    assert rows["image type"] == ("BRIGHTNESS", "")
+    assert rows["image type"] == ("BRIGHTNESS (assumed)", "")
     assert rows["transforms"] == ("ProbeToTracker, ReferenceToTracker", "")
     assert rows["time stamps"] == ("yes", "")

@@ -35,29 +35,12 @@ from speckle3d.io.plus.layout import Layout
 
 GROUP = "plus"
 
-_STORAGE = frozenset(
-    [
-        "ObjectType",
-        "BinaryData",
-        "BinaryDataByteOrderMSB",
-        "ElementByteOrderMSB",
-        "CompressedData",
-        "CompressedDataSize",
-        "DimSize",
-        "ElementNumberOfChannels",
-        "ElementSize",
-        "ElementDataFile",
-        "HeaderSize",
-        "Kinds",
-        "dimension",
-        "encoding",
-        "endian",
-        "kinds",
-        "sizes",
-        "type",
-        "spacings",
-    ]
-) | {"space dimension", "space directions", "data file", "datafile"}
+_STORAGE = {
+    "ObjectType", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB", "CompressedData",
+    "HeaderSize", "CompressedDataSize", "DimSize", "ElementNumberOfChannels", "ElementSize", "Kinds",
+    "ElementDataFile", "dimension", "encoding", "endian", "kinds", "sizes", "type", "spacings", "data file",
+    "datafile", "space dimension", "space directions", "space origin",
+}  # fmt: skip
 """Fields that say how pixels are stored; a writer makes them anew."""
 
 
@@ -94,7 +77,9 @@ def record_of(
     """Take the fields of a header that say more than how pixels are stored."""
     own = {name: value for name, value in header.fields.items() if name not in _STORAGE}
     spacing = " ".join(map(number_text, header.spacing_mm or (1.0, 1.0)))
+    origin = header.fields.get("space origin", "").strip("()").replace(",", " ").split()
     standard = {
+        **({"Offset": " ".join([*origin, "0"])} if {*origin} - {"0"} else {}),
         "NDims": str(len(header.size)),
         "UltrasoundImageOrientation": layout.orientation,
         "UltrasoundImageType": layout.kind,

@@ -99,7 +99,7 @@ def rows_of(sweep: Sweep) -> Rows:
         left_out += _add_orientation(sweep, sweep.orientation, frames, times)
     if sweep.truth is not None:
         left_out.append("the true poses")
-    fields = _standard(sweep) | dict(record.fields) | own_fields(sweep)
+    fields = (dict(record.fields) or _standard(sweep)) | own_fields(sweep)
     return Rows(fields, frames, images, record.conjugated, left_out)
 
 

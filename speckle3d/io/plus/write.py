@@ -210,7 +210,7 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str) -> bytes:
         f"kinds: {'domain domain' if rows.is_plane else 'domain domain list'}",
         "endian: little",
         f"encoding: {encoding}",
-        "space origin: (0,0)",
+        f"space origin: ({','.join(rows.fields.get('Offset', '0 0').split()[:2])})",
         *(
             f"{_NRRD_NAMES.get(name, name)}:={value}"
             for name, value in rows.fields.items()
@@ -228,4 +228,4 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str) -> bytes:
 
 def _encoded(lines: list[str]) -> bytes:
     """Text of a header, as bytes that are read back as the same text."""
-    return "".join(f"{line}\n" for line in lines).encode("latin-1", "backslashreplace")
+    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")

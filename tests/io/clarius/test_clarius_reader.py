@@ -118,7 +118,8 @@ def test_settings_replace_what_the_package_says(tmp_path):
     package = examples.write_package(tmp_path / "p", sweep_of("iq"))
     given = ImportSettings(
         vector_pitch_mm=0.4, bandwidth_hz=(3e6, 7e6), demodulation_frequency_hz=5e6,
-        centre_frequency_hz=5.5e6, speed_of_sound_m_s=1500.0, first_sample_depth_mm=1.25, sampling_rate_hz=14e6,
+        centre_frequency_hz=5.5e6, speed_of_sound_m_s=1500.0, first_sample_depth_mm=1.25,
+        sampling_rate_hz=14e6,
     )  # fmt: skip
     found = load_sweep(package, given)
     assert found.signal == RFSettings(14e6, 1500.0, 5.5e6, (3e6, 7e6), 5e6)
