@@ -15,6 +15,9 @@ from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import one_line, reading
 
 _DEFLATED = "1.2.840.10008.1.2.1.99"
+_LONGEST = 64
+"""Letters of an element that are shown: those of a name of a kind; DICOM allows no more."""
+
 _TAGS = (
     "SOPClassUID", "Modality", "Manufacturer", "ManufacturerModelName", "TransducerData", "TransducerType",
     "ProcessingFunction", "NumberOfFrames", "FrameIncrementPointer", "FrameTime", "FrameTimeVector",
@@ -69,7 +72,8 @@ def text_of(header: Any, name: str) -> str:
     if value is None:
         return ""
     words = value if isinstance(value, list | tuple) or type(value).__name__ == "MultiValue" else [value]
-    return " ".join(printable(str(word)) for word in words).strip()
+    text = " ".join(printable(" ".join(str(word).split())) for word in words).strip()
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def whole_of(path: Path, header: Any, name: str, default: int) -> int:
