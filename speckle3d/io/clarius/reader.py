@@ -93,6 +93,21 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     return rows
 
 
+def sensor_of(path: Path) -> tuple[imu.SensorSamples, imu.Fit | None]:
+    """Read the sensor's samples of a package, and what its quaternion means; None where nothing fits.
+
+    Raises
+    ------
+    InvalidInputError
+        If the package has no sensor, or its samples make no sense.
+    """
+    member = find_recording(path).sensor
+    if member is None:
+        raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
+    samples = imu.read_samples(member)
+    return samples, imu.meaning_of(imu.fits_of(samples))
+
+
 def package_files(path: Path) -> Sequence[Path]:
     """Other files on disk that the sweep's content depends on."""
     return sorted({each.path for each in find_recording(path).members} - {path})
@@ -219,8 +234,7 @@ def _signal(said: Description, values: dict[str, float]) -> RFSettings | BModeSe
 def _orientation(recording: Recording) -> OrientationSensor | None:
     if recording.sensor is None:
         return None
-    samples = imu.read_samples(recording.sensor)
-    fit = imu.meaning_of(imu.fits_of(samples))
+    samples, fit = sensor_of(recording.path)
     return None if fit is None else imu.orientation_sensor(samples, fit)
 
 
@@ -234,6 +248,8 @@ def _curves(recording: Recording, chosen: _Chosen) -> tuple[Curve, ...] | None:
         if name not in recording.gains:
             continue
         curves = read_gains(recording.gains[name])
+        if not curves:
+            continue
         lacking = [int(t) for t in chosen.times_ns if int(t) not in curves]
         if not lacking:
             return tuple(curves[int(t)] or chosen.said.gain for t in chosen.times_ns)

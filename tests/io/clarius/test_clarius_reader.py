@@ -5,38 +5,16 @@ from dataclasses import replace
 import clarius_examples as examples
 import numpy as np
 import pytest
-from sweep_examples import rf_sweep
+from clarius_examples import GIVEN, sweep_of
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.core.sweep import ImageGrid, RFSettings
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import companion_files, load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 
-GIVEN = ImportSettings(probe="Clarius L7 HD3", bandwidth_hz=(4e6, 8e6), dynamic_range_db=60)
-
-
 SECOND = f"{{rx element: {0.3 / examples.ELEMENT_MM!r}"
-
-
-def sweep_of(kind, frames=4, vectors=5, samples=40):
-    made = rf_sweep(frames, vectors, samples)
-    times = examples.bursts_s(9.9, 10.4)
-    sensor = examples.sensor_of(examples.swayed(times), times)
-    # At 11 frames/s and every third frame left out, as RF is interleaved.
-    clock = 10.0 + np.delete(np.arange(3 * frames), slice(None, None, 3))[:frames] / 11
-    made = replace(made, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
-    if kind == "rf":
-        return made
-    rng = np.random.default_rng(1)
-    if kind == "env":
-        data = rng.integers(0, 256, made.frames.shape).astype(np.uint8)
-        return replace(made, frames=data, signal=BModeSettings(60.0))
-    pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
-    signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
-    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm, 2.0)
-    return replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
 
 
 def require_equal(found, expected):
@@ -161,6 +139,31 @@ def test_gain_of_another_kind_serves_all(tmp_path):
     files = {name.replace("_rf.tgc", "_env.tgc.yml"): content for name, content in files.items()}
     package = examples.write_files(tmp_path / "p", files)
     assert load_sweep(package, GIVEN).frames.dtype == np.float32
+
+
+def test_gain_in_lines_of_its_own_as_newer_files_have_it(tmp_path):
+    sweep = sweep_of("rf", frames=2)
+    rows = [
+        f"timestamp: {t}\n" + "".join(f"  - {{ {d:.2f}mm, {g:.2f}dB }}\n" for d, g in curve(last))
+        for t, last in zip(examples.frame_times_ns(sweep), (30.0, 50.0), strict=True)
+    ]
+    text = examples.yml_text(sweep).replace(
+        "tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }",
+        "tgc:\n  - { 0.00mm, 23.00dB }\n  - { 39.70mm, 35.00dB }",
+    )
+    files = examples.package_files(sweep, yml=text) | {f"{examples.NAME}_rf.tgc": "".join(rows).encode()}
+    package = examples.write_files(tmp_path / "p", files)
+    assert load_sweep(package, GIVEN).frames.dtype == np.float32
+    assert dict(row[:2] for row in describe(package))["rf: gain"] == "23 dB at 0 mm, 35 dB at 39.7 mm"
+
+
+@pytest.mark.parametrize("content", [b"", b"# tgc curves per frame\n\nframes: 0\n"])
+def test_an_empty_gain_file_tells_nothing(tmp_path, content):
+    sweep = sweep_of("rf")
+    files = examples.package_files(sweep) | {f"{examples.NAME}_rf.tgc": content}
+    package = examples.write_files(tmp_path / "p", files)
+    require_equal(load_sweep(package, GIVEN), sweep)
+    assert dict(row[:2] for row in describe(package))["gain by frame"] == "not told: taken as the same"
 
 
 def test_gain_of_other_times_is_named(tmp_path):
