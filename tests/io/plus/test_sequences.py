@@ -281,7 +281,9 @@ def test_itk_reads_the_same_pixels(tmp_path, compressed):
         image = SimpleITK.ReadImage(str(tmp_path / name))
         np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
     write_sequence(tmp_path / "a.nrrd", sweep, compressed=compressed)
-    image = SimpleITK.ReadImage(str(tmp_path / "a.nrrd"))  # a list of images is for ITK one of many components
+    image = SimpleITK.ReadImage(
+        str(tmp_path / "a.nrrd")
+    )  # a list of images is for ITK one of many components
     assert image.GetNumberOfComponentsPerPixel() == len(sweep)
 
 
@@ -293,6 +295,13 @@ def test_frames_go_to_other_processes_and_are_opened_again(tmp_path):
     for each in (frames, again):
         np.testing.assert_array_equal(each[1], expected)
     assert again.record == frames.record
+
+
+@pytest.mark.parametrize("kinds", ["list domain domain", "vector domain domain", "domain list domain"])
+def test_frames_on_another_axis_are_not_taken_for_columns(tmp_path, kinds):
+    path = write_mha(tmp_path / "a.mha", grey(), {"Kinds": kinds}, frames=[])
+    with pytest.raises(InvalidInputError, match=rf"a\.mha: kinds: .*{kinds}"):
+        load_sweep(path, BMODE.model_copy(update={"frame_rate_hz": 10.0}))
 
 
 def test_names_of_other_files_are_refused(tmp_path):
