@@ -177,7 +177,7 @@ def convert(
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
     """
-    from speckle3d.cli.recordings import require_sequence
+    from speckle3d.cli.recordings import require_sequence, require_unsaid
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
@@ -196,6 +196,7 @@ def convert(
         require_sequence(source, transform)
         options["tracker_transform"] = transform
     given = from_options(ImportSettings, options)
+    require_unsaid(source, given)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
     sweep = resize(load_sweep(source, given.model_copy(update=fitted)), fitted)
     sweep = mount(sweep, calibration or ())

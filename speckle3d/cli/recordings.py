@@ -146,6 +146,19 @@ def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
         raise InvalidInputError(f"--pixel-mm: expected none with {path}, which has its own")
 
 
+def require_unsaid(path: Path, given: ImportSettings) -> None:
+    """Refuse settings for a recording that says all of them itself.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    names = sorted(given.model_fields_set)
+    if names and kind_of(path) in SIZED:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise InvalidInputError(f"{options}: expected none with {path} ({kind_of(path)}), which has its own")
+
+
 def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
     """Return B-mode images as they are, or log-compressed images made from RF."""
     if isinstance(sweep.signal, BModeSettings):

@@ -94,6 +94,14 @@ def test_places_that_are_taken_are_refused(refused, done, sequence, tmp_path):
     assert (tmp_path / "y.zraw").read_bytes() == b"of another header"
 
 
+def test_a_sweep_file_has_settings_of_its_own(refused, tmp_path):
+    write_sweep(tmp_path / "a.h5", sweep_examples.bmode_sweep())
+    line = refused(
+        "convert", tmp_path / "a.h5", tmp_path / "b.mha", "--row-spacing-mm", "0.2", "--probe", "x"
+    )
+    assert "--probe, --row-spacing-mm: expected none with" in line
+
+
 CONFIG = "PlusDeviceSet_"
 SPINE = f"{CONFIG}SpinePhantomFreehandReconstructionOnly.xml"
 WIRES = f"{CONFIG}fCal_Sim_SpatialCalibration_2.0.xml"
