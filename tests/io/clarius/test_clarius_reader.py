@@ -1,14 +1,17 @@
 """Packages of any sweep, written as the scanner writes them, are read back equal in every field."""
 
+import sys
 from dataclasses import replace
 
 import clarius_examples as examples
 import numpy as np
 import pytest
 from clarius_examples import GIVEN, sweep_of
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import companion_files, load_sweep
@@ -86,10 +89,10 @@ def test_the_type_decides_not_the_name(tmp_path):
 def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
     with pytest.raises(MissingSettingsError) as caught:
         load_sweep(examples.write_package(tmp_path / "rf", sweep_of("rf")))
-    assert caught.value.settings == ("vector_pitch_mm", "bandwidth_hz")
+    assert caught.value.settings == ("probe", "bandwidth_hz")
     with pytest.raises(MissingSettingsError) as caught:
         load_sweep(examples.write_package(tmp_path / "env", sweep_of("env")))
-    assert caught.value.settings == ("vector_pitch_mm", "dynamic_range_db")
+    assert caught.value.settings == ("probe", "dynamic_range_db")
 
 
 def test_settings_replace_what_the_package_says(tmp_path):
@@ -294,6 +297,28 @@ def test_a_package_becomes_a_sweep_file(tmp_path):
     package = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, packed=True), GIVEN)
     write_sweep(tmp_path / "sweep.h5", package)
     require_equal(load_sweep(tmp_path / "sweep.h5"), sweep)
+
+
+@pytest.mark.parametrize("library", ["yaml", "lzallright"])
+def test_a_missing_library_is_told_by_its_extra(tmp_path, library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    sweep = sweep_of("rf", samples=400)
+    sweep.frames[:, :, 20:] = 0  # so that blocks are packed
+    package = examples.write_package(tmp_path / "p", sweep, packed=True)
+    with pytest.raises(InvalidInputError, match=r'pip install "speckle3d\[clarius\]"'):
+        load_sweep(package, GIVEN)
+
+
+def test_a_sweep_without_a_believed_quaternion_has_no_orientation(tmp_path):
+    sweep = sweep_of("rf")
+    count = len(sweep.orientation.readings)
+    wrong = Rotation.random(count, rng=np.random.default_rng(3)).as_quat()
+    text = examples.sensor_text(sweep.orientation, wrong)
+    package = examples.write_package(tmp_path / "p", sweep, imu_text=text)
+    assert load_sweep(package, GIVEN).orientation is None
+    samples, fit = sensor_of(package)
+    assert fit is None
+    assert len(samples) == count
 
 
 @pytest.mark.realdata
