@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.io.clarius.package import Member
+from speckle3d.io.clarius.raw import RawFile, RawFrames, read_header
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
@@ -339,3 +341,16 @@ def test_real_packages(realdata):
     assert envelope.frame_time_s[0] == pytest.approx(272.547324170, abs=1e-9)
     # 592 samples of 0.0513 mm; the depth is counted from the first but for one of its 16 delay samples.
     assert envelope.grid.depth_mm == pytest.approx(0.051 + 591 * 0.051333, abs=0.01)
+
+
+@pytest.mark.realdata
+def test_real_iq_was_shifted_down_by_its_transmit_frequency(realdata):
+    path = realdata / "clarius" / "carotid" / "doppler" / "carotid_iq.raw"
+    raw = RawFile(Member(path, path.name, 0, path.stat().st_size))
+    header = read_header(raw)
+    frame = RawFrames(raw, header, "IQ", slice(None), slice(None))[0]
+    assert frame.shape == (1248, 352)
+    for part in np.split(frame, 4, axis=1):
+        # The mean turn of the phase from sample to sample is the spectrum's centre.
+        turn = np.angle(np.vdot(part[:, :-1], part[:, 1:]))
+        assert abs(turn * 15.0 / (2 * np.pi)) < 0.01  # MHz
