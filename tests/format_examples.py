@@ -184,14 +184,14 @@ def matlab_order(frames):
     return frames.transpose(2, 1, 0)
 
 
-def write_mat(path, new=False, **variables):
+def write_mat(path, new=False, packed=True, **variables):
     """Save variables as MATLAB does, dictionaries as structs, lists as cells; `new` is version 7.3."""
     if new:
         _write_mat_73(path, variables)
         return path
     from scipy.io import savemat
 
-    savemat(path, {name: _old(value) for name, value in variables.items()}, do_compression=True)
+    savemat(path, {name: _old(value) for name, value in variables.items()}, do_compression=packed)
     return path
 
 

@@ -148,17 +148,15 @@ def _recording(path: Path) -> Recording:
 def _require_decoder(path: Path, syntax: Any) -> None:
     from pydicom.pixels.decoders.base import get_decoder
 
-    try:
-        decoder = get_decoder(syntax)
-    except NotImplementedError:
-        raise InvalidInputError(
-            f"{path}: expected pixels that pydicom unpacks, got {printable(str(syntax.name))}"
-        ) from None
+    with reading_dicom(str(path)):
+        name = printable(str(syntax.name))
+        try:
+            decoder = get_decoder(syntax)
+        except NotImplementedError:
+            raise InvalidInputError(f"{path}: expected pixels that pydicom unpacks, got {name}") from None
     if not decoder.is_available:
         needs = ", or ".join(printable(each) for each in decoder.missing_dependencies)
-        raise InvalidInputError(
-            f"{path}: {printable(str(syntax.name))}: expected a package that unpacks it: {needs}"
-        )
+        raise InvalidInputError(f"{path}: {name}: expected a package that unpacks it: {needs}")
 
 
 def _require_grey(path: Path, header: Any, syntax: Any, file_bytes: int) -> int:

@@ -15,6 +15,9 @@ from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import one_line, reading
 
 _DEFLATED = "1.2.840.10008.1.2.1.99"
+_LONGEST = 64
+"""Letters of an element that are shown: those of a name of a kind; DICOM allows no more."""
+
 _TAGS = (
     "SOPClassUID", "Modality", "Manufacturer", "ManufacturerModelName", "TransducerData", "TransducerType",
     "ProcessingFunction", "NumberOfFrames", "FrameIncrementPointer", "FrameTime", "FrameTimeVector",
@@ -52,12 +55,14 @@ def read_header(path: Path, stream: BufferedReader) -> tuple[Any, Any]:
 def reading_dicom(where: str) -> Iterator[None]:
     """Turn what pydicom raises on damaged files into one line, and keep its warnings to itself."""
     import pydicom.config
+    from pydicom.errors import BytesLengthException, InvalidDicomError
 
+    damage = (AttributeError, IndexError, EOFError, AssertionError, struct.error)
     with reading(where), warnings.catch_warnings(), pydicom.config.disable_value_validation():
         warnings.simplefilter("ignore")
         try:
             yield
-        except (AttributeError, IndexError, EOFError, AssertionError, struct.error) as error:
+        except (*damage, BytesLengthException, InvalidDicomError) as error:
             raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
@@ -67,7 +72,8 @@ def text_of(header: Any, name: str) -> str:
     if value is None:
         return ""
     words = value if isinstance(value, list | tuple) or type(value).__name__ == "MultiValue" else [value]
-    return " ".join(printable(str(word)) for word in words).strip()
+    text = " ".join(printable(" ".join(str(word).split())) for word in words).strip()
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def whole_of(path: Path, header: Any, name: str, default: int) -> int:

@@ -115,7 +115,7 @@ def _damage(path: Path) -> Iterator[None]:
     with reading(path):
         try:
             yield
-        except (IndexError, AttributeError, EOFError, SystemError, AssertionError) as error:
+        except (IndexError, AttributeError, EOFError, SystemError, AssertionError, NameError) as error:
             raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
 
 

@@ -142,13 +142,11 @@ class _Source:
     def require_images(self) -> npt.NDArray[np.intp]:
         """Numbers of the frames that are images, or why there are none."""
         header, size = self.header, self.header.size
-        what = " a tracker's recording, for --poses" if header.transforms else ""
-        if 0 in size:
+        if 0 in size or max(size[:2]) == 1:
+            what = ": the recording of a tracker, for --poses" if header.transforms else ""
             raise InvalidInputError(
-                f"{self.path}: expected pixels, got images of size {size[0]} x {size[1]}:{what}"
+                f"{self.path}: expected pixels of images, got images of size {size[0]} x {size[1]}{what}"
             )
-        if max(size[:2]) == 1:
-            raise InvalidInputError(f"{self.path}: expected images, got a single pixel each:{what}")
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
                 f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space"
@@ -222,7 +220,8 @@ class _Source:
                 f"{self.path}: expected an image calibration for pixels of {given} mm, as ElementSpacing "
                 f"says, got one for {got} mm"
             )
-        return calibrated or held or self.device.pixel_mm(self.header.size) or (None, None)
+        shown = None if self.layout.is_rf else self.device.pixel_mm(self.header.size)
+        return calibrated or held or shown or (None, None)
 
     def _calibrated_pixel_mm(self) -> tuple[float, float] | None:
         found = self.image_to_probe()

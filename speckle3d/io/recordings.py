@@ -81,6 +81,7 @@ class Recording:
             raise InvalidInputError(f"{self.path}: expected frames, got shape {self.frames.shape}")
         values = settings.over(self.path, **{n: one.value for n, one in self._needed(settings).items()})
         with naming(str(self.path)):
+            self._require_depths(values)
             signal = self._signal(values)
             pitch = values["vector_pitch_mm" if isinstance(signal, RFSettings) else "column_pitch_mm"]
             spacing = signal.sample_spacing_mm if isinstance(signal, RFSettings) else values["row_spacing_mm"]
@@ -117,6 +118,19 @@ class Recording:
                 f"of samples {self.sample_spacing_mm:.6g} mm apart at {speed:g} m/s",
             )
         return needed
+
+    def _require_depths(self, values: Mapping[str, Any]) -> None:
+        """Refuse a sampling rate that contradicts where the recording says its samples lie."""
+        rate, spacing = values.get("sampling_rate_hz"), self.sample_spacing_mm
+        if rate is None or spacing is None:
+            return
+        speed = values["speed_of_sound_m_s"]
+        implied = 1e3 * speed / (2.0 * spacing)
+        if abs(rate - implied) > SPREAD * implied:
+            raise InvalidInputError(
+                f"sampling_rate_hz: expected {implied:.7g} of samples that lie {spacing:.6g} mm apart at "
+                f"{speed:g} m/s, got {rate:.7g}"
+            )
 
     def _signal(self, values: Mapping[str, Any]) -> RFSettings | BModeSettings:
         if self.frames.dtype == np.uint8:

@@ -22,9 +22,10 @@ import h5py
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
+from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.greys import grey_frames
 from speckle3d.io.hdf5 import (
     find_group,
@@ -39,7 +40,7 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.hdf5_guard import plain_attribute
 from speckle3d.io.hdf5_values import flat, single
-from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.lazy import Complex, HDF5Slices, Layout, Real
 from speckle3d.io.readers import Reader, Row
 from speckle3d.io.recordings import Found, Recording, step_of
@@ -117,20 +118,54 @@ def _recording(path: Path, settings: ImportSettings) -> Recording:
         }
     layout, shape = Layout((x_mm.size, z_mm.size), (0, 1)), (count, x_mm.size, z_mm.size)
     if len(parts) == 2:
-        found["demodulation_frequency_hz"] = Found(modulation_hz, f"in {name}/modulation_frequency")
         frames = HDF5Slices(path, parts, axis, Complex(layout), shape, np.complex64)
-    else:
-        frames = HDF5Slices(path, parts, axis, Real(layout), shape, np.float32)
-        if count and float(frames[count // 2].min()) >= 0.0:
-            given = settings.dynamic_range_db
-            frames, top, span = grey_frames(path, parts, axis, layout, shape, False, given)
-            notes += (("data", "no number below zero: an envelope, made grey levels here", ""),)
-            found |= {
-                "column_pitch_mm": found["vector_pitch_mm"],
-                "row_spacing_mm": Found(spacing, f"in {name}/scan/z_axis"),
-                "dynamic_range_db": Found(span, f"of grey levels made here below {top:g}"),
-            }
+        if settings.demodulation_frequency_hz is None and count:
+            _require_phase(path, frames, found, modulation_hz, spacing, settings)
+        found["demodulation_frequency_hz"] = Found(modulation_hz, f"in {name}/modulation_frequency")
+        return Recording(path, frames, found, sample_spacing_mm=spacing, notes=notes)
+    frames = HDF5Slices(path, parts, axis, Real(layout), shape, np.float32)
+    kind = _kind_of(frames) if count else "RF"
+    if kind != "RF":
+        given = settings.dynamic_range_db
+        frames, top, span = grey_frames(path, parts, axis, layout, shape, kind == "decibels", given)
+        notes += (("data", f"of one sign: {kind}, made grey levels here", ""),)
+        found |= {
+            "column_pitch_mm": found["vector_pitch_mm"],
+            "row_spacing_mm": Found(spacing, f"in {name}/scan/z_axis"),
+            "dynamic_range_db": Found(span, f"of grey levels made here below {top:g}"),
+        }
     return Recording(path, frames, found, sample_spacing_mm=spacing, notes=notes)
+
+
+def _kind_of(frames: HDF5Slices) -> str:
+    """What real numbers are, by their signs: echoes swing to both sides, amplitudes and decibels do not."""
+    frame = frames[len(frames) // 2]
+    if frame.min() < 0 < frame.max():
+        return "RF"
+    return "decibels" if frame.min() < 0 else "an envelope"
+
+
+def _require_phase(
+    path: Path,
+    frames: HDF5Slices,
+    found: dict[str, Found],
+    modulation_hz: float,
+    spacing_mm: float,
+    settings: ImportSettings,
+) -> None:
+    """Refuse a modulation frequency that contradicts how the phase of the data turns."""
+    carried = modulation_hz or found.get("centre_frequency_hz", Found(0.0)).value
+    if not carried:
+        return
+    speed = settings.speed_of_sound_m_s or found.get("speed_of_sound_m_s", Found(SPEED_OF_SOUND_M_S)).value
+    with naming(str(path)):
+        told = demodulation_of(frames, carried, 1e3 * speed / (2.0 * spacing_mm))
+        if told is not None and bool(told) != bool(modulation_hz):
+            says = f"shifted down by {carried:g} Hz" if told else f"still carrying {carried:g} Hz"
+            raise InvalidInputError(
+                f"modulation_frequency: expected that of data {says}, as their phase tells, got "
+                f"{modulation_hz:g}: give --demodulation-frequency-hz, 0 where it is still carried"
+            )
 
 
 def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import calibration_files
 import challenge_examples
+import format_examples
 import image_examples
 import imu_logs
 import numpy as np
@@ -205,6 +206,80 @@ def small_sweep(folder):
     return [folder / "s.h5", folder / "curves.h5"]
 
 
+GIVEN = """vector_pitch_mm = 0.3
+sampling_rate_hz = 15e6
+centre_frequency_hz = 6e6
+demodulation_frequency_hz = 6e6
+bandwidth_hz = [4.5e6, 7e6]
+column_pitch_mm = 0.2
+row_spacing_mm = 0.1
+dynamic_range_db = 60.0
+frame_rate_hz = 20.0
+"""
+
+
+def given(folder, more=""):
+    (folder / "import.toml").write_text(GIVEN + more, encoding="utf-8")
+
+
+def uffs(folder):
+    given(folder)
+    return [
+        format_examples.write_uff(folder / "a.uff", format_examples.iq(), 6e6),
+        format_examples.write_uff(folder / "b.uff", format_examples.rf()),
+        format_examples.write_uff(folder / "c.uff", np.abs(format_examples.iq())),
+    ]
+
+
+def zeas(folder):
+    given(folder)
+    amplitude = np.abs(format_examples.iq())
+    return [
+        format_examples.write_zea(folder / "a.hdf5", format_examples.iq()),
+        format_examples.write_zea(folder / "b.hdf5", format_examples.rf(), home="tracks/a/"),
+        format_examples.write_zea(folder / "c.hdf5", amplitude, "envelope_data"),
+        format_examples.write_zea(folder / "d.hdf5", format_examples.grey(), "image"),
+    ]
+
+
+def mats(new):
+    def write(folder):
+        given(folder, '[arrays]\nrf = "data{1}.rf"\naxes = "sample, vector, frame"\ntime_s = "t / 2"\n')
+        data = format_examples.matlab_order(format_examples.rf())
+        held = {"data": [{"rf": data, "gain": 3.0}], "t": np.arange(4.0), "note": "words"}
+        kinds = [new] if new else [True, False]
+        return [
+            format_examples.write_mat(folder / f"{packed:d}.mat", new, packed=packed, **held)
+            for packed in kinds
+        ]
+
+    return write
+
+
+def dicoms(folder):
+    from pydicom.uid import RLELossless
+
+    given(folder)
+    images = np.random.default_rng(0).integers(0, 256, (3, 20, 16)).astype(np.uint8)
+    colours = np.repeat(images[..., None], 3, axis=3)
+    regions = [format_examples.region(2, 3, 11, 15)]
+    return [
+        format_examples.write_dicom(folder / "a.dcm", images, regions),
+        format_examples.write_dicom(folder / "b.dcm", images, regions, syntax=RLELossless),
+        format_examples.write_dicom(folder / "c.dcm", colours, regions, "RGB", FrameTimeVector=[0, 20, 30]),
+        format_examples.write_dicom(folder / "d.dcm", images, PixelSpacing=[0.1, 0.2]),
+    ]
+
+
+def ultrasonics(folder):
+    given(folder)
+    return [
+        format_examples.write_ultrasonix(folder / "a.rf", format_examples.rf()),
+        format_examples.write_ultrasonix(folder / "b.rf", format_examples.rf(), tags=True),
+        format_examples.write_ultrasonix(folder / "c.b8", format_examples.grey(), 4),
+    ]
+
+
 def read_sweep(path):
     from speckle3d.io.describe import describe
     from speckle3d.io.load import load_sweep
@@ -282,6 +357,12 @@ def kinds():
         "calibration": Kind(calibrations, read_described(read_calibration), hdf5),
         "reconstruction": Kind(reconstructions, read_described(read_reconstruction), hdf5),
         "scan": Kind(scans, read_sweep, hdf5),
+        "uff": Kind(uffs, read_sweep, hdf5),
+        "zea": Kind(zeas, read_sweep, hdf5),
+        "mat": Kind(mats(False), read_sweep, raw),
+        "mat73": Kind(mats(True), read_sweep, hdf5),
+        "dicom": Kind(dicoms, read_sweep, raw),
+        "ultrasonix": Kind(ultrasonics, read_sweep, raw),
         "tum": Kind(trajectories, read_tum, text),
         "toml": Kind(configurations, load_config, text),
         "xml": Kind(texts(".xml", XML), read_wire_phantom, text),

@@ -1,7 +1,7 @@
 import h5py
 import numpy as np
 import pytest
-from format_examples import FIRST_MM, PITCH_MM, SPACING_MM, VECTORS, axes, iq, rf, write_uff
+from format_examples import FIRST_MM, PITCH_MM, SPACING_MM, VECTORS, axes, carrying, iq, rf, write_uff
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
@@ -98,6 +98,38 @@ def test_an_envelope_becomes_grey_levels_and_says_so(tmp_path):
     np.testing.assert_allclose(read, np.maximum(levels, -80), atol=0.16)
     assert sweep.signal.dynamic_range_db == 80
     assert any("envelope" in value for _, value, _ in describe(path))
+
+
+def test_images_in_decibels_become_grey_levels(tmp_path):
+    frames = np.minimum(-np.abs(rf()) / 50.0, -0.5)
+    sweep = load_sweep(
+        write_uff(tmp_path / "a.uff", frames), ImportSettings(frame_rate_hz=9, dynamic_range_db=50)
+    )
+    read = 50 * (np.stack([sweep.frames[i] for i in range(len(frames))]) / 255 - 1)
+    np.testing.assert_allclose(read, np.maximum(frames - frames.max(), -50), atol=0.1)
+
+
+@pytest.mark.parametrize("carried", [0.0, 6e6])
+def test_a_modulation_frequency_that_the_phase_contradicts_is_refused(tmp_path, carried):
+    frames = carrying(carried, sound_speed=1540.0)
+    right, wrong = (0.0, 6e6) if carried else (6e6, 0.0)
+    sweep = load_sweep(write_uff(tmp_path / "a.uff", frames, right), RATE)
+    assert sweep.signal.demodulation_frequency_hz == right
+    path = write_uff(tmp_path / "b.uff", frames, wrong)
+    with pytest.raises(InvalidInputError, match="as their phase tells"):
+        load_sweep(path, RATE)
+    given = RATE.model_copy(update={"demodulation_frequency_hz": right})
+    assert load_sweep(path, given).signal.demodulation_frequency_hz == right
+
+
+def test_a_sampling_rate_that_the_depths_contradict_is_refused(tmp_path):
+    path = write_uff(tmp_path / "a.uff", rf())
+    with pytest.raises(InvalidInputError, match=r"sampling_rate_hz: expected 1.561866e\+07 of samples"):
+        load_sweep(path, RATE.model_copy(update={"sampling_rate_hz": 40e6}))
+    given = RATE.model_copy(
+        update={"sampling_rate_hz": 2 * 1480e3 / (4 * SPACING_MM), "speed_of_sound_m_s": 1480.0}
+    )
+    assert load_sweep(path, given).grid.sample_spacing_mm == pytest.approx(SPACING_MM, rel=SINGLE)
 
 
 def moved(name, change):

@@ -9,7 +9,8 @@ are there, also those whose image is not valid and not in the sweep.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +43,10 @@ _STORAGE = {
     "datafile", "space dimension", "space directions", "space origin",
 }  # fmt: skip
 """Fields that say how pixels are stored; a writer makes them anew."""
+
+
+_FIELD_NAME = re.compile(r"[\w.-](?:[\w. -]*[\w.-])?")
+_FRAME_FIELD_NAME = re.compile(r"\w+")
 
 
 @dataclass(frozen=True)
@@ -143,8 +148,18 @@ def read_record(file: h5py.File) -> SequenceRecord | None:
         for i in range(max(frames, default=0))
     ]
     fields = dict(zip(names, values, strict=True))
+    _require_lines(locate(group, "field_names"), _FIELD_NAME, fields.items())
+    for row in rows:
+        _require_lines(locate(group, "frames"), _FRAME_FIELD_NAME, row.items())
     poses = tuple(read_text(group, "poses").split())
     return SequenceRecord(fields, tuple(rows), poses, bool(read_attribute(group, "conjugated", default=0)))
+
+
+def _require_lines(where: str, pattern: re.Pattern[str], fields: Iterable[tuple[str, str]]) -> None:
+    """Refuse names and values that would be other lines of a header than those of a field."""
+    for name, value in fields:
+        if not pattern.fullmatch(name) or name in _STORAGE or len(f"{value} ".splitlines()) > 1:
+            raise InvalidInputError(f"{where}: expected fields of one line, got {name!r} = {value!r}")
 
 
 def _columns(group: h5py.Group) -> dict[str, list[Any]]:
