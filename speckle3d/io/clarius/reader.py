@@ -183,10 +183,12 @@ def _values(path: Path, chosen: _Chosen, place: Place, settings: ImportSettings)
     element_mm, _ = (None, "") if settings.vector_pitch_mm else element_pitch_mm(said, settings.probe)
     speed = settings.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
     rate_hz = settings.sampling_rate_hz or said.sampling_rate_hz
+    known = settings.vector_pitch_mm is not None or element_mm is not None
     found: dict[str, float | None] = {
         "sampling_rate_hz": rate_hz,
         "speed_of_sound_m_s": speed,
-        "vector_pitch_mm": None if element_mm is None else element_mm * place.elements_per_line,
+        # A probe's model is easier told than the distance between its lines.
+        "vector_pitch_mm" if known else "probe": (element_mm or 0.0) * place.elements_per_line or None,
         "first_sample_depth_mm": place.first_depth_mm(rate_hz, speed),
     }
     if said.kind == "envelope":
