@@ -192,9 +192,9 @@ def convert(
     require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    if transform is not None:
-        require_sequence(source, transform)
-        options["tracker_transform"] = transform
+    options["tracker_transform"] = transform
+    for name in ("transform", "reference_transform", "plus_config"):
+        require_sequence(source, options[name], f"--{name.replace('_', '-')}")
     given = from_options(ImportSettings, options)
     require_unsaid(source, given)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
