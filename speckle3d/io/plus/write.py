@@ -17,8 +17,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike
+from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
@@ -89,10 +90,15 @@ def write_sequence(
         beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
         _require_own(target, target.with_name(beside))
         with FileSet(target.name, (beside,)).replaced(target.parent) as part:
-            with (part / beside).open("wb") as file:
-                size = images.write(file, 15 if compressed else None)
-            with (part / target.name).open("wb") as file:
-                file.write(_meta_header(images, rows, beside, size if compressed else None))
+            try:
+                with (part / beside).open("wb") as file:
+                    size = images.write(file, 15 if compressed else None)
+                header = _meta_header(images, rows, beside, size if compressed else None)
+                (part / target.name).write_bytes(header)
+            except Speckle3DError:
+                raise
+            except OSError as error:
+                raise cannot_write(path, error) from error
         return rows.left_out
     with atomic_path(target) as part, part.open("wb") as file:
         if suffix == ".nrrd":
