@@ -89,7 +89,8 @@ def write_sequence(
     if suffix == ".mhd":
         beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
         _require_own(target, target.with_name(beside))
-        with FileSet(target.name, (beside,)).replaced(target.parent) as part:
+        files = FileSet(target.name, (beside,), _left_by(target, beside))
+        with files.replaced(target.parent) as part:
             try:
                 with (part / beside).open("wb") as file:
                     size = images.write(file, 15 if compressed else None)
@@ -121,6 +122,14 @@ def _require_own(header: Path, data: Path) -> None:
         return
     if not header.exists() or read_header(header).pixels.path != data.resolve():
         raise InvalidInputError(f"{data}: is there and no part of {header.name}: give another name")
+
+
+def _left_by(header: Path, beside: str) -> tuple[str, ...]:
+    """Name of the pixels that a header leaves behind which is replaced by one with other pixels."""
+    if not header.exists():
+        return ()
+    names = {f"{header.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
+    return tuple(names & {read_header(header).pixels.path.name})
 
 
 _SIZE_FIELD = b"CompressedDataSize = "
