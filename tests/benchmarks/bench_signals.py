@@ -1,10 +1,10 @@
 """Lengths of a sweep as RF, as I/Q and as 8-bit B-mode images, each with its own curves, through the command.
 
-Run: ``python tests/benchmarks/bench_signals.py [--seeds 6] [--first-seed 1] [--workers 2]``. Simulated sweeps of
-12 mm, over a phantom and over tissue, are stored in each of the ways that scanners store them. I/Q are pairs of
-16 bits, demodulated at the band's centre and off it, and use the curves of RF. Images are log-compressed, full
-white 20 dB over the mean of speckle; their curves are of a phantom seen by the same scanner. Sweeps are
-simulated once (half an hour on two cores) and kept.
+Run: ``python tests/benchmarks/bench_signals.py [--seeds 6] [--first-seed 1] [--workers 2]``. Simulated sweeps
+of 12 mm, over a phantom and over tissue, are stored in each way that scanners do. I/Q are pairs of 16
+bits, demodulated at the band's centre and off it; they use the curves of RF. Images are log-compressed;
+full white is 20 dB over the mean of speckle; their curves are of a phantom seen by the same scanner. Sweeps
+are simulated once (half an hour on two cores) and kept.
 """
 
 import argparse

@@ -73,7 +73,7 @@ class SequenceRecord:
     @property
     def has_image(self) -> BoolArray:
         """Which frames have a valid image, shape (n,)."""
-        return valid_frames(self.frames, "ImageStatus", "Status")
+        return valid_images(self.frames)
 
 
 def record_of(
@@ -92,6 +92,11 @@ def record_of(
         "ElementSpacing": f"{spacing} 1" if len(header.size) == 3 else spacing,
     }
     return SequenceRecord(standard | own, header.frames, poses, conjugated)
+
+
+def valid_images(frames: Sequence[Mapping[str, str]]) -> BoolArray:
+    """Which frames have a valid image, shape (n,); older files of PLUS say so in Status alone."""
+    return valid_frames(frames, "ImageStatus", "Status")
 
 
 def valid_frames(frames: Sequence[Mapping[str, str]], *names: str) -> BoolArray:

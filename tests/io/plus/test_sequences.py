@@ -270,6 +270,23 @@ def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     assert len(load_sweep(path, BMODE.model_copy(update={"frame_rate_hz": 10.0}))) == 3
 
 
+@pytest.mark.parametrize("compressed", [True, False])
+def test_itk_reads_the_same_pixels(tmp_path, compressed):
+    import SimpleITK
+
+    sweep = sweep_examples.rf_sweep()
+    expected = np.stack([sweep.frames[i] for i in range(len(sweep))])
+    for name in ("a.mha", "a.mhd"):
+        write_sequence(tmp_path / name, sweep, compressed=compressed)
+        image = SimpleITK.ReadImage(str(tmp_path / name))
+        np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
+    write_sequence(tmp_path / "a.nrrd", sweep, compressed=compressed)
+    image = SimpleITK.ReadImage(
+        str(tmp_path / "a.nrrd")
+    )  # a list of images is for ITK one of many components
+    assert image.GetNumberOfComponentsPerPixel() == len(sweep)
+
+
 def test_frames_go_to_other_processes_and_are_opened_again(tmp_path):
     frames = load_sweep(write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2]), BMODE).frames
     expected = frames[1]
