@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import ComplexArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, OrientationSensor, RFSettings, Sweep
 from speckle3d.io.clarius import imu
+from speckle3d.io.clarius.demodulation import middle_hz, turns_to
 from speckle3d.io.clarius.lines import Place, element_pitch_mm, place_of, require_roi
 from speckle3d.io.clarius.package import Recording, find_recording
 from speckle3d.io.clarius.raw import SAMPLES, RawFile, RawFrames, RawHeader, read_header, read_times_ns
 from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
-from speckle3d.io.clarius.spectrum import measured_band_hz
+from speckle3d.io.clarius.spectrum import measured_band_hz, measured_centres_hz
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 
 FORMAT = "Clarius raw package"
@@ -62,8 +63,9 @@ def read_package(path: Path, settings: ImportSettings) -> Sweep:
     spacing_mm = 1e3 * values["speed_of_sound_m_s"] / (2.0 * values["sampling_rate_hz"])
     _, vectors, samples = _frames(chosen, place).shape
     grid = ImageGrid(vectors, samples, values["vector_pitch_mm"], spacing_mm, values["first_sample_depth_mm"])
-    gains = None if said.kind == "envelope" else _gain_ratios(recording, chosen, grid)
-    frames = _frames(chosen, place, gains)
+    gains = None if said.kind == "envelope" else _gain_factors(recording, chosen, grid)
+    turns = _turns(chosen, place, values, settings)
+    frames = _frames(chosen, place, turns if gains is None else gains if turns is None else gains * turns)
     with naming(said.where):
         signal = _signal(said, values)
     return Sweep(
@@ -156,8 +158,8 @@ def is_padded(chosen: Chosen) -> bool:
     return True
 
 
-def _frames(chosen: Chosen, place: Place, gains: FloatArray | None = None) -> RawFrames:
-    return RawFrames(chosen.raw, chosen.header, chosen.said.kind, place.lines, place.samples, gains)
+def _frames(chosen: Chosen, place: Place, factors: npt.NDArray[Any] | None = None) -> RawFrames:
+    return RawFrames(chosen.raw, chosen.header, chosen.said.kind, place.lines, place.samples, factors)
 
 
 def values_of(path: Path, chosen: Chosen, place: Place, settings: ImportSettings) -> dict[str, float]:
@@ -178,29 +180,53 @@ def values_of(path: Path, chosen: Chosen, place: Place, settings: ImportSettings
         return settings.over(path, **found, dynamic_range_db=None)
     centre_hz = settings.centre_frequency_hz or said.transmit_frequency_hz
     found["centre_frequency_hz"] = centre_hz
-    shifted_hz = None
+    shifted_hz = settings.demodulation_frequency_hz
     if said.kind == "IQ":
-        first_mm = place.first_depth_mm(rate_hz, speed)
-        own_hz = _shifted_by_hz(chosen, place, first_mm, speed / (2e-3 * rate_hz))
-        given_hz = settings.demodulation_frequency_hz
-        shifted_hz = (own_hz or centre_hz) if given_hz is None else given_hz
+        if shifted_hz is None and said.receive is not None:
+            shifted_hz = middle_hz(said.receive, _depths_mm(chosen, place, rate_hz, speed))
         found["demodulation_frequency_hz"] = shifted_hz
     band = None
-    if settings.bandwidth_hz is None and centre_hz is not None:
-        band = measured_band_hz(cast(Frames, _frames(chosen, place)), rate_hz, centre_hz, shifted_hz)
+    if settings.bandwidth_hz is None and centre_hz and (said.kind == "RF" or shifted_hz):
+        known_values = {name: value for name, value in found.items() if value is not None}
+        frames = _frames(chosen, place, _turns(chosen, place, known_values, settings))
+        about_hz = None if said.kind == "RF" else shifted_hz
+        band = measured_band_hz(cast(Frames, frames), rate_hz, centre_hz, about_hz)
     return settings.over(path, **found, bandwidth_hz=band)
 
 
-def _shifted_by_hz(chosen: Chosen, place: Place, first_mm: float, spacing_mm: float) -> float | None:
-    """Demodulation frequency in the middle of a line; None where the yml does not say.
+def centres_of(
+    path: Path, chosen: Chosen, place: Place, settings: ImportSettings
+) -> tuple[float, float] | None:
+    """Centre of the echoes' spectrum near the probe and far from it, Hz; None where it is not clear.
 
-    Where it changes with depth, as 11 to 8 MHz, phases of different depths are not comparable.
+    Raises
+    ------
+    MissingSettingsError
+        If a number of the sweep is neither said nor given.
     """
+    values = values_of(path, chosen, place, settings)
+    frames = cast(Frames, _frames(chosen, place, _turns(chosen, place, values, settings)))
+    shifted_hz = values.get("demodulation_frequency_hz")
+    return measured_centres_hz(frames, values["sampling_rate_hz"], values["centre_frequency_hz"], shifted_hz)
+
+
+def _depths_mm(chosen: Chosen, place: Place, rate_hz: float, speed_m_s: float) -> FloatArray:
+    """Depth of each kept sample as the scanner counts it."""
+    samples = np.arange(len(range(chosen.header.samples)[place.samples]))
+    return np.asarray(place.first_depth_mm(rate_hz, speed_m_s) + samples * speed_m_s / (2e-3 * rate_hz))
+
+
+def _turns(
+    chosen: Chosen, place: Place, values: Mapping[str, float], settings: ImportSettings
+) -> ComplexArray | None:
+    """Factors that make I/Q as if shifted down by one frequency, shape (1, sample); None where they are."""
     receive = chosen.said.receive
-    if receive is None:
+    if chosen.said.kind != "IQ" or receive is None or settings.demodulation_frequency_hz is not None:
         return None
-    samples = len(range(chosen.header.samples)[place.samples])
-    return receive.at_hz(first_mm + spacing_mm * (samples - 1) / 2)
+    rate_hz, speed_m_s = values["sampling_rate_hz"], values["speed_of_sound_m_s"]
+    depths_mm = _depths_mm(chosen, place, rate_hz, speed_m_s)
+    turns = turns_to(values["demodulation_frequency_hz"], receive, depths_mm, rate_hz)
+    return None if turns is None else turns[None]
 
 
 def _signal(said: Description, values: dict[str, float]) -> RFSettings | BModeSettings:
@@ -247,8 +273,8 @@ def curves_of(recording: Recording, chosen: Chosen) -> tuple[Curve, ...] | None:
     return None
 
 
-def _gain_ratios(recording: Recording, chosen: Chosen, grid: ImageGrid) -> FloatArray | None:
-    """Amplitude gain relative to the first frame's, shape (frame, sample); None where it is the same."""
+def _gain_factors(recording: Recording, chosen: Chosen, grid: ImageGrid) -> FloatArray | None:
+    """The first frame's gain over each one's, shape (frame, sample); None where it is the same."""
     curves = curves_of(recording, chosen)
     if curves is None or len(set(curves)) == 1:
         return None
@@ -260,4 +286,4 @@ def _gain_ratios(recording: Recording, chosen: Chosen, grid: ImageGrid) -> Float
     depth_mm = grid.first_sample_depth_mm + grid.sample_spacing_mm * np.arange(grid.samples)
     gain_db = np.array([np.interp(depth_mm, *np.array(curve).T) for curve in curves])
     apart_db = gain_db - gain_db[0]
-    return None if np.abs(apart_db).max() < _SAME_GAIN_DB else 10.0 ** (apart_db / 20.0)
+    return None if np.abs(apart_db).max() < _SAME_GAIN_DB else 10.0 ** (-apart_db / 20.0)
