@@ -73,7 +73,8 @@ def require_pair(first: Sweep, second: Sweep) -> None:
         if one != other:
             advice = BAND_ADVICE if what == "signal" else ""
             raise MismatchError(
-                f"{second.name}: expected the {what} of {first.name} in its crossing: {one}; got {other}{advice}"
+                f"{second.name}: expected the {what} of {first.name} in its crossing: {one}; got "
+                f"{other}{advice}"
             )
     if first.name == second.name and np.isin(second.frame_time_s, first.frame_time_s).any():
         raise InvalidInputError(
