@@ -27,7 +27,8 @@ from speckle3d.io.readers import Row
 
 _MOST_RISE, _MOST_ABOVE = 1.05, 1.15
 """Of the echoes' centre: far from the probe over near, and near over what was sent. On a simulated phantom
-0.91 and 0.79; with the other sign of Q 1.05 and 1.22, with another law of a falling frequency 1.16 and 0.87."""
+0.91 and 0.79; with the other sign of Q 1.05 and 1.22; with another phase of a falling oscillator 1.16 and
+0.87."""
 
 
 def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
