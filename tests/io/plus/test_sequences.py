@@ -281,7 +281,9 @@ def test_itk_reads_the_same_pixels(tmp_path, compressed):
         image = SimpleITK.ReadImage(str(tmp_path / name))
         np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
     write_sequence(tmp_path / "a.nrrd", sweep, compressed=compressed)
-    image = SimpleITK.ReadImage(str(tmp_path / "a.nrrd"))  # a list of images is for ITK one of many components
+    image = SimpleITK.ReadImage(
+        str(tmp_path / "a.nrrd")
+    )  # a list of images is for ITK one of many components
     assert image.GetNumberOfComponentsPerPixel() == len(sweep)
 
 
