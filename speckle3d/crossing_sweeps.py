@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from speckle3d.config import Config
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import BAND_ADVICE, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
@@ -71,8 +71,10 @@ def require_pair(first: Sweep, second: Sweep) -> None:
     """
     for what, one, other in (("images", first.grid, second.grid), ("signal", first.signal, second.signal)):
         if one != other:
+            advice = BAND_ADVICE if what == "signal" else ""
             raise MismatchError(
-                f"{second.name}: expected the {what} of {first.name} in its crossing: {one}; got {other}"
+                f"{second.name}: expected the {what} of {first.name} in its crossing: {one}; got "
+                f"{other}{advice}"
             )
     if first.name == second.name and np.isin(second.frame_time_s, first.frame_time_s).any():
         raise InvalidInputError(

@@ -8,20 +8,45 @@ import io
 import struct
 import tarfile
 import zlib
+from dataclasses import replace
 
 import lzallright
 import numpy as np
 from scipy.spatial.transform import Rotation
+from sweep_examples import rf_sweep
 
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.sweep import BModeSettings, OrientationSensor
+from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings
+from speckle3d.io.import_settings import ImportSettings
 
 NAME = "2024-05-01T10-00-00+0000"
 ELEMENT_MM = 0.2
 """Of an L7 HD3."""
 
+GIVEN = ImportSettings(probe="Clarius L7 HD3", bandwidth_hz=(4e6, 8e6), dynamic_range_db=60)
+
 BLOCK_BYTES = 256 * 1024
 G = 9.80665
+
+
+def sweep_of(kind, frames=4, vectors=5, samples=40):
+    """A sweep of noise, its sensor in bursts: "rf", "iq" or "env"; `GIVEN` is what its package lacks."""
+    made = rf_sweep(frames, vectors, samples)
+    times = bursts_s(9.9, 10.4)
+    sensor = sensor_of(swayed(times), times)
+    # At 11 frames/s and every third frame left out, as RF is interleaved.
+    clock = 10.0 + np.delete(np.arange(3 * frames), slice(None, None, 3))[:frames] / 11
+    made = replace(made, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
+    if kind == "rf":
+        return made
+    rng = np.random.default_rng(1)
+    if kind == "env":
+        data = rng.integers(0, 256, made.frames.shape).astype(np.uint8)
+        return replace(made, frames=data, signal=BModeSettings(60.0))
+    pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
+    signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
+    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm, 2.0)
+    return replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
 
 
 def write_package(target, sweep, *, packed=False, sensor=True, name=NAME, others=(), **fields):

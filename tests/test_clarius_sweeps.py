@@ -68,7 +68,7 @@ def test_a_package_reconstructs_as_the_sweep_it_was_made_from(tmp_path, sweep, c
     # The same samples: the same path, to the rounding of the grid's numbers.
     np.testing.assert_allclose(by_package.as_matrix(), by_sweep.as_matrix(), atol=1e-6)
     for mode in ("image", "orientation"):
-        # Other samples of the sensor, and none in a pause: its noise over some 20 samples a degree of freedom.
+        # Other samples of the sensor, and none in a pause: its noise over some 20 of them.
         got, wanted = errors[mode], expected[mode]
         assert got.length_error_percent == pytest.approx(wanted.length_error_percent, abs=0.3)
         assert got.tilt_error_deg == pytest.approx(wanted.tilt_error_deg, abs=0.1)

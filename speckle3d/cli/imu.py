@@ -198,6 +198,9 @@ def read(path: Path, rate_hz: float | None) -> ImuLog:
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
+    inside = _inside_probe(path)
+    if inside is not None:
+        return inside
     held = _ridden_along(path)
     if held is not None:
         return log_of(held, path.name)
@@ -210,12 +213,37 @@ def _ridden_along(path: Path) -> OrientationSensor | None:
     from speckle3d.io.load import load_sweep
     from speckle3d.io.readers import find_reader
 
-    if find_reader(path) is None:
+    if find_reader(path) is None or _inside_probe(path) is not None:
         return None
     sensor = load_sweep(path).orientation
     if sensor is None:
         raise InsufficientDataError(f"{path}: expected an orientation sensor's stream in the sweep, got none")
     return sensor
+
+
+def _inside_probe(path: Path) -> ImuLog | None:
+    """Log of the sensor inside a handheld scanner, whatever its images are; None of other recordings."""
+    from speckle3d.io.clarius import READER
+    from speckle3d.io.clarius.reader import sensor_of
+    from speckle3d.io.readers import find_reader
+    from xsens.logs.clocks import timeline_of_times
+    from xsens.logs.samples import ImuLog
+
+    if find_reader(path) is not READER:
+        return None
+    samples, fit = sensor_of(path)
+    clock = timeline_of_times(samples.time_s)
+    found = "is not used: it fits none of its other readings" if fit is None else f"is {fit.meaning}"
+    return ImuLog(
+        clock.time_s,
+        samples.accelerometer_m_s2(fit),
+        samples.gyroscope_rad_s,
+        samples.magnetometer_gauss,
+        world_from_sensor=None if fit is None else fit.world_from_sensor,
+        gaps=clock.gaps,
+        notes=(*clock.notes, f"the sensor's quaternion {found}"),
+        source=path.name,
+    )
 
 
 def log_of(sensor: OrientationSensor, source: str) -> ImuLog:

@@ -30,6 +30,10 @@ PROBE_SIGMA = 0.08
 focus within 10 %, apertures are as high within 5 %, either way: 8 to 13 and 5 % of length at those bounds on
 simulated sweeps, taken as evenly spread between them (over the root of 3), and `TISSUE_SIGMA`."""
 
+BAND_ADVICE = (
+    " (where a recording does not say its band, it is measured, and never twice the same: give bandwidth_hz)"
+)
+
 
 @dataclass(frozen=True)
 class CurveKey:
@@ -67,7 +71,8 @@ class CurveKey:
             theirs = others[name]
             exact = isinstance(mine, str)
             if not (mine == theirs if exact else np.allclose(mine, theirs, rtol=1e-3, atol=1e-9)):
-                raise MismatchError(f"{what}: {name} is {mine} and {theirs}")
+                advice = BAND_ADVICE if name == "bandwidth_hz" else ""
+                raise MismatchError(f"{what}: {name} is {mine} and {theirs}{advice}")
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,8 @@ class ImportSettings(BaseModel):
     )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames per second, on the scanner's screen")
     probe: str | None = Field(
-        None, description="model of the probe, printed on it: gives the pitch of its elements"
+        None,
+        description="model of the probe, printed on it, for its element pitch; or --vector-pitch-mm",
     )
     tracker_transform: str | None = Field(
         None,

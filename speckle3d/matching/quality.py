@@ -175,7 +175,11 @@ class FrameInspector:
         samples = np.ascontiguousarray(frame)
         if np.iscomplexobj(samples):
             samples = samples.view(samples.real.dtype)
-        floor, clipped = self._rails(samples)
+        # Every eighth vector tells how strong the samples as read are, and whether they are counts: so are I/Q
+        # that come from pairs of integers.
+        some = samples[::8]
+        counted = samples.dtype.kind in "iu" or bool((some == np.rint(some)).all())
+        floor, clipped = self._rails(samples, counted)
         with np.errstate(all="ignore"):  # Flat patches, and samples that are not finite, come out as NaN.
             tiles = self._tiles(intensity)
             mean: Float32Array = tiles.mean(axis=(1, 3))
@@ -184,8 +188,7 @@ class FrameInspector:
             speckle &= np.isfinite(intensity.sum())
             near = intensity[:, : self._first[1]]
             top = (self._first[1] + self._size[1]) * samples.shape[1] // intensity.shape[1]
-            # Every eighth vector tells how strong the samples as read are.
-            below = samples[::8, top:].astype(np.float32)
+            below = some[:, top:].astype(np.float32)
             return FrameFeatures(
                 identical=self._repeats(samples),
                 clipped=clipped,
@@ -202,15 +205,15 @@ class FrameInspector:
         self._last_digest, before = digest, self._last_digest
         return digest == before
 
-    def _rails(self, samples: npt.NDArray[Any]) -> tuple[float, float]:
+    def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
         """Intensity below which there is no echo, and clipping over its limit."""
         low, high = float(samples.min()), float(samples.max())
-        clipped = _at_rail(samples, high, -1)
+        clipped = _at_rail(samples, high, -1, counted)
         if self._bmode:
             # Black is no echo: it is neither clipped nor counted.
             return 0.0, clipped / max(int(np.count_nonzero(samples)), 1) / self.settings.clipped_bmode
-        clipped += _at_rail(samples, low, 1)
-        least = _LEAST_COUNTS if np.issubdtype(samples.dtype, np.integer) else 0.0
+        clipped += _at_rail(samples, low, 1, counted)
+        least = _LEAST_COUNTS if counted else 0.0
         floor = max(least, _LEAST_RATIO * max(abs(low), abs(high)) ** 2)
         return floor, clipped / samples.size / self.settings.clipped_rf
 
@@ -316,7 +319,7 @@ def _darkened(
     return np.asarray((darker > drop_db) & (beyond_near > drop_db) & (~few | (fainter > drop_db)))
 
 
-def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int) -> int:
+def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool) -> int:
     """Samples at an extreme of the frame, less those one count inside it.
 
     Clipping piles samples up at the rail; without it there are fewer at the extreme than next to it, however
@@ -326,7 +329,7 @@ def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int) -> int:
     if at in (1, samples.size):
         return 0
     beside: int = 0
-    if np.issubdtype(samples.dtype, np.integer):
+    if counted:
         beside = int(np.count_nonzero(samples == samples.dtype.type(rail + inwards)))
     return max(int(at) - beside, 0)
 

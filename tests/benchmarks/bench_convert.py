@@ -1,7 +1,7 @@
 """Speed of writing sweep files, beside a plain loop over h5py's gzip of the same frames in the same process.
 
 Run: ``python tests/benchmarks/bench_convert.py [--gigabytes 1]``. Frames are those of ``data/phantom.h5``
-over and over, as int16 RF and as I/Q; the source is a file without compression, read as fast as the disk gives.
+over and over, as int16 RF and as I/Q; the source has no compression and is read as fast as the disk gives.
 Every write ends with the file on the disk (fsync). The peak is resident memory of ``speckle3d convert``.
 """
 

@@ -306,7 +306,12 @@ def read_image(path):
     from speckle3d.io.metaimage import read_metaimage, read_poses
 
     settings = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
-    read_metaimage(path, settings)
+    frames = read_metaimage(path, settings).frames
+    try:
+        for i in range(frames.shape[0]):
+            frames[i]
+    finally:
+        frames.close()
     read_poses(path)
 
 

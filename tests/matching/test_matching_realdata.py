@@ -19,7 +19,11 @@ pytestmark = pytest.mark.realdata
 MOUSE = ImportSettings(centre_frequency_hz=20e6, bandwidth_hz=(12e6, 28e6), frame_rate_hz=10.0)
 MOUSE_ALSO = ImportSettings(centre_frequency_hz=18e6, bandwidth_hz=(14e6, 22e6), frame_rate_hz=10.0)
 ULTRASONIX = ImportSettings(
-    sampling_rate_hz=40e6, vector_pitch_mm=0.3, centre_frequency_hz=5e6, bandwidth_hz=(3e6, 7e6)
+    sampling_rate_hz=40e6,
+    vector_pitch_mm=0.3,
+    centre_frequency_hz=5e6,
+    bandwidth_hz=(3e6, 7e6),
+    demodulation_frequency_hz=0.0,
 )
 RECORDINGS = {
     "mouse": ("rf/MouseLiverRF.mha", MOUSE),

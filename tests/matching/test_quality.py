@@ -244,6 +244,17 @@ def test_few_counts_are_not_clipping(phantom):
     assert [f.clipped for f in faint] == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("kind", ["float32", "complex64"])
+def test_few_counts_of_other_types_are_not_clipping(phantom, kind):
+    """I/Q of 16 bits are read as complex64, and their counts may be as few."""
+    frames, signal, grid = phantom
+    few = [counts(0.01 * frame) for frame in frames]
+    if kind == "complex64":
+        few = [hilbert(frame.astype(float)).round() for frame in few]
+        signal = replace(signal, demodulation_frequency_hz=0.0)
+    assert not any(flags_of([frame.astype(kind) for frame in few], signal, grid))
+
+
 @pytest.mark.parametrize("kind", ["float32", "analytic", "double precision"])
 def test_samples_of_other_types_are_judged_alike(tissue, kind):
     frames, signal, grid = tissue
@@ -416,7 +427,11 @@ def test_flags_are_told_a_line_each():
 
 MOUSE = ImportSettings(centre_frequency_hz=20e6, bandwidth_hz=(12e6, 28e6), frame_rate_hz=10.0)
 ULTRASONIX = ImportSettings(
-    sampling_rate_hz=40e6, vector_pitch_mm=0.3, centre_frequency_hz=5e6, bandwidth_hz=(3e6, 7e6)
+    sampling_rate_hz=40e6,
+    vector_pitch_mm=0.3,
+    centre_frequency_hz=5e6,
+    bandwidth_hz=(3e6, 7e6),
+    demodulation_frequency_hz=0.0,
 )
 PLUS = ImportSettings(
     column_pitch_mm=0.085, row_spacing_mm=0.085, dynamic_range_db=60.0, tracker_transform="none"

@@ -11,7 +11,7 @@ from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.texture import doubt_band, speckle_size
+from speckle3d.matching.texture import doubt_band, doubt_sign, speckle_size
 
 GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
 """Fine enough to hold intensities as they are."""
@@ -93,6 +93,49 @@ def test_echoes_below_the_band_are_doubted_but_used():
     # Fundamental echoes beside a band at their harmonic.
     (doubt,) = doubt_band(echoes(2e6, 3.5e6, band=(6e6, 8e6)))
     assert not doubt.refuted
+
+
+def attenuated(sign=1, middle_hz=6e6, rate_hz=8e6, noise=0.0):
+    """I/Q, demodulated at `middle_hz`, of echoes whose frequency falls from 6.2 to 5.2 MHz; `sign` of Q."""
+    rng = np.random.default_rng(4)
+    white = rng.normal(size=(3, 32, 1024)) + 1j * rng.normal(size=(3, 32, 1024))
+    spread = np.fft.fft(white) * np.exp(-((np.fft.fftfreq(1024, 1 / rate_hz) / 1e6) ** 2))
+    depth = np.linspace(0, 1, 1024)
+    turning = np.exp(2j * np.pi * np.cumsum(6.2e6 - 1e6 * depth - middle_hz) / rate_hz)
+    frames = np.fft.ifft(spread) * turning
+    frames += noise * frames.std() * (rng.normal(size=frames.shape) + 1j * rng.normal(size=frames.shape))
+    signal = RFSettings(rate_hz, 1540.0, 6e6, (4e6, 8e6), middle_hz)
+    grid = replace(speckle.GRID, vectors=32, samples=1024, sample_spacing_mm=signal.sample_spacing_mm)
+    data = (frames.real + sign * 1j * frames.imag).astype(np.complex64)
+    return Sweep(data, grid, signal, np.arange(3) / 25)
+
+
+@pytest.mark.parametrize("middle_hz", [5.7e6, 6e6, 7e6])
+def test_the_other_sign_of_q_is_doubted(middle_hz):
+    assert doubt_sign(attenuated(1, middle_hz)) == ()
+    (doubt,) = doubt_sign(attenuated(-1, middle_hz))
+    assert (doubt.suspect, doubt.refuted) == ("sign of Q", False)
+    assert "frequency falls with depth" in doubt.evidence
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_noise_tells_nothing_of_the_sign(sign):
+    assert doubt_sign(attenuated(sign, noise=30.0)) == ()
+    assert doubt_sign(echoes(4e6, 8e6)) == ()
+
+
+@pytest.mark.parametrize(("low", "high"), [(4e6, 8e6), (5e6, 6e6)])
+def test_i_and_q_in_the_band_are_believed_and_above_it_refuted(low, high):
+    """The bins of I/Q stand for frequencies about that of the demodulation."""
+    analytic = echoes(low, high, complex_too=True)
+    turns = np.exp(-2j * np.pi * 6e6 * np.arange(SAMPLES) / RATE)
+    lowered = [analytic.frames[k] * turns for k in range(3)]
+    baseband = replace(analytic.signal, demodulation_frequency_hz=6e6)
+    sweep = replace(analytic, frames=np.asarray(lowered, np.complex64), signal=baseband)
+    assert doubt_band(sweep) == ()
+    wrong = replace(sweep, signal=replace(baseband, demodulation_frequency_hz=12e6))
+    (doubt,) = doubt_band(wrong)
+    assert doubt.refuted
 
 
 def test_noise_and_grey_levels_tell_nothing_of_the_band(seen):

@@ -99,6 +99,13 @@ class SensorSamples:
     def __len__(self) -> int:
         return int(self.time_s.size)
 
+    def accelerometer_m_s2(self, fit: Fit | None) -> FloatArray:
+        """Specific force, shape (m, 3): what is measured, or against it, as the quaternion's z tells.
+
+        Against it where no quaternion fits, as in both public recordings.
+        """
+        return (-1.0 if fit is None else fit.vertical) * G_M_S2 * self.accelerometer_g
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -207,12 +214,11 @@ def meaning_of(fits: tuple[Fit, ...]) -> Fit | None:
 
 def orientation_sensor(samples: SensorSamples, fit: Fit) -> OrientationSensor:
     """Make the orientation stream of a sweep; its world is z up, its accelerometer specific force."""
-    field = samples.magnetometer_gauss
     return OrientationSensor(
         TimedRotations(samples.time_s, fit.world_from_sensor),
-        accelerometer_m_s2=fit.vertical * G_M_S2 * samples.accelerometer_g,
+        accelerometer_m_s2=samples.accelerometer_m_s2(fit),
         gyroscope_rad_s=samples.gyroscope_rad_s,
-        magnetometer_au=field,
+        magnetometer_au=samples.magnetometer_gauss,
     )
 
 

@@ -28,6 +28,8 @@ from speckle3d.io.hdf5 import reading
 
 HEADER = struct.Struct("<5I")
 _TIME_BYTES = 8
+_MOST_FRAMES = 2**20
+"""Ten hours at 30 frames/s; the scanner's memory holds seconds."""
 
 SAMPLES: dict[str, tuple[np.dtype[Any], int, np.dtype[Any]]] = {
     "RF": (np.dtype("<i2"), 1, np.dtype(np.int16)),
@@ -110,10 +112,10 @@ def read_header(raw: RawFile) -> RawHeader:
         raise FileError(f"{where}: expected a header of {HEADER.size} bytes, got {raw.size}")
     _, frames, lines, samples, sample_bytes = HEADER.unpack(raw.read(0, HEADER.size))
     header = RawHeader(frames, lines, samples, sample_bytes)
-    if 0 in (frames, lines, samples, sample_bytes):
+    if 0 in (frames, lines, samples, sample_bytes) or frames > _MOST_FRAMES:
         raise InvalidInputError(
-            f"{where}: expected frames, lines and samples, got {frames} x {lines} x {samples} of "
-            f"{sample_bytes} bytes"
+            f"{where}: expected frames, up to {_MOST_FRAMES}, of lines and samples, got {frames} x "
+            f"{lines} x {samples} of {sample_bytes} bytes"
         )
     if raw.size != header.file_bytes:
         raise FileError(

@@ -93,6 +93,21 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     return rows
 
 
+def sensor_of(path: Path) -> tuple[imu.SensorSamples, imu.Fit | None]:
+    """Read the sensor's samples of a package, and what its quaternion means; None where nothing fits.
+
+    Raises
+    ------
+    InvalidInputError
+        If the package has no sensor, or its samples make no sense.
+    """
+    member = find_recording(path).sensor
+    if member is None:
+        raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
+    samples = imu.read_samples(member)
+    return samples, imu.meaning_of(imu.fits_of(samples))
+
+
 def package_files(path: Path) -> Sequence[Path]:
     """Other files on disk that the sweep's content depends on."""
     return sorted({each.path for each in find_recording(path).members} - {path})
@@ -168,10 +183,12 @@ def _values(path: Path, chosen: _Chosen, place: Place, settings: ImportSettings)
     element_mm, _ = (None, "") if settings.vector_pitch_mm else element_pitch_mm(said, settings.probe)
     speed = settings.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
     rate_hz = settings.sampling_rate_hz or said.sampling_rate_hz
+    known = settings.vector_pitch_mm is not None or element_mm is not None
     found: dict[str, float | None] = {
         "sampling_rate_hz": rate_hz,
         "speed_of_sound_m_s": speed,
-        "vector_pitch_mm": None if element_mm is None else element_mm * place.elements_per_line,
+        # A probe's model is easier told than the distance between its lines.
+        "vector_pitch_mm" if known else "probe": (element_mm or 0.0) * place.elements_per_line or None,
         "first_sample_depth_mm": place.first_depth_mm(rate_hz, speed),
     }
     if said.kind == "envelope":
@@ -219,8 +236,7 @@ def _signal(said: Description, values: dict[str, float]) -> RFSettings | BModeSe
 def _orientation(recording: Recording) -> OrientationSensor | None:
     if recording.sensor is None:
         return None
-    samples = imu.read_samples(recording.sensor)
-    fit = imu.meaning_of(imu.fits_of(samples))
+    samples, fit = sensor_of(recording.path)
     return None if fit is None else imu.orientation_sensor(samples, fit)
 
 
@@ -234,6 +250,8 @@ def _curves(recording: Recording, chosen: _Chosen) -> tuple[Curve, ...] | None:
         if name not in recording.gains:
             continue
         curves = read_gains(recording.gains[name])
+        if not curves:
+            continue
         lacking = [int(t) for t in chosen.times_ns if int(t) not in curves]
         if not lacking:
             return tuple(curves[int(t)] or chosen.said.gain for t in chosen.times_ns)

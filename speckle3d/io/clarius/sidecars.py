@@ -197,8 +197,9 @@ def read_gains(member: Member) -> dict[int, Curve]:
     """
     text, where = member.text(), member.where
     stamps = list(_STAMP.finditer(text))
+    stops = [*(stamp.start() for stamp in stamps), len(text)][1:]
     curves: dict[int, Curve] = {}
-    for stamp, after in zip(stamps, [*(s.start() for s in stamps[1:]), len(text)], strict=True):
+    for stamp, after in zip(stamps, stops, strict=bool(stamps)):
         time_ns = int(stamp[1])
         if time_ns in curves:
             raise InvalidInputError(f"{where}: expected one curve at {time_ns} ns, got two")

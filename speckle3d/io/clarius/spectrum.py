@@ -78,7 +78,7 @@ def _mean_spectra(frames: Frames, length: int) -> tuple[FloatArray, FloatArray, 
     count, vectors, samples = frames.shape
     window = np.hanning(length + 1)[:-1]
     shared, power, spectra = np.zeros(length), np.zeros(length), 0
-    first = np.unique(np.linspace(0, vectors - 2, _PAIRS).astype(int))
+    first = np.unique(np.linspace(0, vectors - 2, _PAIRS if vectors > 1 else 0).astype(int))
     for i in sorted({0, count // 2, count - 1})[:_FRAMES]:
         frame = frames[i]
         for start in range(0, samples - length + 1, length // 2):

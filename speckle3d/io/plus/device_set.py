@@ -65,6 +65,7 @@ class DeviceSet:
     scan : ScanConversion
     """
 
+    path: str = ""
     image_frame: str = "Image"
     probe_frame: str = "Probe"
     tracker_frame: str = "Tracker"
@@ -89,7 +90,7 @@ class DeviceSet:
             for (a, b), matrix in self.transforms.items():
                 for source, target, inverted in ((a, b, False), (b, a, True)):
                     if source == here and target not in reached:
-                        step = _inverse(matrix, f"Transform {a} to {b}") if inverted else matrix
+                        step = _inverse(matrix, f"{self.path}: Transform {a} to {b}") if inverted else matrix
                         reached[target] = step @ reached[here]
                         waiting.append(target)
         return reached.get(end)
@@ -99,7 +100,7 @@ class DeviceSet:
         for end in (self.probe_frame, self.origin_frame):
             found = self.transform(self.image_frame, end)
             if found is not None:
-                return pixel_axes(found, f"{self.image_frame} to {end}")
+                return pixel_axes(found, f"{self.path}: {self.image_frame} to {end}")
         made = self.scan.output_size
         is_of_size = made is None or (size is not None and tuple(size[:2]) == made)
         return self.scan.output_mm if is_of_size else None
@@ -144,6 +145,7 @@ def read_device_set(path: PathLike) -> DeviceSet:
             for each in root.iterfind(place):
                 named |= each.attrib
         return DeviceSet(
+            path=str(path),
             image_frame=named.get("ImageCoordinateFrame", usual.image_frame),
             probe_frame=named.get("ProbeCoordinateFrame", usual.probe_frame),
             tracker_frame=_attribute(root, "ToolReferenceFrame") or usual.tracker_frame,

@@ -110,7 +110,10 @@ def layout_of(header: SequenceHeader, orientation: str | None = None) -> Layout:
     PLUS stores B-mode as MF and RF as FM unless the header names another orientation.
     """
     kind = image_type(header)
-    default = orientation or ("FM" if kind in RF_TYPES else "MF")
+    usual = "FM" if kind in RF_TYPES else "MF"
+    # A machine's orientation is of one kind of its images, those whose lines run as they usually do.
+    is_of_kind = orientation is not None and (orientation[:1].upper() in "FN") == (usual == "FM")
+    default = orientation if orientation is not None and is_of_kind else usual
     return Layout(kind, header.fields.get("UltrasoundImageOrientation", default).upper())
 
 

@@ -9,7 +9,8 @@ are there, also those whose image is not valid and not in the sweep.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,6 +45,10 @@ _STORAGE = {
 """Fields that say how pixels are stored; a writer makes them anew."""
 
 
+_FIELD_NAME = re.compile(r"[\w.-](?:[\w. -]*[\w.-])?")
+_FRAME_FIELD_NAME = re.compile(r"\w+")
+
+
 @dataclass(frozen=True)
 class SequenceRecord:
     """Fields of a sequence.
@@ -68,7 +73,7 @@ class SequenceRecord:
     @property
     def has_image(self) -> BoolArray:
         """Which frames have a valid image, shape (n,)."""
-        return valid_frames(self.frames, "ImageStatus", "Status")
+        return valid_images(self.frames)
 
 
 def record_of(
@@ -87,6 +92,11 @@ def record_of(
         "ElementSpacing": f"{spacing} 1" if len(header.size) == 3 else spacing,
     }
     return SequenceRecord(standard | own, header.frames, poses, conjugated)
+
+
+def valid_images(frames: Sequence[Mapping[str, str]]) -> BoolArray:
+    """Which frames have a valid image, shape (n,); older files of PLUS say so in Status alone."""
+    return valid_frames(frames, "ImageStatus", "Status")
 
 
 def valid_frames(frames: Sequence[Mapping[str, str]], *names: str) -> BoolArray:
@@ -143,8 +153,18 @@ def read_record(file: h5py.File) -> SequenceRecord | None:
         for i in range(max(frames, default=0))
     ]
     fields = dict(zip(names, values, strict=True))
+    _require_lines(locate(group, "field_names"), _FIELD_NAME, fields.items())
+    for row in rows:
+        _require_lines(locate(group, "frames"), _FRAME_FIELD_NAME, row.items())
     poses = tuple(read_text(group, "poses").split())
     return SequenceRecord(fields, tuple(rows), poses, bool(read_attribute(group, "conjugated", default=0)))
+
+
+def _require_lines(where: str, pattern: re.Pattern[str], fields: Iterable[tuple[str, str]]) -> None:
+    """Refuse names and values that would be other lines of a header than those of a field."""
+    for name, value in fields:
+        if not pattern.fullmatch(name) or name in _STORAGE or len(f"{value} ".splitlines()) > 1:
+            raise InvalidInputError(f"{where}: expected fields of one line, got {name!r} = {value!r}")
 
 
 def _columns(group: h5py.Group) -> dict[str, list[Any]]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -54,6 +56,10 @@ class Rows:
     images: list[int | None]
     conjugated: bool
     left_out: list[str]
+
+    def stored(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Give Q the sign that it has in the file."""
+        return np.conj(frame) if self.conjugated else frame
 
     @property
     def is_plane(self) -> bool:

@@ -22,6 +22,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.headers import read_header
 from speckle3d.io.pixels import meta_type, type_of_word
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.rows import Rows, rows_of
@@ -86,6 +87,7 @@ def write_sequence(
     images = _Images.of(sweep, rows, progress)
     if suffix == ".mhd":
         beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
+        _require_own(target, target.with_name(beside))
         with FileSet(target.name, (beside,)).replaced(target.parent) as part:
             with (part / beside).open("wb") as file:
                 size = images.write(file, 15 if compressed else None)
@@ -107,6 +109,14 @@ def write_sequence(
     return rows.left_out
 
 
+def _require_own(header: Path, data: Path) -> None:
+    """Refuse to write over pixels that are not those of the header that is replaced."""
+    if not data.exists():
+        return
+    if not header.exists() or read_header(header).pixels.path != data.resolve():
+        raise InvalidInputError(f"{data}: is there and no part of {header.name}: give another name")
+
+
 _SIZE_FIELD = b"CompressedDataSize = "
 
 
@@ -124,7 +134,7 @@ class _Images:
     @classmethod
     def of(cls, sweep: Sweep, rows: Rows, progress: Progress | None) -> _Images:
         layout = Layout(rows.fields["UltrasoundImageType"], rows.fields["UltrasoundImageOrientation"])
-        dtype = _narrowest(sweep)
+        dtype = _narrowest(sweep, rows)
         word = rows.fields.get("ElementType", "")
         if word and np.can_cast(dtype, type_of_word(word), "safe"):
             dtype = type_of_word(word)
@@ -137,15 +147,14 @@ class _Images:
             if number is None:
                 yield np.zeros(self.shape, self.dtype)
                 continue
-            frame = self.sweep.frames[number]
-            yield self.layout.pixels(np.conj(frame) if self.rows.conjugated else frame)
+            yield self.layout.pixels(self.rows.stored(self.sweep.frames[number]))
             written += 1
             if self.progress is not None:
                 self.progress(written, len(self.sweep))
 
     def write(self, file: BinaryIO, window: int | None) -> int:
         """Write all images, packed if there is a window, and return how many bytes that took."""
-        packer = None if window is None else zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
+        packer = None if window is None else _packer(window)
         size = 0
         for image in self:
             raw = image.astype(self.dtype.newbyteorder("<"), order="C").data.cast("B")
@@ -153,13 +162,22 @@ class _Images:
         return size if packer is None else size + file.write(packer.flush())
 
 
-def _narrowest(sweep: Sweep) -> np.dtype[Any]:
+def _packer(window: int) -> Any:
+    """Return ISA-L's packer, or zlib's where that has no wheel."""
+    try:
+        from isal import isal_zlib
+    except ImportError:
+        return zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
+    return isal_zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
+
+
+def _narrowest(sweep: Sweep, rows: Rows) -> np.dtype[Any]:
     """Type that holds all samples; of I and Q, int16 if all are whole numbers within it."""
     if sweep.frames.dtype.kind != "c":
         return sweep.frames.dtype
     limit = np.iinfo(np.int16)
     for i in range(len(sweep)):
-        parts = np.ascontiguousarray(sweep.frames[i]).view(np.float32)
+        parts = np.ascontiguousarray(rows.stored(sweep.frames[i])).view(np.float32)
         if parts.min() < limit.min or parts.max() > limit.max or (parts != np.rint(parts)).any():
             return np.dtype(np.float32)
     return np.dtype(np.int16)

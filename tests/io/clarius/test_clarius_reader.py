@@ -1,42 +1,25 @@
 """Packages of any sweep, written as the scanner writes them, are read back equal in every field."""
 
+import sys
 from dataclasses import replace
 
 import clarius_examples as examples
 import numpy as np
 import pytest
-from sweep_examples import rf_sweep
+from clarius_examples import GIVEN, sweep_of
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.io.clarius.package import Member
+from speckle3d.io.clarius.raw import RawFile, RawFrames, read_header
+from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import companion_files, load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 
-GIVEN = ImportSettings(probe="Clarius L7 HD3", bandwidth_hz=(4e6, 8e6), dynamic_range_db=60)
-
-
 SECOND = f"{{rx element: {0.3 / examples.ELEMENT_MM!r}"
-
-
-def sweep_of(kind, frames=4, vectors=5, samples=40):
-    made = rf_sweep(frames, vectors, samples)
-    times = examples.bursts_s(9.9, 10.4)
-    sensor = examples.sensor_of(examples.swayed(times), times)
-    # At 11 frames/s and every third frame left out, as RF is interleaved.
-    clock = 10.0 + np.delete(np.arange(3 * frames), slice(None, None, 3))[:frames] / 11
-    made = replace(made, orientation=sensor, tracker=None, truth=None, frame_time_s=np.round(clock, 9))
-    if kind == "rf":
-        return made
-    rng = np.random.default_rng(1)
-    if kind == "env":
-        data = rng.integers(0, 256, made.frames.shape).astype(np.uint8)
-        return replace(made, frames=data, signal=BModeSettings(60.0))
-    pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
-    signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
-    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm, 2.0)
-    return replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
 
 
 def require_equal(found, expected):
@@ -108,10 +91,10 @@ def test_the_type_decides_not_the_name(tmp_path):
 def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
     with pytest.raises(MissingSettingsError) as caught:
         load_sweep(examples.write_package(tmp_path / "rf", sweep_of("rf")))
-    assert caught.value.settings == ("vector_pitch_mm", "bandwidth_hz")
+    assert caught.value.settings == ("probe", "bandwidth_hz")
     with pytest.raises(MissingSettingsError) as caught:
         load_sweep(examples.write_package(tmp_path / "env", sweep_of("env")))
-    assert caught.value.settings == ("vector_pitch_mm", "dynamic_range_db")
+    assert caught.value.settings == ("probe", "dynamic_range_db")
 
 
 def test_settings_replace_what_the_package_says(tmp_path):
@@ -161,6 +144,31 @@ def test_gain_of_another_kind_serves_all(tmp_path):
     files = {name.replace("_rf.tgc", "_env.tgc.yml"): content for name, content in files.items()}
     package = examples.write_files(tmp_path / "p", files)
     assert load_sweep(package, GIVEN).frames.dtype == np.float32
+
+
+def test_gain_in_lines_of_its_own_as_newer_files_have_it(tmp_path):
+    sweep = sweep_of("rf", frames=2)
+    rows = [
+        f"timestamp: {t}\n" + "".join(f"  - {{ {d:.2f}mm, {g:.2f}dB }}\n" for d, g in curve(last))
+        for t, last in zip(examples.frame_times_ns(sweep), (30.0, 50.0), strict=True)
+    ]
+    text = examples.yml_text(sweep).replace(
+        "tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }",
+        "tgc:\n  - { 0.00mm, 23.00dB }\n  - { 39.70mm, 35.00dB }",
+    )
+    files = examples.package_files(sweep, yml=text) | {f"{examples.NAME}_rf.tgc": "".join(rows).encode()}
+    package = examples.write_files(tmp_path / "p", files)
+    assert load_sweep(package, GIVEN).frames.dtype == np.float32
+    assert dict(row[:2] for row in describe(package))["rf: gain"] == "23 dB at 0 mm, 35 dB at 39.7 mm"
+
+
+@pytest.mark.parametrize("content", [b"", b"# tgc curves per frame\n\nframes: 0\n"])
+def test_an_empty_gain_file_tells_nothing(tmp_path, content):
+    sweep = sweep_of("rf")
+    files = examples.package_files(sweep) | {f"{examples.NAME}_rf.tgc": content}
+    package = examples.write_files(tmp_path / "p", files)
+    require_equal(load_sweep(package, GIVEN), sweep)
+    assert dict(row[:2] for row in describe(package))["gain by frame"] == "not told: taken as the same"
 
 
 def test_gain_of_other_times_is_named(tmp_path):
@@ -293,6 +301,28 @@ def test_a_package_becomes_a_sweep_file(tmp_path):
     require_equal(load_sweep(tmp_path / "sweep.h5"), sweep)
 
 
+@pytest.mark.parametrize("library", ["yaml", "lzallright"])
+def test_a_missing_library_is_told_by_its_extra(tmp_path, library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    sweep = sweep_of("rf", samples=400)
+    sweep.frames[:, :, 20:] = 0  # so that blocks are packed
+    package = examples.write_package(tmp_path / "p", sweep, packed=True)
+    with pytest.raises(InvalidInputError, match=r'pip install "speckle3d\[clarius\]"'):
+        load_sweep(package, GIVEN)
+
+
+def test_a_sweep_without_a_believed_quaternion_has_no_orientation(tmp_path):
+    sweep = sweep_of("rf")
+    count = len(sweep.orientation.readings)
+    wrong = Rotation.random(count, rng=np.random.default_rng(3)).as_quat()
+    text = examples.sensor_text(sweep.orientation, wrong)
+    package = examples.write_package(tmp_path / "p", sweep, imu_text=text)
+    assert load_sweep(package, GIVEN).orientation is None
+    samples, fit = sensor_of(package)
+    assert fit is None
+    assert len(samples) == count
+
+
 @pytest.mark.realdata
 def test_real_packages(realdata):
     for name, frames in (("carotid", "17"), ("wirephantom", "13")):
@@ -311,3 +341,16 @@ def test_real_packages(realdata):
     assert envelope.frame_time_s[0] == pytest.approx(272.547324170, abs=1e-9)
     # 592 samples of 0.0513 mm; the depth is counted from the first but for one of its 16 delay samples.
     assert envelope.grid.depth_mm == pytest.approx(0.051 + 591 * 0.051333, abs=0.01)
+
+
+@pytest.mark.realdata
+def test_real_iq_was_shifted_down_by_its_transmit_frequency(realdata):
+    path = realdata / "clarius" / "carotid" / "doppler" / "carotid_iq.raw"
+    raw = RawFile(Member(path, path.name, 0, path.stat().st_size))
+    header = read_header(raw)
+    frame = RawFrames(raw, header, "IQ", slice(None), slice(None))[0]
+    assert frame.shape == (1248, 352)
+    for part in np.split(frame, 4, axis=1):
+        # The mean turn of the phase from sample to sample is the spectrum's centre.
+        turn = np.angle(np.vdot(part[:, :-1], part[:, 1:]))
+        assert abs(turn * 15.0 / (2 * np.pi)) < 0.01  # MHz

@@ -128,6 +128,18 @@ def test_rf_and_i_and_q_of_every_layout_survive(tmp_path, orientation, kind, dty
     assert (again.grid, again.signal) == (sweep.grid, sweep.signal)
 
 
+def test_the_least_of_16_bits_survives_a_turned_sign_of_q(tmp_path):
+    lines = np.exp(-0.6j * np.arange(32)) * 30000
+    values = np.stack([lines.real, lines.imag], axis=1).reshape(1, 1, 64).astype(np.int16)
+    values[0, 0, 1] = -32768  # whose opposite int16 does not hold
+    path = write_mha(tmp_path / "in.mha", values, {"UltrasoundImageType": "RF_IQ_LINE"})
+    sweep = load_sweep(path, RF)
+    assert sweep.frames.record.conjugated
+    write_sweep(tmp_path / "a.h5", sweep)
+    write_sequence(tmp_path / "out.mha", read_sweep(tmp_path / "a.h5"))
+    assert_same(tmp_path / "out.mha", path)
+
+
 def test_an_image_of_two_axes_stays_one(tmp_path):
     pixels = grey(1)
     path = write_mha(tmp_path / "in.mha", pixels)
@@ -256,6 +268,23 @@ def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     with pytest.raises(InvalidInputError, match=r"a\.mha: .*got a volume"):
         load_sweep(path, BMODE)
     assert len(load_sweep(path, BMODE.model_copy(update={"frame_rate_hz": 10.0}))) == 3
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_itk_reads_the_same_pixels(tmp_path, compressed):
+    import SimpleITK
+
+    sweep = sweep_examples.rf_sweep()
+    expected = np.stack([sweep.frames[i] for i in range(len(sweep))])
+    for name in ("a.mha", "a.mhd"):
+        write_sequence(tmp_path / name, sweep, compressed=compressed)
+        image = SimpleITK.ReadImage(str(tmp_path / name))
+        np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
+    write_sequence(tmp_path / "a.nrrd", sweep, compressed=compressed)
+    image = SimpleITK.ReadImage(
+        str(tmp_path / "a.nrrd")
+    )  # a list of images is for ITK one of many components
+    assert image.GetNumberOfComponentsPerPixel() == len(sweep)
 
 
 def test_frames_go_to_other_processes_and_are_opened_again(tmp_path):

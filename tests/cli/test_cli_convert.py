@@ -1,0 +1,208 @@
+"""`convert`: out by suffix, options of every setting, and all real recordings of PLUS at the first try."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import sweep_examples
+from image_examples import grey, tracked, write_mha
+
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.load import load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+
+PIXELS = ("--column-pitch-mm", "0.1", "--row-spacing-mm", "0.2", "--dynamic-range-db", "60")
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    return write_mha(tmp_path / "a.igs.mha", grey(), frames=tracked(3)[2])
+
+
+@pytest.fixture
+def done(run):
+    """Run a command, which must succeed; returns stdout and stderr."""
+
+    def call(*arguments):
+        code, out, err = run(*arguments)
+        assert code == 0, err
+        return out, err
+
+    return call
+
+
+def test_the_suffix_of_out_says_what_is_written(done, sequence, tmp_path):
+    h5, back, nrrd, mhd = (tmp_path / name for name in ("a.h5", "b.igs.mha", "c.igs.nrrd", "d.mhd"))
+    done("convert", sequence, h5, *PIXELS)
+    for source, out in ((h5, back), (back, nrrd), (nrrd, mhd), (mhd, h5), (mhd, back)):
+        assert done("convert", source, out) == ("", "")
+        sweep = load_sweep(out)
+        np.testing.assert_array_equal(sweep.frames[2], grey()[2].T)
+        assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == (0.1, 0.2)
+        assert len(sweep.tracker.readings) == 3
+    assert (tmp_path / "d.zraw").is_file()
+    done("convert", h5, mhd, "--compression", "none")
+    assert (tmp_path / "d.raw").stat().st_size == grey().size
+
+
+def test_what_a_sequence_does_not_hold_is_said(done, tmp_path):
+    write_sweep(tmp_path / "a.h5", sweep_examples.bmode_sweep())
+    _, err = done("convert", tmp_path / "a.h5", tmp_path / "b.mha")
+    assert [line.split(": ", 1)[1].split("'s")[0] for line in err.splitlines()] == [
+        "does not hold the tracker",
+        "does not hold the orientation sensor",
+        "does not hold the true poses",
+    ]
+
+
+def test_every_setting_has_an_option_with_its_description(done, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    text = " ".join(done("convert", "--help")[0].replace("│", " ").split())
+    named = {"tracker_transform": "--transform"}
+    not_numbers = {"image_to_probe", "arrays"}  # matrices and tables are for TOML
+    for name, field in ImportSettings.model_fields.items():
+        if name not in not_numbers:
+            assert named.get(name, f"--{name.replace('_', '-')}") in text
+        if name not in {*not_numbers, *named}:
+            assert " ".join(field.description.split()[:3]) in text
+
+
+def test_options_reach_the_sweep(done, tmp_path):
+    pixels = np.random.default_rng(0).integers(-900, 900, (3, 4, 30)).astype(np.int16)
+    path = write_mha(tmp_path / "rf.mha", pixels, frames=tracked(3)[2])
+    done("convert", path, tmp_path / "o.h5", "--sampling-rate-hz", "30e6", "--vector-pitch-mm", "0.2",
+         "--speed-of-sound-m-s", "1480", "--centre-frequency-hz", "5e6", "--bandwidth-hz", "3e6", "7e6",
+         "--first-sample-depth-mm", "1.5", "--probe", "L14", "--frame-rate-hz", "20",
+         "--reference-transform", "none")  # fmt: skip
+    sweep = load_sweep(tmp_path / "o.h5")
+    assert (sweep.signal.speed_of_sound_m_s, sweep.signal.sampling_rate_hz) == (1480, 30e6)
+    assert (sweep.grid.vector_pitch_mm, sweep.grid.first_sample_depth_mm, sweep.probe) == (0.2, 1.5, "L14")
+    np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
+    expected = tracked(3)[0].as_matrix()
+    np.testing.assert_allclose(sweep.tracker.readings.world_from_sensor.as_matrix(), expected, atol=1e-3)
+
+
+def test_places_that_are_taken_are_refused(refused, done, sequence, tmp_path):
+    assert "is an input" in refused("convert", sequence, sequence, *PIXELS)
+    (tmp_path / "x.mha").write_bytes(b"something else")
+    assert "another kind of file" in refused("convert", sequence, tmp_path / "x.mha", *PIXELS)
+    assert "'.nii'" in refused("convert", sequence, tmp_path / "x.nii", *PIXELS)
+    # Pixels beside a header are as much an output as the header.
+    (tmp_path / "y.zraw").write_bytes(b"of another header")
+    assert "y.zraw" in refused("convert", sequence, tmp_path / "y.mhd", *PIXELS)
+    assert (tmp_path / "y.zraw").read_bytes() == b"of another header"
+
+
+CONFIG = "PlusDeviceSet_"
+SPINE = f"{CONFIG}SpinePhantomFreehandReconstructionOnly.xml"
+WIRES = f"{CONFIG}fCal_Sim_SpatialCalibration_2.0.xml"
+LINEAR = f"{CONFIG}RfProcessingAlgoLinearTest.xml"
+DB = {"dynamic_range_db": "60"}
+SIZE = {"column_pitch_mm": "0.08", "row_spacing_mm": "0.08"}
+ECHOES = {"centre_frequency_hz": "6e6", "bandwidth_hz": "4e6 8e6"}
+RESULT = "FreehandCalibration3NWires_fCal2.0.results.xml"
+
+SWEEPS = {
+    "plus/BoneUltrasound_L14.igs.mha": ("BoneUltrasound_L14_config.xml", DB, (21, 820, 616), 21),
+    "plus/SpinePhantomFreehand.igs.mha": (SPINE, DB, (21, 820, 616), 21),
+    "plus/NwirePhantomFreehand.igs.nrrd": (None, DB | SIZE, (97, 820, 616), 97),
+    "plus/fCal_Test_Calibration_3NWires_fCal2.0.igs.mha": (RESULT, DB, (190, 820, 616), 190),
+    "plus/fCal_Test_Validation_3NWires_fCal2.0.igs.mha": (WIRES, DB, (103, 820, 616), 103),
+    "plus/WaterTankBottomTranslationVideoBuffer.igs.mha": (None, DB | SIZE, (201, 820, 616), None),
+    "plus/UltrasonixLinearScanConvertedData.igs.mha": (LINEAR, DB, (1, 260, 400), None),
+    "plus/UltrasonixLinearRfData.igs.mha": (
+        LINEAR,
+        ECHOES | {"sampling_rate_hz": "40e6", "demodulation_frequency_hz": "0"},
+        (1, 128, 2080),
+        None,
+    ),
+    "rf/MouseLiverRF.mha": (None, ECHOES | {"frame_rate_hz": "30"}, (4, 128, 1536), None),
+}
+"""By file: the device set beside it, what neither says, the frames, and the poses of its tracker."""
+
+NO_SWEEPS = {
+    "WaterTankBottomTranslationTrackerBuffer.igs.mha": "images of size 0 x 0: the recording of a tracker",
+    "TimestampFilteringTest.igs.mha": "images of size 1 x 1: the recording of a tracker",
+    "TransformInterpolationTest.igs.mha": "images of size 1 x 1: the recording of a tracker",
+    "vtkVolumeReconstructorTestLNMEANvolumeRef.mha": "a volume",
+    "vtkVolumeReconstructorTestNNMEANvolumeRef.mha": "a volume",
+    "BoneUltrasound_L14_config.xml": "a device set of PLUS, which is for --plus-config",
+    SPINE: "a device set",
+    f"{CONFIG}VolumeReconstructionOnly_SpinePhantom_NN_MEAN.xml": "a device set",
+    WIRES: "--phantom of calibrate wires",
+    LINEAR: "a device set",
+    f"{CONFIG}fCal_Sim_TemporalCalibration.xml": "a device set",
+    RESULT: "the result of a probe calibration",
+    "TemporalCalibrationResultsBaseline.xml": "a tracker's delay",
+    "LineSegmentationResultsBaseline.xml": "lines found in images",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+def test_every_recording_of_plus_is_in_the_table(realdata):
+    held = {path.name for path in (realdata / "plus").iterdir()} - {"LICENSE"}
+    assert held == {*NO_SWEEPS, *(name.removeprefix("plus/") for name in SWEEPS if name.startswith("plus/"))}
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", SWEEPS)
+def test_real_recordings_convert_at_the_first_try_and_back(realdata, run, done, tmp_path, name):
+    config, asked, shape, poses = SWEEPS[name]
+    source, h5, back = realdata / name, tmp_path / "a.h5", tmp_path / "back.mha"
+    given = [] if config is None else ["--plus-config", source.parent / config]
+    code, _, err = run("convert", source, h5, *given)
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    # All that is missing, and nothing else, at once.
+    assert {*re.findall(r"--([\w-]+) \(", err)} == {each.replace("_", "-") for each in asked}
+    options = [
+        word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", *value.split())
+    ]
+    done("convert", source, h5, *given, *options)
+    rows = {row["description"]: row["value"] for row in json.loads(done("info", source, "--json")[0])}
+    assert "none: " in rows["sweep"]
+    assert rows["size"].split(" x ")[0] in map(str, (shape[1], shape[2]))
+    sweep = load_sweep(h5)
+    assert sweep.frames.shape == shape
+    assert (None if sweep.tracker is None else len(sweep.tracker.readings)) == poses
+    if poses and config not in (None, WIRES):
+        assert sweep.tracker.sensor_from_image is not None
+    done("convert", h5, back)
+    again = load_sweep(back)
+    middle = shape[0] // 2
+    np.testing.assert_array_equal(again.frames[middle], sweep.frames[middle])
+    assert (again.grid, again.signal) == (sweep.grid, sweep.signal)
+    require_same_fields(back, source)
+
+
+def require_same_fields(got, expected):
+    from speckle3d.io.headers import read_header
+    from speckle3d.io.pixels import read_pixels
+
+    ours, theirs = read_header(got), read_header(expected)
+    assert ours.size == theirs.size
+    assert ours.spacing_mm == theirs.spacing_mm
+    assert ours.pixels.dtype == theirs.pixels.dtype
+    np.testing.assert_array_equal(read_pixels(ours.pixels), read_pixels(theirs.pixels))
+    assert len(ours.frames) == ours.frame_count
+    for our, their in zip(ours.frames, theirs.frames or [{}] * len(ours.frames), strict=True):
+        for name, text in their.items():
+            if name.endswith(("Transform", "Timestamp")):
+                assert [*map(float, our[name].split())] == [*map(float, text.split())]
+            else:
+                assert our[name] == text
+        added = {"ImageToProbe"} if their else {"Timestamp", "ImageStatus"}
+        assert {name.split("Transform")[0] for name in our.keys() - their.keys()} <= added
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+def test_what_is_no_sweep_says_why_in_one_line(realdata, done, refused, tmp_path):
+    for name, words in NO_SWEEPS.items():
+        path = realdata / "plus" / name
+        assert words in refused("convert", path, tmp_path / "o.h5")
+        rows = {row["description"]: row["value"] for row in json.loads(done("info", path, "--json")[0])}
+        assert words in rows["sweep"]

@@ -1,0 +1,178 @@
+"""A device set gives what headers lack: pixels, the image on the probe, names of frames, pitch of lines."""
+
+import numpy as np
+import pytest
+from image_examples import grey, tracked, write_mha
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.load import load_sweep, recording_files
+from speckle3d.io.plus.device_set import read_device_set
+
+TURN = Rotation.from_euler("xyz", [0.1, -0.2, 0.3]).as_matrix()
+
+
+def matrix(columns=(0.1, 0.2, 0.15), place=(10.0, 20.0, 30.0)):
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = TURN * columns, place
+    return found
+
+
+def text(values):
+    return " ".join(map(repr, np.ravel(values).tolist()))
+
+
+def written(path, *transforms, more="", scan=""):
+    each = "".join(f'<Transform From="{a}" To="{b}" Matrix="{text(m)}"/>' for a, b, m in transforms)
+    path.write_text(
+        f"<PlusConfiguration>{scan}{more}<CoordinateDefinitions>{each}</CoordinateDefinitions></PlusConfiguration>"
+    )
+    return str(path)
+
+
+def given(config, **more):
+    return ImportSettings(dynamic_range_db=60.0, plus_config=config, **more)
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    return write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+
+
+HALF = np.diag([1.0, 1.0, 1.0, 1.0])
+HALF[:3, 3] = -2.5, 5.0, 0.0
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [("Image", "Probe", matrix())],
+        [("Probe", "Image", np.linalg.inv(matrix()))],
+        [
+            ("Image", "TransducerOriginPixel", HALF),
+            ("TransducerOriginPixel", "Probe", matrix() @ np.linalg.inv(HALF)),
+        ],
+        [
+            ("Phantom", "Reference", np.eye(4)),
+            ("TransducerOriginPixel", "Image", np.linalg.inv(HALF)),
+            ("Probe", "TransducerOriginPixel", HALF @ np.linalg.inv(matrix())),
+        ],
+    ],
+)
+def test_the_image_on_the_probe_whichever_way_it_is_written(tmp_path, sequence, transforms):
+    sweep = load_sweep(sequence, given(written(tmp_path / "set.xml", *transforms)))
+    assert sweep.grid.vector_pitch_mm == pytest.approx(0.1, abs=1e-12)
+    assert sweep.grid.sample_spacing_mm == pytest.approx(0.2, abs=1e-12)
+    mounting = sweep.tracker.sensor_from_image
+    np.testing.assert_allclose(mounting.translation, [10, 20, 30], atol=1e-9)
+    np.testing.assert_allclose(mounting.rotation.as_matrix(), TURN, atol=1e-9)
+
+
+def test_pixels_alone_come_from_the_transducer_or_the_scan_conversion(tmp_path, sequence):
+    origin = [("Image", "TransducerOrigin", matrix())]
+    sweep = load_sweep(sequence, given(written(tmp_path / "set.xml", *origin)))
+    assert sweep.grid.vector_pitch_mm == pytest.approx(0.1)
+    assert sweep.tracker.sensor_from_image is None
+    spacing = 'OutputImageSpacingMmPerPixel="0.3 0.4"'
+    scan = f'<ScanConversion TransducerName="L9" OutputImageSizePixel="{{}}" {spacing}/>'
+    sweep = load_sweep(sequence, given(written(tmp_path / "set.xml", scan=scan.format("5 4"))))
+    assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == (0.3, 0.4)
+    assert sweep.probe == "L9"
+    with pytest.raises(MissingSettingsError) as caught:  # the machine's image is of another size
+        load_sweep(sequence, given(written(tmp_path / "set.xml", scan=scan.format("820 616"))))
+    assert caught.value.settings == ("column_pitch_mm", "row_spacing_mm")
+
+
+def test_names_of_frames_are_those_of_the_set(tmp_path):
+    frames = [
+        {name.replace("ProbeToTracker", "ToolToBed"): value for name, value in each.items()}
+        for each in tracked(3)[2]
+    ]
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
+    names = '<vtkPlusProbeCalibrationAlgo ImageCoordinateFrame="Slice" ProbeCoordinateFrame="Tool"/>'
+    device = '<Device ToolReferenceFrame="Bed"/>'
+    config = written(tmp_path / "set.xml", ("Slice", "Tool", matrix()), more=names + device)
+    sweep = load_sweep(path, given(config))
+    assert len(sweep.tracker.readings) == 3
+    np.testing.assert_allclose(sweep.tracker.sensor_from_image.translation, [10, 20, 30])
+
+
+def test_options_and_the_header_are_above_the_set(tmp_path):
+    frames = tracked(3)[2]
+    for frame in frames:
+        frame["ImageToProbeTransform"] = text(matrix((0.5, 0.6, 0.5), (1, 2, 3)))
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
+    config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()))
+    sweep = load_sweep(path, given(config, column_pitch_mm=0.7))
+    assert sweep.grid.vector_pitch_mm == 0.7
+    assert sweep.grid.sample_spacing_mm == pytest.approx(0.6)
+    np.testing.assert_allclose(sweep.tracker.sensor_from_image.translation, [1, 2, 3])
+
+
+def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
+    config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()),
+                     more='<DataSource PortUsImageOrientation="UN"/>')  # fmt: skip
+    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    np.testing.assert_array_equal(load_sweep(path, given(config)).frames[0], grey()[0, ::-1, ::-1].T)
+    path = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2])
+    np.testing.assert_array_equal(load_sweep(path, given(config)).frames[0], grey()[0].T)
+
+
+def test_the_pitch_of_rf_lines_but_not_the_image_of_them(tmp_path):
+    scan = '<ScanConversion TransducerGeometry="{}" TransducerWidthMm="38.4" ImagingDepthMm="40"/>'
+    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 4, 30), np.int16), frames=tracked(2)[2])
+    config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()), scan=scan.format("LINEAR"))
+    more = {"centre_frequency_hz": 5e6, "bandwidth_hz": (3e6, 7e6)}
+    with pytest.raises(MissingSettingsError) as caught:  # the shown depth is not that of the samples
+        load_sweep(rf, given(config, **more))
+    assert caught.value.settings == ("sampling_rate_hz",)
+    sweep = load_sweep(rf, given(config, sampling_rate_hz=40e6, **more))
+    assert sweep.grid.vector_pitch_mm == pytest.approx(38.4 / 4)
+    assert sweep.tracker.sensor_from_image is None  # of the B-mode image's pixels
+    config = written(tmp_path / "set.xml", scan=scan.format("CURVILINEAR"))
+    with pytest.raises(InvalidInputError, match=r"rf\.mha: .*curvilinear.*parallel"):
+        load_sweep(rf, given(config, sampling_rate_hz=40e6, **more))
+
+
+def test_a_settings_file_names_a_set_of_its_folder(tmp_path, sequence):
+    folder = tmp_path / "sub"
+    folder.mkdir()
+    moved = sequence.rename(folder / "a.mha")
+    written(folder / "set.xml", ("Image", "Probe", matrix()))
+    (folder / "import.toml").write_text('plus_config = "set.xml"\ndynamic_range_db = 60.0\n')
+    assert load_sweep(moved).tracker.sensor_from_image is not None
+    assert {path.name for path in recording_files(moved)} == {"a.mha", "import.toml", "set.xml"}
+    assert ("image calibration", f"{folder / 'set.xml'}: ImageToProbe", "") in describe(moved)
+    written(tmp_path / "set.xml", ("Image", "Probe", matrix()))
+    (folder / "link.xml").symlink_to(tmp_path / "set.xml")
+    for name in ("../set.xml", str(folder / "set.xml"), "link.xml"):
+        (folder / "import.toml").write_text(f'plus_config = "{name}"\n')
+        with pytest.raises(InvalidInputError, match=r"import\.toml: plus_config: .*the same folder"):
+            load_sweep(moved)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("<PlusConfiguration", "well-formed XML"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><PlusConfiguration/>', "declaration"),
+        ("<Other/>", "PlusConfiguration.*got Other"),
+        ('<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="1 2"/>'
+         "</CoordinateDefinitions></PlusConfiguration>", r"Transform Image: Matrix: expected 16"),
+        ('<PlusConfiguration><ScanConversion TransducerWidthMm="-1"/></PlusConfiguration>', "above zero"),
+        ('<PlusConfiguration><CoordinateDefinitions><Transform From="Probe" To="Image" Matrix="'
+         + "0 " * 16 + '"/></CoordinateDefinitions></PlusConfiguration>', "Probe to Image.*singular"),
+        ('<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="'
+         + "0 " * 16 + '"/></CoordinateDefinitions></PlusConfiguration>', "axes of some length"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named(tmp_path, sequence, content, message):
+    (tmp_path / "set.xml").write_text(content)
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        load_sweep(sequence, given(str(tmp_path / "set.xml")))
+    assert "set.xml" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+    with pytest.raises(FileError, match=r"none\.xml"):
+        read_device_set(tmp_path / "none.xml")

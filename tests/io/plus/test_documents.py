@@ -1,0 +1,51 @@
+"""Documents of PLUS are told what they are, and which option takes them; they are no sweeps."""
+
+import pytest
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.describe import describe
+from speckle3d.io.load import kind_of, load_sweep
+
+
+@pytest.mark.parametrize(
+    ("content", "expected", "option"),
+    [
+        ("<PlusConfiguration/>", {"content": "a device set", "pixel": "unknown"}, "--plus-config"),
+        (
+            '\ufeff<?xml version="1.0"?>\n<!-- x -->\n<ProbeCalibrationResult><CalibrationResults><Transform '
+            'From="Image" To="Probe" Matrix="0.1 0 0 1 0 0.2 0 2 0 0 1 3 0 0 0 1"/></CalibrationResults>'
+            "</ProbeCalibrationResult>",
+            {"content": "the result of a probe calibration", "pixel": "0.10000 x 0.20000"},
+            "--plus-config",
+        ),
+        (
+            '<TemporalCalibrationResults TrackerLagSec="-0.0648266"/>',
+            {"content": "a tracker's delay", "time offset of the tracker": "+0.0648"},
+            "--time-offset",
+        ),
+        (
+            '<LineSegmentationResults><Frame SegmentationStatus="OK"/><Frame/></LineSegmentationResults>',
+            {"content": "lines found in images", "lines found": "1"},
+            "comparison",
+        ),
+    ],
+)
+def test_documents_are_told_apart(tmp_path, content, expected, option):
+    path = tmp_path / "a.xml"
+    path.write_text(content, encoding="utf-8")
+    rows = {name: value for name, value, _ in describe(path)}
+    assert kind_of(path) == rows["format"] == "PLUS document"
+    assert expected.items() <= rows.items()
+    assert option in rows["for"]
+    with pytest.raises(InvalidInputError, match=rf"a\.xml: expected a recording, got .*{option}") as caught:
+        load_sweep(path)
+    assert rows["sweep"] == f"none: {caught.value}"
+
+
+@pytest.mark.parametrize("content", ["<Other/>", "<a><PlusConfiguration/></a>", "<PlusConfiguration"])
+def test_other_xml_is_one_line(tmp_path, content):
+    path = tmp_path / "a.xml"
+    path.write_text(content)
+    with pytest.raises(InvalidInputError, match=r"a\.xml: expected") as caught:
+        load_sweep(path)
+    assert len(str(caught.value).splitlines()) == 1

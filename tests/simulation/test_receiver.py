@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+import sweep_examples
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.sweeps import read_sweep
+from speckle3d.simulation.receiver import WHITE_DB, Demodulator, received_as_bmode, received_as_iq
+from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
+
+RF = RFSettings(200e6 / 3, 1540.0, 7.5e6, (5e6, 10e6))
+SAMPLES = 1200
+
+
+def rf_sweep(waves):
+    frames = np.rint(waves)[None].astype(np.int16)
+    grid = ImageGrid(*waves.shape, 0.3, RF.sample_spacing_mm, 3.0)
+    return Sweep(frames, grid, RF, np.zeros(1))
+
+
+def tone(frequency_hz, amplitude=1000.0, phase=0.4):
+    t = np.arange(SAMPLES) / RF.sampling_rate_hz
+    return amplitude * np.cos(2 * np.pi * frequency_hz * t + phase)[None]
+
+
+@pytest.mark.parametrize("middle_hz", [6.5e6, 7.5e6, 8.5e6])
+@pytest.mark.parametrize("frequency_hz", [4.6e6, 6e6, 10.4e6])
+def test_a_tone_turns_at_what_it_is_off_the_demodulation_with_its_phase_and_no_delay(frequency_hz, middle_hz):
+    made = Demodulator(RF, middle_hz)
+    got = made(tone(frequency_hz))[0]
+    t = np.arange(got.size) * made.every / RF.sampling_rate_hz
+    expected = 1000.0 * np.exp(1j * (2 * np.pi * (frequency_hz - middle_hz) * t + 0.4))
+    # 80 dB of the filter, and what the ends cut off.
+    inside = slice(20, -20)
+    np.testing.assert_allclose(got[inside], expected[inside], atol=1.0)
+
+
+@pytest.mark.parametrize("frequency_hz", [0.0, 1e6, 14.6e6, 30e6])
+def test_what_would_fold_into_the_band_is_filtered_out(frequency_hz):
+    made = Demodulator(RF, 7.5e6)
+    # Without the filter these would be where the band is kept.
+    rate_hz = made.signal.sampling_rate_hz
+    assert abs((frequency_hz - 7.5e6 + rate_hz / 2) % rate_hz - rate_hz / 2) < made.reach_hz
+    assert np.abs(made(tone(frequency_hz))[0, 20:-20]).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("middle_hz", "decimation", "every"), [(7.5e6, None, 8), (7.5e6, 10, 10), (6.5e6, None, 6)]
+)
+def test_i_and_q_are_as_few_as_the_band_allows(middle_hz, decimation, every):
+    sweep = received_as_iq(rf_sweep(tone(7e6)), middle_hz, decimation)
+    assert sweep.frames[0].shape == (1, -(-SAMPLES // every)) == (1, sweep.grid.samples)
+    assert sweep.grid.sample_spacing_mm == pytest.approx(every * RF.sample_spacing_mm, rel=1e-12)
+    assert sweep.grid.first_sample_depth_mm == 3.0
+
+
+@pytest.mark.parametrize("decimation", [11, 40])
+def test_a_rate_that_does_not_hold_the_band_is_refused(decimation):
+    with pytest.raises(InvalidInputError, match=rf"decimation: expected 1 to 10 .*got {decimation}"):
+        received_as_iq(rf_sweep(tone(7e6)), None, decimation)
+
+
+def test_i_and_q_are_whole_counts_that_come_back_from_a_file(tmp_path):
+    sweep = received_as_iq(sweep_examples.rf_sweep(samples=400, dtype=np.int16), 6e6)
+    write_sweep(tmp_path / "s.h5", sweep)
+    got = read_sweep(tmp_path / "s.h5")
+    assert got.frames.stored_dtype == np.int16
+    for i in range(len(sweep)):
+        np.testing.assert_array_equal(got.frames[i], sweep.frames[i])
+
+
+def test_grey_levels_are_the_envelope_in_decibel():
+    # The envelope's square over speckle's, whose rms as RF is that of a tone of the root of two times it.
+    for decibel in (0.0, -13.0, 15.0):
+        amplitude = np.sqrt(2) * SPECKLE_RMS_COUNTS * 10 ** (decibel / 20)
+        sweep = received_as_bmode(rf_sweep(tone(7.5e6, amplitude)), 60.0)
+        grey = sweep.frames[0][0, 20:-20].astype(float)
+        assert sweep.frames.dtype == np.uint8
+        expected = 255 * (1 + (decibel - WHITE_DB) / 60.0)
+        # Half a level of rounding, and counts rounded.
+        assert np.abs(grey - expected).max() < 0.6
+
+
+def test_beyond_the_range_is_black_or_white():
+    made = [received_as_bmode(rf_sweep(tone(7.5e6, amplitude)), 40.0) for amplitude in (8000.0, 2.0)]
+    loud, silent = (sweep.frames[0][0, 20:-20] for sweep in made)
+    assert loud.min() == 255
+    assert silent.max() == 0
+
+
+@pytest.mark.parametrize("signal", ["iq", "bmode"])
+def test_only_rf_can_be_received(signal):
+    with pytest.raises(InvalidInputError, match="expected RF"):
+        received_as_iq(sweep_examples.iq_sweep() if signal == "iq" else sweep_examples.bmode_sweep())
