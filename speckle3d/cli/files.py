@@ -179,7 +179,7 @@ def convert(
     """
     from speckle3d.cli.recordings import require_sequence, require_unsaid
     from speckle3d.io.import_settings import ImportSettings
-    from speckle3d.io.load import load_sweep
+    from speckle3d.io.load import import_notes, load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
 
@@ -198,8 +198,11 @@ def convert(
     given = from_options(ImportSettings, options)
     require_unsaid(source, given)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
-    sweep = resize(load_sweep(source, given.model_copy(update=fitted)), fitted)
+    settings = given.model_copy(update=fitted)
+    sweep = resize(load_sweep(source, settings), fitted)
     sweep = mount(sweep, calibration or ())
+    for each in import_notes(source, settings):
+        note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
             write_sweep(out, sweep, progress, COMPRESSIONS[compression])
