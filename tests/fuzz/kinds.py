@@ -70,7 +70,9 @@ def bytes_of(change):
 
 
 def sweeps(folder):
-    paths = [folder / f"{i}.h5" for i in range(4)]
+    paths = [folder / f"{i}.h5" for i in range(6)]
+    write_sweep(paths[4], sweep_examples.iq_sweep())
+    write_sweep(paths[5], sweep_examples.iq_sweep(paired=False), compression=None)
     write_sweep(paths[0], sweep_examples.rf_sweep())
     write_sweep(paths[1], sweep_examples.rf_sweep(dtype=np.float32), compression="lzf")
     write_sweep(paths[2], sweep_examples.bmode_sweep(), compression=None)
@@ -207,7 +209,6 @@ def small_sweep(folder):
 
 
 GIVEN = """vector_pitch_mm = 0.3
-sampling_rate_hz = 15e6
 centre_frequency_hz = 6e6
 demodulation_frequency_hz = 6e6
 bandwidth_hz = [4.5e6, 7e6]
@@ -244,7 +245,8 @@ def zeas(folder):
 
 def mats(new):
     def write(folder):
-        given(folder, '[arrays]\nrf = "data{1}.rf"\naxes = "sample, vector, frame"\ntime_s = "t / 2"\n')
+        arrays = '[arrays]\nrf = "data{1}.rf"\naxes = "sample, vector, frame"\ntime_s = "t / 2"\n'
+        given(folder, f"sampling_rate_hz = 15e6\n{arrays}")
         data = format_examples.matlab_order(format_examples.rf())
         held = {"data": [{"rf": data, "gain": 3.0}], "t": np.arange(4.0), "note": "words"}
         kinds = [new] if new else [True, False]
