@@ -272,7 +272,7 @@ def test_a_probe_has_one_name_however_it_is_typed(tmp_path, probe):
 
 def test_frames_that_the_sensor_does_not_cover_are_told(tmp_path):
     sweep = sweep_of("rf")
-    times = examples.bursts_s(sweep.frame_time_s[1], sweep.frame_time_s[2] + 0.03)
+    times = examples.bursts_s(sweep.frame_time_s[1], sweep.frame_time_s[2] + 0.06)
     late = replace(sweep, orientation=examples.sensor_of(examples.swayed(times), times))
     rows = dict(row[:2] for row in describe(examples.write_package(tmp_path / "p", late)))
     told = "1 before the sensor's first sample, 1 after its last, 0 in pauses"
