@@ -21,18 +21,23 @@ def iq(seed=0, **shape):
     return (rf(seed, **shape) + 1j * rf(seed + 1, **shape)).astype(np.complex64)
 
 
-def axes(vectors=VECTORS, samples=SAMPLES):
-    """Lateral positions and depths, m."""
-    x = PITCH_MM * (np.arange(vectors) - (vectors - 1) / 2)
-    return 1e-3 * x, 1e-3 * (FIRST_MM + SPACING_MM * np.arange(samples))
+def axes(vectors=VECTORS, samples=SAMPLES, grid=None):
+    """Lateral positions and depths, m, of the examples' grid or of another."""
+    pitch, spacing, first = PITCH_MM, SPACING_MM, FIRST_MM
+    if grid is not None:
+        pitch, spacing, first = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
+    x = pitch * (np.arange(vectors) - (vectors - 1) / 2)
+    return 1e-3 * x, 1e-3 * (first + spacing * np.arange(samples))
 
 
-def write_uff(path, frames, modulation_hz=0.0, pulse=(6e6, 0.5), scan="uff.linear_scan", name="b_data"):
+def write_uff(
+    path, frames, modulation_hz=0.0, pulse=(6e6, 0.5), scan="uff.linear_scan", name="b_data", grid=None
+):
     """Write beamformed data as USTB does from MATLAB: axes in reverse, last ones of length 1 left out."""
     data = frames.reshape(len(frames), 1, 1, -1)
     if len(frames) == 1:
         data = data.reshape(1, -1)
-    x, z = axes(*frames.shape[1:])
+    x, z = axes(*frames.shape[1:], grid)
     with h5py.File(path, "a") as file:
         file.attrs["version"] = np.array([b"v1.2.0"])
         group = _object(file, name, "uff.beamformed_data")
@@ -146,13 +151,13 @@ def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None
     return path
 
 
-def write_zea(path, frames, kind="beamformed_data", home="", placed=True, scan=(), positions=None):
+def write_zea(path, frames, kind="beamformed_data", home="", placed=True, scan=(), positions=None, grid=None):
     """Write `frames` (frame, vector, sample) as zea 0.0.12 does; not `placed`, as earlier versions did."""
     turned = frames.transpose(0, 2, 1)
     if kind == "beamformed_data":
         parts = (turned.real, turned.imag) if np.iscomplexobj(frames) else (turned,)
         turned = np.stack(parts, axis=-1).astype("f4")
-    x, z = axes(*frames.shape[1:])
+    x, z = axes(*frames.shape[1:], grid)
     if positions is None:
         positions = np.stack([*np.broadcast_arrays(x[None], 0.0, z[:, None])], axis=-1)
     given = {"sound_speed": 1480.0, "center_frequency": 6e6, "demodulation_frequency": 6e6} | dict(scan)

@@ -301,8 +301,9 @@ class _OldFile(MatFile):
     ) -> Frames:
         made = np.empty(shape, dtype)
         arrays = [self._node(name) for name in names]
+        by_frame = [array[None] if axis is None else np.moveaxis(array, axis, 0) for array in arrays]
         for i in range(shape[0]):
-            frame = turn([array if axis is None else array.take(i, axis) for array in arrays])
+            frame = turn([array[i] for array in by_frame])
             if frame.dtype.kind in "fc":
                 require_finite(frame, f"{self.path}: {printable(names[0])}: frame {i}")
             made[i] = frame

@@ -209,7 +209,6 @@ def small_sweep(folder):
 
 
 GIVEN = """vector_pitch_mm = 0.3
-sampling_rate_hz = 15e6
 centre_frequency_hz = 6e6
 demodulation_frequency_hz = 6e6
 bandwidth_hz = [4.5e6, 7e6]
@@ -246,7 +245,8 @@ def zeas(folder):
 
 def mats(new):
     def write(folder):
-        given(folder, '[arrays]\nrf = "data{1}.rf"\naxes = "sample, vector, frame"\ntime_s = "t / 2"\n')
+        arrays = '[arrays]\nrf = "data{1}.rf"\naxes = "sample, vector, frame"\ntime_s = "t / 2"\n'
+        given(folder, f"sampling_rate_hz = 15e6\n{arrays}")
         data = format_examples.matlab_order(format_examples.rf())
         held = {"data": [{"rf": data, "gain": 3.0}], "t": np.arange(4.0), "note": "words"}
         kinds = [new] if new else [True, False]
