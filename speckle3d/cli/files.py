@@ -177,9 +177,9 @@ def convert(
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
     """
-    from speckle3d.cli.recordings import require_sequence
+    from speckle3d.cli.recordings import require_sequence, require_unsaid
     from speckle3d.io.import_settings import ImportSettings
-    from speckle3d.io.load import load_sweep
+    from speckle3d.io.load import import_notes, load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
 
@@ -192,13 +192,17 @@ def convert(
     require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    if transform is not None:
-        require_sequence(source, transform)
-        options["tracker_transform"] = transform
+    options["tracker_transform"] = transform
+    for name in ("transform", "reference_transform", "plus_config"):
+        require_sequence(source, options[name], f"--{name.replace('_', '-')}")
     given = from_options(ImportSettings, options)
+    require_unsaid(source, given)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
-    sweep = resize(load_sweep(source, given.model_copy(update=fitted)), fitted)
+    settings = given.model_copy(update=fitted)
+    sweep = resize(load_sweep(source, settings), fitted)
     sweep = mount(sweep, calibration or ())
+    for each in import_notes(source, settings):
+        note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
             write_sweep(out, sweep, progress, COMPRESSIONS[compression])

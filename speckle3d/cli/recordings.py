@@ -121,18 +121,15 @@ def _advice(path: Path, lacking: Sequence[str]) -> str:
     )
 
 
-def require_sequence(path: Path, transform: str | None) -> None:
-    """Refuse the name of a transform for a sweep file, which has one tracker at most.
+def require_sequence(path: Path, given: object, option: str = "--transform") -> None:
+    """Refuse an option of image sequences, if given, for another recording, as a sweep file.
 
     Raises
     ------
     InvalidInputError
     """
-    if transform is not None and kind_of(path) != IMAGE:
-        raise InvalidInputError(
-            f"--transform: expected an image sequence with it, got {path} ({kind_of(path)}), whose poses "
-            "have no names"
-        )
+    if given is not None and kind_of(path) != IMAGE:
+        raise InvalidInputError(f"{option}: expected an image sequence with it, got {path} ({kind_of(path)})")
 
 
 def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
@@ -144,6 +141,19 @@ def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
     """
     if pixel_mm is not None and kind_of(path) in SIZED:
         raise InvalidInputError(f"--pixel-mm: expected none with {path}, which has its own")
+
+
+def require_unsaid(path: Path, given: ImportSettings) -> None:
+    """Refuse settings for a recording that says all of them itself.
+
+    Raises
+    ------
+    InvalidInputError
+    """
+    names = sorted(given.model_fields_set)
+    if names and kind_of(path) in SIZED:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise InvalidInputError(f"{options}: expected none with {path} ({kind_of(path)}), which has its own")
 
 
 def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:

@@ -36,11 +36,13 @@ class Frames(Protocol):
 
 
 def stored_dtype(frames: Frames) -> np.dtype[Any]:
-    """Type of the samples where they were recorded, by the frames' attribute ``stored_dtype``.
+    """Type that frames are stored as: int16 for complex ones that say so by ``stored_dtype``, else their own.
 
-    Pairs of int16 (I/Q) are read as complex64, which they are not stored as.
+    Pairs of int16 (I/Q) are read as complex64, and would take twice the room so.
     """
-    return np.dtype(getattr(frames, "stored_dtype", frames.dtype))
+    pairs = np.dtype(np.int16)
+    own: np.dtype[Any] = np.dtype(frames.dtype)
+    return pairs if own.kind == "c" and getattr(frames, "stored_dtype", own) == pairs else own
 
 
 @dataclass(frozen=True)

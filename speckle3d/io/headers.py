@@ -58,10 +58,14 @@ class SequenceHeader:
         return self.size[2] if len(self.size) > 2 else 1
 
     @property
+    def kinds(self) -> list[str]:
+        """What the axes are, fastest first, as domain or list; none where the header does not say."""
+        return (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
+
+    @property
     def is_volume(self) -> bool:
         """Whether the third axis is of space, as ``Kinds`` says and frames' fields do not contradict."""
-        kinds = (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
-        in_space = len(kinds) == 3 and kinds[2] in ("domain", "space")
+        in_space = len(self.kinds) == 3 and self.kinds[2] in ("domain", "space")
         return in_space and self.frame_count > max(len(self.frames), 1)
 
     @property

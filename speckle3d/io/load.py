@@ -65,6 +65,12 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
     return challenge.read_landmarks(path) if kind_of(path) == challenge.FORMAT else None
 
 
+def import_notes(path: PathLike, settings: ImportSettings | None = None) -> list[str]:
+    """Tell what `load_sweep` assumed, measured or left out of a recording."""
+    reader = find_reader(path)
+    return [] if reader is None else list(reader.notes(Path(path), settings_for(path, settings)))
+
+
 def companion_files(path: PathLike) -> list[Path]:
     """List other files that a sweep's content depends on; none of what no reader claims."""
     reader, beside = find_reader(path), settings_file(path)

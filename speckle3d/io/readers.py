@@ -34,6 +34,10 @@ def _nothing_beside(_: Path) -> Sequence[Path]:
     return ()
 
 
+def _nothing_to_say(_: Path, __: ImportSettings) -> Sequence[str]:
+    return ()
+
+
 @dataclass(frozen=True)
 class Reader:
     """How sweeps of one format are told and read.
@@ -51,6 +55,8 @@ class Reader:
         Rows of what a recording holds, also where it is no sweep; by default the sweep's.
     companions : callable
         Other files that the sweep's content depends on.
+    notes : callable
+        What a user should know of how a sweep was made: what was assumed, measured or left out.
     """
 
     format: str
@@ -58,6 +64,7 @@ class Reader:
     read: Callable[[Path, ImportSettings], Sweep]
     describe: Callable[[Path, ImportSettings], list[Row]] | None = None
     companions: Callable[[Path], Sequence[Path]] = _nothing_beside
+    notes: Callable[[Path, ImportSettings], Sequence[str]] = _nothing_to_say
 
 
 def find_reader(path: PathLike) -> Reader | None:

@@ -175,7 +175,7 @@ class FrameInspector:
         samples = np.ascontiguousarray(frame)
         if np.iscomplexobj(samples):
             samples = samples.view(samples.real.dtype)
-        # Every eighth vector tells how strong the samples as read are, and whether they are counts: so are I/Q
+        # Every eighth vector tells how strong samples as read are, and whether they are counts, as I/Q are, too,
         # that come from pairs of integers.
         some = samples[::8]
         counted = samples.dtype.kind in "iu" or bool((some == np.rint(some)).all())

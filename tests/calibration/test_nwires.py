@@ -207,7 +207,7 @@ def test_dots_found_here_calibrate_real_images_for_others(realdata, fcal):
     for kind, step in (("Calibration", 3), ("Validation", 2)):
         path = realdata / "plus" / f"fCal_Test_{kind}_3NWires_fCal2.0.igs.mha"
         kept = read_metaimage(path, known).frames
-        frames = [kept[i] for i in range(0, len(kept), step)]
+        frames = np.stack([kept[i] for i in range(0, len(kept), step)])
         dots = dots_in_frames(frames, [fcal.pixel_mm] * 2, region_px=fcal.clip_px)
         poses = poses_of(realdata / "plus", kind)[::step]
         labelled[kind], starts[kind] = label_and_start(dots, fcal.phantom, poses, [fcal.pixel_mm] * 2)

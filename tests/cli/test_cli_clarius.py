@@ -35,7 +35,9 @@ def test_the_orientation_of_a_package_is_found_anew(run, tmp_path):
     package = examples.write_package(tmp_path / "x.tar", sweep, imu_text=text)
     out = tmp_path / "sweep.h5"
     given = ("--probe", "L7 HD3", "--bandwidth-hz", "4e6", "8e6")
-    assert run("convert", package, out, *given)[0] == 0
+    code, _, err = run("convert", package, out, *given)
+    assert code == 0
+    assert "the sweep has no orientation" in err
     assert load_sweep(out).orientation is None
     code, _, err = run("imu", "orient", package, "--into", out)
     assert code == 0

@@ -94,6 +94,15 @@ def test_places_that_are_taken_are_refused(refused, done, sequence, tmp_path):
     assert (tmp_path / "y.zraw").read_bytes() == b"of another header"
 
 
+def test_a_sweep_file_has_settings_of_its_own(refused, tmp_path):
+    write_sweep(tmp_path / "a.h5", sweep_examples.bmode_sweep())
+    names = tmp_path / "a.h5", tmp_path / "b.mha"
+    line = refused("convert", *names, "--row-spacing-mm", "0.2", "--probe", "x")
+    assert "--probe, --row-spacing-mm: expected none with" in line
+    for option in ("--transform", "--reference-transform", "--plus-config"):
+        assert f"{option}: expected an image sequence" in refused("convert", *names, option, "x")
+
+
 CONFIG = "PlusDeviceSet_"
 SPINE = f"{CONFIG}SpinePhantomFreehandReconstructionOnly.xml"
 WIRES = f"{CONFIG}fCal_Sim_SpatialCalibration_2.0.xml"

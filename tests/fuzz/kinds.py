@@ -70,7 +70,9 @@ def bytes_of(change):
 
 
 def sweeps(folder):
-    paths = [folder / f"{i}.h5" for i in range(4)]
+    paths = [folder / f"{i}.h5" for i in range(6)]
+    write_sweep(paths[4], sweep_examples.iq_sweep())
+    write_sweep(paths[5], sweep_examples.iq_sweep(paired=False), compression=None)
     write_sweep(paths[0], sweep_examples.rf_sweep())
     write_sweep(paths[1], sweep_examples.rf_sweep(dtype=np.float32), compression="lzf")
     write_sweep(paths[2], sweep_examples.bmode_sweep(), compression=None)

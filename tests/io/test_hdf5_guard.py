@@ -128,6 +128,23 @@ def test_data_that_lie_elsewhere_or_nowhere_are_refused(path, make, message):
         read_sweep(path)
 
 
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (external("/etc/passwd"), "/etc/passwd"),
+        (virtual, "virtual"),
+        (unwritten((*SHAPE, 2), chunks=(1, 5, 40, 2)), "6 chunks.*got 0"),
+        (unwritten((10**12, 5, 40, 2)), "800000000000000 bytes.*got 0"),
+        (unwritten((6, 50_000, 40_000, 2), chunks=(1, 50_000, 40_000, 2)), "at most.*8000000000"),
+    ],
+)
+def test_the_same_of_i_and_q(path, make, message):
+    write_sweep(path, sweep_examples.iq_sweep())
+    in_place_of(path, "iq", make)
+    with pytest.raises(InvalidInputError, match=rf"s\.h5: /iq: .*{message}"):
+        read_sweep(path)
+
+
 def test_the_same_of_what_is_read_whole(path):
     in_place_of(
         path, "frame_time_s", lambda file, name: file.create_dataset(name, (10**12,), "f8", chunks=(6,))

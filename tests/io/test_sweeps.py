@@ -85,6 +85,15 @@ def test_i_and_q_come_back_as_they_were_stored(tmp_path, paired, compression, de
         assert file["iq"].attrs["demodulation_frequency_hz"] == demodulation_frequency_hz
 
 
+def test_i_and_q_of_another_stored_type_are_stored_as_they_are_read(tmp_path):
+    """As of a scanner's numbers whose gain was undone."""
+    sweep = sweep_examples.iq_sweep()
+    sweep.frames.stored_dtype = np.dtype(np.float32)
+    write_sweep(tmp_path / "s.h5", sweep)
+    assert_same_sweep(read_sweep(tmp_path / "s.h5"), sweep)
+    assert stored_dtype(read_sweep(tmp_path / "s.h5").frames) == np.complex64
+
+
 def test_only_i_and_q_make_a_file_of_version_2(path, tmp_path):
     with h5py.File(path) as file:
         assert file.attrs["version"] == 1

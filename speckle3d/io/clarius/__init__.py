@@ -4,7 +4,8 @@ What is read, what is assumed and why is in ``docs/clarius.md``, and with the co
 """
 
 from speckle3d.io.clarius.package import is_package
-from speckle3d.io.clarius.reader import FORMAT, describe_package, package_files, read_package
+from speckle3d.io.clarius.reader import FORMAT, package_files, read_package
+from speckle3d.io.clarius.told import describe_package, package_notes
 from speckle3d.io.readers import Reader
 
-READER = Reader(FORMAT, is_package, read_package, describe_package, package_files)
+READER = Reader(FORMAT, is_package, read_package, describe_package, package_files, package_notes)

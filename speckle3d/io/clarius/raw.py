@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.io.clarius.lzop import Unpacker
@@ -151,7 +150,15 @@ class RawFrames:
     Attributes
     ----------
     stored_dtype : dtype
-        Of the numbers in the file: int16 for RF and for the pairs of I/Q, uint8 for envelopes.
+        Of the numbers in the file: int16 for RF and for the pairs of I/Q, uint8 for envelopes; that of the
+        frames where samples are multiplied by factors.
+
+    Parameters
+    ----------
+    lines, samples : slice
+        Kept.
+    factors : ndarray, shape (1 or frame, sample), optional
+        What the samples kept are multiplied by; complex for I/Q, else real.
     """
 
     def __init__(
@@ -161,14 +168,14 @@ class RawFrames:
         kind: str,
         lines: slice,
         samples: slice,
-        gains: FloatArray | None = None,
+        factors: npt.NDArray[Any] | None = None,
     ) -> None:
         self.raw, self.header, self.kind = raw, header, kind
-        self.lines, self.samples, self.gains = lines, samples, gains
+        self.lines, self.samples, self.factors = lines, samples, factors
         self.stored_dtype, self._parts, self.dtype = SAMPLES[kind]
-        if gains is not None:
+        if factors is not None:
             self.dtype = np.dtype(np.complex64 if self._parts == 2 else np.float32)
-            self.stored_dtype = np.dtype(np.float32)
+            self.stored_dtype = self.dtype
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -183,12 +190,16 @@ class RawFrames:
         i = operator.index(index)
         if not -len(self) <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
-        values = self.whole(i % len(self))[self.lines, self.samples]
+        i %= len(self)
+        values = self.whole(i)[self.lines, self.samples]
         if self._parts == 2:
             frame: npt.NDArray[Any] = values.astype(np.float32).view(np.complex64)[..., 0]
         else:
             frame = np.ascontiguousarray(values, dtype=SAMPLES[self.kind][2])
-        return frame if self.gains is None else (frame / self.gains[i % len(self)]).astype(self.dtype)
+        if self.factors is None:
+            return frame
+        multiplied: npt.NDArray[Any] = frame * self.factors[i % len(self.factors)]
+        return multiplied.astype(self.dtype)
 
     def whole(self, i: int) -> npt.NDArray[Any]:
         """Read a frame as it is in the file, shape (line, sample) or (line, sample, 2)."""
@@ -200,4 +211,4 @@ class RawFrames:
         return whole
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.raw, self.header, self.kind, self.lines, self.samples, self.gains)
+        return type(self), (self.raw, self.header, self.kind, self.lines, self.samples, self.factors)

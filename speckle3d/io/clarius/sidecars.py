@@ -141,11 +141,13 @@ def read_description(member: Member) -> Description:
     Raises
     ------
     FileError
-        If it cannot be read.
+        If it cannot be read, or is longer than any scanner writes.
     InvalidInputError
         Naming the field that is missing or has another unit.
     """
     where = member.where
+    if member.size > _MOST_YAML_BYTES:
+        raise FileError(f"{where}: expected at most {_MOST_YAML_BYTES} bytes, got {member.size}")
     text = member.text()
     gain_text = "".join(_GAIN_LINE.findall(text))
     documents = list(documents_of(_GAIN_LINE.sub("", text), where))
@@ -348,15 +350,3 @@ def _library() -> Any:
             'packages of Clarius scanners need PyYAML: pip install "speckle3d[clarius]"'
         ) from None
     return yaml
-
-
-def require_short(member: Member) -> None:
-    """Refuse a description longer than any scanner writes.
-
-    Raises
-    ------
-    FileError
-        Naming the file.
-    """
-    if member.size > _MOST_YAML_BYTES:
-        raise FileError(f"{member.where}: expected at most {_MOST_YAML_BYTES} bytes, got {member.size}")

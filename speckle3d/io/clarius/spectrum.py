@@ -9,6 +9,8 @@ RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise; at -10 dB no ba
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
@@ -25,6 +27,24 @@ _STEP_HZ = 0.1e6
 _CLEAR = 10.0
 """Least height of the band, in standard deviations of the mean cross-spectrum of as many spectra of noise
 alone: a quarter of it, where the edges are, is then 2.5 of them."""
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What neighbouring lines share of each frequency, and their power, means of so many spectra."""
+
+    frequency_hz: FloatArray
+    shared: FloatArray
+    power: FloatArray
+    spectra: int
+
+    def top(self, about_hz: float) -> int | None:
+        """Index of the highest within a factor of two of a frequency; None where it is not clear."""
+        near = (self.frequency_hz > 0.5 * about_hz) & (self.frequency_hz < 2 * about_hz)
+        if not near.any() or self.spectra == 0:
+            return None
+        top = int(np.flatnonzero(near)[np.argmax(self.shared[near])])
+        return top if self.shared[top] >= _CLEAR / np.sqrt(self.spectra) * self.power[top] else None
 
 
 def measured_band_hz(
@@ -46,19 +66,33 @@ def measured_band_hz(
     tuple of float, or None
         Lowest and highest frequency; None where there is no clear band.
     """
-    length = max(2 ** round(np.log2(sampling_rate_hz / _RESOLUTION_HZ)), 16)
-    shared, power, spectra = _mean_spectra(frames, length)
-    frequency = np.fft.fftshift(np.fft.fftfreq(length, 1 / sampling_rate_hz)) + (shifted_by_hz or 0.0)
-    if shifted_by_hz is None:
-        half = slice(length // 2, None)
-        shared, power, frequency = shared[half], power[half], frequency[half]
-    near = (frequency > 0.5 * about_hz) & (frequency < 2 * about_hz)
-    if not near.any():
-        return None
-    top = int(np.flatnonzero(near)[np.argmax(shared[near])])
-    if spectra == 0 or shared[top] < _CLEAR / np.sqrt(spectra) * power[top]:
-        return None
-    return _edges(shared, frequency, top)
+    found = _shared(frames, sampling_rate_hz, shifted_by_hz, (0.0, 1.0))
+    top = found.top(about_hz)
+    return None if top is None else _edges(found.shared, found.frequency_hz, top)
+
+
+def measured_centres_hz(
+    frames: Frames, sampling_rate_hz: float, about_hz: float, shifted_by_hz: float | None
+) -> tuple[float, float] | None:
+    """Measure the centre of the echoes' spectrum in the nearest and in the farthest third of the lines.
+
+    Tissue lowers it with depth. In I/Q that carry the other sign of Q, or were shifted down otherwise than is
+    said, it may rise.
+
+    Returns
+    -------
+    tuple of float, or None
+        None where one of them is not clear.
+    """
+    centres = []
+    for span in ((0.0, 1 / 3), (2 / 3, 1.0)):
+        found = _shared(frames, sampling_rate_hz, shifted_by_hz, span)
+        top = found.top(about_hz)
+        if top is None:
+            return None
+        heard = np.where(found.shared > found.shared[top] / 4, found.shared, 0.0)
+        centres.append(float(np.sum(heard * found.frequency_hz) / np.sum(heard)))
+    return centres[0], centres[1]
 
 
 def _edges(power: FloatArray, frequency: FloatArray, top: int) -> tuple[float, float] | None:
@@ -73,15 +107,19 @@ def _edges(power: FloatArray, frequency: FloatArray, top: int) -> tuple[float, f
     return (low, high) if low > 0 else None
 
 
-def _mean_spectra(frames: Frames, length: int) -> tuple[FloatArray, FloatArray, int]:
-    """Mean cross-spectrum of neighbouring lines (its real part), mean power, and of how many spectra."""
+def _shared(
+    frames: Frames, sampling_rate_hz: float, shifted_by_hz: float | None, span: tuple[float, float]
+) -> _Shared:
+    """Compare neighbouring lines within a part of their length."""
+    length = max(2 ** round(np.log2(sampling_rate_hz / _RESOLUTION_HZ)), 16)
     count, vectors, samples = frames.shape
+    begin, end = (round(part * samples) for part in span)
     window = np.hanning(length + 1)[:-1]
     shared, power, spectra = np.zeros(length), np.zeros(length), 0
     first = np.unique(np.linspace(0, vectors - 2, _PAIRS if vectors > 1 else 0).astype(int))
     for i in sorted({0, count // 2, count - 1})[:_FRAMES]:
         frame = frames[i]
-        for start in range(0, samples - length + 1, length // 2):
+        for start in range(begin, end - length + 1, length // 2):
             pair = [_spectrum(frame[lines, start : start + length], window) for lines in (first, first + 1)]
             scale = np.sqrt([np.sum(np.abs(each) ** 2, axis=1) for each in pair]).prod(axis=0)
             used = scale > 0
@@ -89,8 +127,12 @@ def _mean_spectra(frames: Frames, length: int) -> tuple[FloatArray, FloatArray, 
             shared += (one * other.conj()).real.sum(axis=0)
             power += 0.5 * (np.abs(one) ** 2 + np.abs(other) ** 2).sum(axis=0)
             spectra += int(np.count_nonzero(used))
-    shared, power = (np.fft.fftshift(each) / max(spectra, 1) for each in (shared, power))
-    return shared, power, spectra
+    frequency = np.fft.fftfreq(length, 1 / sampling_rate_hz) + (shifted_by_hz or 0.0)
+    # Real samples have each frequency twice.
+    kept = slice(0, length // 2) if shifted_by_hz is None else slice(None)
+    order = np.argsort(frequency[kept])
+    shared, power = (each[kept][order] / max(spectra, 1) for each in (shared, power))
+    return _Shared(np.asarray(frequency[kept][order]), shared, power, spectra)
 
 
 def _spectrum(part: np.ndarray, window: FloatArray) -> np.ndarray:

@@ -39,6 +39,13 @@ class SequenceFrames(LazyFrames):
     def _opened(self) -> OpenFrames:
         return _OpenSequence(self)
 
+    @property
+    def stored_dtype(self) -> np.dtype[Any]:
+        """What a sweep file needs to hold them: pairs of int16 for I and Q of 16 bits as they were read."""
+        # A turned Q may be one more than int16 holds.
+        narrow = self.dtype.kind == "c" and self.pixels.dtype.newbyteorder("=") == np.int16
+        return np.dtype(np.int16) if narrow and not self.record.conjugated else self.dtype
+
     def write_more(self, file: h5py.File) -> None:
         """Write what the sequence says beside its pixels into a sweep file."""
         write_record(file, self.record)

@@ -85,6 +85,11 @@ class Source:
             raise InvalidInputError(
                 f"{self.path}: expected pixels of images, got images of size {size[0]} x {size[1]}{what}"
             )
+        if not {*header.kinds[:2]} <= {"domain", "space", "???", "none"}:
+            raise InvalidInputError(
+                f"{self.path}: kinds: expected images on the first two axes and their list on the third, got "
+                f"{' '.join(header.kinds)}"
+            )
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
                 f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space"

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import read_header
@@ -175,6 +175,8 @@ def _narrowest(sweep: Sweep, rows: Rows) -> np.dtype[Any]:
     """Type that holds all samples; of I and Q, int16 if all are whole numbers within it."""
     if sweep.frames.dtype.kind != "c":
         return sweep.frames.dtype
+    if stored_dtype(sweep.frames) == np.int16 and not rows.conjugated:
+        return np.dtype(np.int16)
     limit = np.iinfo(np.int16)
     for i in range(len(sweep)):
         parts = np.ascontiguousarray(rows.stored(sweep.frames[i])).view(np.float32)

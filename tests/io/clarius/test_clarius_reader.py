@@ -10,13 +10,13 @@ from clarius_examples import GIVEN, sweep_of
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.core.sweep import ImageGrid, RFSettings, stored_dtype
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.raw import RawFile, RawFrames, read_header
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import companion_files, load_sweep
+from speckle3d.io.load import companion_files, import_notes, load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 
 SECOND = f"{{rx element: {0.3 / examples.ELEMENT_MM!r}"
@@ -131,7 +131,7 @@ def test_differing_gain_is_undone_relative_to_the_first_frame(tmp_path, kind):
     curves = [curve(last) for last in (30.0, 36.0, 24.0)]
     package = examples.write_package(tmp_path / "p", recorded, tgc=curves)
     found = load_sweep(package, GIVEN)
-    assert found.frames.dtype == (np.float32 if kind == "rf" else np.complex64)
+    assert found.frames.dtype == stored_dtype(found.frames) == (np.float32 if kind == "rf" else np.complex64)
     for i in range(3):
         # The scanner rounds to whole numbers, which is then divided by the gain.
         np.testing.assert_allclose(found.frames[i], sweep.frames[i], atol=0.75)
@@ -354,3 +354,50 @@ def test_real_iq_was_shifted_down_by_its_transmit_frequency(realdata):
         # The mean turn of the phase from sample to sample is the spectrum's centre.
         turn = np.angle(np.vdot(part[:, :-1], part[:, 1:]))
         assert abs(turn * 15.0 / (2 * np.pi)) < 0.01  # MHz
+
+
+@pytest.mark.parametrize(("shallow", "deep"), [(11, 8), (5, 5)])
+def test_demodulation_frequency_is_that_of_the_lines_middle(tmp_path, shallow, deep):
+    sweep = sweep_of("iq", samples=400)
+    said = f"shallowfreq: {shallow} MHz, deepfreq: {deep} MHz, filterdepth: 40 mm"
+    yml = examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"
+    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    middle_mm = sweep.grid.first_sample_depth_mm + 199.5 * sweep.grid.sample_spacing_mm
+    found = load_sweep(package, GIVEN).signal.demodulation_frequency_hz
+    assert found == pytest.approx(1e6 * (shallow + (deep - shallow) * middle_mm / 40))
+    rows = dict(row[:2] for row in describe(package))
+    assert rows["demodulation frequency from"].startswith("its yml")
+
+
+def test_iq_of_older_software_is_asked_for_its_demodulation_frequency(tmp_path):
+    sweep = sweep_of("iq")
+    package = examples.write_package(tmp_path / "p", sweep, yml=examples.yml_text(sweep).split("focus:")[0])
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(package, GIVEN)
+    assert caught.value.settings == ("demodulation_frequency_hz",)
+    require_equal(load_sweep(package, GIVEN.model_copy(update={"demodulation_frequency_hz": 6e6})), sweep)
+
+
+def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
+    """Echoes of 7 MHz, shifted down by 9 to 6 MHz, are afterwards a constant frequency at all depths."""
+    rate_hz, samples = 15e6, 600
+    depth_mm = np.arange(samples) * 1540e3 / (2 * rate_hz)
+    slid = np.interp(depth_mm, [0, 40], [9e6, 6e6])
+    phase = 2 * np.pi * (7e6 * np.arange(samples) - np.cumsum(slid) + slid / 2) / rate_hz
+    sweep = sweep_of("iq", samples=samples)
+    frames = np.tile(np.round(8000 * np.exp(1j * phase)), (len(sweep), 5, 1)).astype(np.complex64)
+    sweep = replace(sweep, frames=frames, grid=replace(sweep.grid, first_sample_depth_mm=0.0))
+    yml = examples.yml_text(sweep).split("focus:")[0]
+    said = "shallowfreq: 9 MHz, deepfreq: 6 MHz, filterdepth: 40 mm"
+    yml += f"focus:\n  - receive:\n      - {{{said}}}\n"
+    found = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), GIVEN)
+    shift_hz = found.signal.demodulation_frequency_hz
+    assert shift_hz == pytest.approx(9e6 - 3e6 * depth_mm[-1] / 2 / 40)
+    line = found.frames[1][2]
+    turn_hz = np.angle(line[1:] * line[:-1].conj()) * rate_hz / (2 * np.pi)
+    # Rounding of 8000 to whole numbers: 1e-4 rad, 200 Hz.
+    np.testing.assert_allclose(turn_hz + shift_hz, 7e6, atol=1e3)
+    assert stored_dtype(found.frames) == np.complex64
+    write_sweep(tmp_path / "sweep.h5", found)
+    np.testing.assert_array_equal(load_sweep(tmp_path / "sweep.h5").frames[1], found.frames[1])
+    assert any("turned" in each for each in import_notes(tmp_path / "p.tar", GIVEN))

@@ -1,10 +1,15 @@
 """The band of echoes is found in RF and in I/Q, in noise too, or not at all."""
 
+from dataclasses import replace
+
+import clarius_examples as examples
 import numpy as np
 import pytest
+from clarius_examples import GIVEN, sweep_of
 from scipy.signal import hilbert
 
-from speckle3d.io.clarius.spectrum import measured_band_hz
+from speckle3d.io.clarius.spectrum import measured_band_hz, measured_centres_hz
+from speckle3d.io.load import import_notes
 
 RATE_HZ = 40e6
 
@@ -38,6 +43,33 @@ def test_band_of_rf_and_of_its_iq(low, high, transmit, snr_db):
     for found in (by_rf, by_iq):
         # Some 4,000 spectra of 0.5 MHz, a window that widens the edges by 0.1, and rounding to 0.1.
         np.testing.assert_allclose(np.array(found) / 1e6, [low, high], atol=0.35)
+
+
+def attenuated():
+    """Echoes whose band falls by 1 MHz along the lines."""
+    near, middle, far = (echoes(low, low + 4e6, 30, samples=400) for low in (4.5e6, 4e6, 3.5e6))
+    return np.concatenate([near, middle, far], axis=-1)
+
+
+def test_attenuation_lowers_the_centre_and_the_other_sign_of_q_raises_it():
+    rf = attenuated()
+    iq = as_iq(rf, 6e6)
+    by_rf = measured_centres_hz(rf, RATE_HZ, 6e6, None)
+    by_iq = measured_centres_hz(iq, RATE_HZ / 2, 6e6, 6e6)
+    np.testing.assert_allclose(np.array([by_rf, by_iq]) / 1e6, [[6.5, 5.5]] * 2, atol=0.2)
+    mirrored = measured_centres_hz(iq.conj(), RATE_HZ / 2, 6e6, 6e6)
+    np.testing.assert_allclose(np.array(mirrored) / 1e6, [5.5, 6.5], atol=0.2)
+
+
+def test_a_package_with_the_other_sign_of_q_is_noted(tmp_path):
+    rf = attenuated()[:, :12]
+    for iq, odd in ((as_iq(rf, 6e6), False), (as_iq(rf, 6e6).conj(), True)):
+        sweep = sweep_of("iq", frames=3, vectors=12, samples=iq.shape[-1])
+        signal = replace(sweep.signal, sampling_rate_hz=RATE_HZ / 2)
+        grid = replace(sweep.grid, sample_spacing_mm=signal.sample_spacing_mm)
+        sweep = replace(sweep, frames=np.round(10 * iq), signal=signal, grid=grid)
+        package = examples.write_package(tmp_path / f"{odd}.tar", sweep)
+        assert any("Q has the other sign" in each for each in import_notes(package, GIVEN)) == odd
 
 
 def test_noise_has_no_band():

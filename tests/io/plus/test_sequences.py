@@ -121,11 +121,13 @@ def test_rf_and_i_and_q_of_every_layout_survive(tmp_path, orientation, kind, dty
     path = write_mha(tmp_path / "in.mha", values, fields)
     sweep = load_sweep(path, RF)
     out = tmp_path / "out.mha"
-    assert write_sequence(out, sweep) == []
-    assert_same(out, path)
-    again = load_sweep(out)
-    np.testing.assert_array_equal(again.frames[1], sweep.frames[1])
-    assert (again.grid, again.signal) == (sweep.grid, sweep.signal)
+    write_sweep(tmp_path / "a.h5", sweep)
+    for source in (sweep, read_sweep(tmp_path / "a.h5")):
+        assert write_sequence(out, source) == []
+        assert_same(out, path)
+        again = load_sweep(out)
+        np.testing.assert_array_equal(again.frames[1], sweep.frames[1])
+        assert (again.grid, again.signal) == (sweep.grid, sweep.signal)
 
 
 def test_the_least_of_16_bits_survives_a_turned_sign_of_q(tmp_path):
@@ -295,6 +297,13 @@ def test_frames_go_to_other_processes_and_are_opened_again(tmp_path):
     for each in (frames, again):
         np.testing.assert_array_equal(each[1], expected)
     assert again.record == frames.record
+
+
+@pytest.mark.parametrize("kinds", ["list domain domain", "vector domain domain", "domain list domain"])
+def test_frames_on_another_axis_are_not_taken_for_columns(tmp_path, kinds):
+    path = write_mha(tmp_path / "a.mha", grey(), {"Kinds": kinds}, frames=[])
+    with pytest.raises(InvalidInputError, match=rf"a\.mha: kinds: .*{kinds}"):
+        load_sweep(path, BMODE.model_copy(update={"frame_rate_hz": 10.0}))
 
 
 def test_names_of_other_files_are_refused(tmp_path):
