@@ -265,6 +265,14 @@ def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
     assert {*caught.value.settings} == wanted
 
 
+@pytest.mark.parametrize("spacing", ["0 0.3 1", "0.02 -1 1"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16])
+def test_spacing_is_above_zero(tmp_path, spacing, dtype):
+    path = write_mha(tmp_path / "a.mha", grey().astype(dtype), spacing=spacing)
+    with pytest.raises(InvalidInputError, match=r"a\.mha: spacing of pixels: expected above zero"):
+        load_sweep(path, ImportSettings(dynamic_range_db=60.0))
+
+
 def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     path = write_mha(tmp_path / "a.mha", grey(), {"Kinds": "domain domain domain"}, frames=[])
     with pytest.raises(InvalidInputError, match=r"a\.mha: .*got a volume"):
