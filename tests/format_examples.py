@@ -113,7 +113,17 @@ def region(left, top, right, bottom, **changes):
     return made
 
 
-def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None, claimed=None, **elements):
+def write_dicom(
+    path,
+    images,
+    regions=(),
+    photometric="MONOCHROME2",
+    syntax=None,
+    claimed=None,
+    packed=None,
+    deflated=None,
+    **elements,
+):
     """Write `images` (frame, row, column[, colour]) as a scanner does, packed by `syntax` or `claimed` so."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.sequence import Sequence
@@ -144,9 +154,10 @@ def write_dicom(path, images, regions=(), photometric="MONOCHROME2", syntax=None
     if claimed is not None:
         from pydicom.encaps import encapsulate
 
-        made.PixelData = encapsulate([image.tobytes() for image in images])
+        made.PixelData = encapsulate(packed or [image.tobytes() for image in images])
         made["PixelData"].is_undefined_length = True
         meta.TransferSyntaxUID = claimed
+    meta.TransferSyntaxUID = deflated or meta.TransferSyntaxUID
     made.save_as(path, enforce_file_format=True)
     return path
 

@@ -120,8 +120,11 @@ def _describe(path: Path, settings: ImportSettings) -> list[Row]:
         return _recording(path).rows(settings)
     except InvalidInputError:
         # Why there is no sweep is told beside these rows.
-        with open_regular(path) as stream:
-            return list(_notes(*read_header(path, stream)))
+        try:
+            with open_regular(path) as stream:
+                return list(_notes(*read_header(path, stream)))
+        except InvalidInputError:
+            return [("elements", "not read", "")]
 
 
 def _recording(path: Path) -> Recording:

@@ -35,8 +35,8 @@ class Found:
 
 
 ASSUMED = {
-    "speed_of_sound_m_s": Found(SPEED_OF_SOUND_M_S, "assumed: the file does not say"),
-    "first_sample_depth_mm": Found(0.0, "assumed: the file does not say"),
+    "speed_of_sound_m_s": Found(SPEED_OF_SOUND_M_S, "assumed"),
+    "first_sample_depth_mm": Found(0.0, "assumed"),
 }
 
 
@@ -159,10 +159,10 @@ def _row(name: str, one: Found, settings: ImportSettings) -> Row:
     if unit == "Hz" and words[0] != "frame":
         unit = "MHz"
     if given is not None:
-        return f"{spoken}, given", _shown(given, unit), unit
+        return spoken, f"{_shown(given, unit)} (given)", unit
     if one.value is None:
-        return f"{spoken}, missing", f"--{name.replace('_', '-')}", ""
-    return f"{spoken}, {one.source}", _shown(one.value, unit), unit
+        return spoken, f"missing: --{name.replace('_', '-')}", ""
+    return spoken, f"{_shown(one.value, unit)} ({one.source})", unit
 
 
 def _shown(value: Any, unit: str) -> str:

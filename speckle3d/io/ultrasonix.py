@@ -107,9 +107,11 @@ def _claims(path: Path, start: bytes) -> bool:
 
 
 def _describe(path: Path, settings: ImportSettings) -> list[Row]:
-    header, _ = _header(path)
-    rows = _notes(header)
-    return rows if header.kind not in _BITS else [*_recording(path).rows(settings)]
+    try:
+        return _recording(path).rows(settings)
+    except InvalidInputError:
+        # Why there is no sweep is told beside these rows.
+        return _notes(_header(path)[0])
 
 
 def _notes(header: _Header) -> list[Row]:

@@ -302,7 +302,7 @@ def _demodulation(
     with naming(str(path)):
         told = demodulation_of(frames, middle, 1e3 * speed / (2.0 * spacing_mm))
     frames.close()
-    return Found(told, "scan/demodulation_frequency, removed or not as the phase of the data tells")
+    return Found(told, "of scan/demodulation_frequency and the phase of the data")
 
 
 def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:

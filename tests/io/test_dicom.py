@@ -115,6 +115,35 @@ def test_packed_pixels_are_those_of_unpacked_ones(tmp_path):
     np.testing.assert_array_equal(read(load_sweep(path, RANGE)), cropped(images()))
 
 
+def test_pixels_packed_with_loss_are_close_and_told(tmp_path):
+    from io import BytesIO
+
+    from PIL import Image
+    from pydicom.uid import JPEGBaseline8Bit
+
+    shown = np.array([np.add.outer(np.arange(50), 2 * np.arange(30)) + i for i in range(4)]).astype(np.uint8)
+    packed = []
+    for image in shown:
+        stream = BytesIO()
+        Image.fromarray(image).save(stream, "JPEG", quality=95)
+        packed.append(stream.getvalue())
+    given = {"claimed": JPEGBaseline8Bit, "packed": packed, "LossyImageCompression": "01"}
+    path = write_dicom(tmp_path / "a.dcm", shown, [region(*BOX)], **given)
+    # A smooth image at quality 95 comes back within 3 levels.
+    difference = read(load_sweep(path, RANGE)).astype(int) - cropped(shown)
+    assert np.abs(difference).max() <= 3
+    assert ("pixels", "packed with loss, which smooths speckle", "") in describe(path)
+
+
+def test_a_deflated_file_says_why_it_is_not_read(tmp_path):
+    from pydicom.uid import DeflatedExplicitVRLittleEndian
+
+    path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)], deflated=DeflatedExplicitVRLittleEndian)
+    with pytest.raises(InvalidInputError, match="got Deflated Explicit VR Little Endian"):
+        load_sweep(path, RANGE)
+    assert describe(path)[-1][0] == "sweep"
+
+
 def test_what_cannot_be_unpacked_here_names_the_syntax_and_the_package(tmp_path):
     from pydicom.pixels import get_decoder
     from pydicom.uid import JPEGLSLossless

@@ -82,7 +82,9 @@ def test_what_is_missing_is_asked_for_at_once_and_told(tmp_path):
         load_sweep(path)
     assert caught.value.settings == ("centre_frequency_hz", "bandwidth_hz", "frame_rate_hz")
     rows = {name: value for name, value, _ in describe(path)}
-    assert rows["bandwidth, missing"] == "--bandwidth-hz"
+    assert rows["speed of sound"] == "1540 (assumed)"
+    assert rows["bandwidth"] == "missing: --bandwidth-hz"
+    assert rows["first sample depth"] == "4 (in b_data/scan/z_axis)"
     assert rows["frame rate of videos made of it, not used"] == "1"
     assert rows["sweep"].startswith("none: ")
 

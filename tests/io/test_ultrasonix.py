@@ -83,6 +83,8 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, name):
     with pytest.raises(Speckle3DError, match=said) as caught:
         load_sweep(path, RF)
     assert "\n" not in str(caught.value)
+    if name in ("no frames", "colour Doppler", "of 8 bits"):
+        assert describe(path)[-1][0] == "sweep"
 
 
 def test_a_file_cut_while_it_is_read_is_an_error(tmp_path):
