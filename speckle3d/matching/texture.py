@@ -100,6 +100,11 @@ def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[
     return frequency_hz, np.maximum(power - noise, 1e-12 * power.max())
 
 
+def doubt_images(sweep: Sweep) -> tuple[Doubt, ...]:
+    """What a sweep's samples say against what is claimed of them."""
+    return (*doubt_band(sweep), *doubt_sign(sweep), *doubt_white(sweep))
+
+
 def doubt_band(sweep: Sweep) -> tuple[Doubt, ...]:
     """Doubt a sampling rate or a band that the echoes contradict.
 

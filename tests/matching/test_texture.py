@@ -138,9 +138,7 @@ def test_i_and_q_in_the_band_are_believed_and_above_it_refuted(low, high):
     assert doubt.refuted
 
 
-@pytest.mark.parametrize(
-    ("gain_db", "doubted"), [(-30.0, False), (-22.0, False), (-12.0, False), (0.0, True)]
-)
+@pytest.mark.parametrize(("gain_db", "doubted"), [(-30.0, False), (-12.0, False), (0.0, True)])
 def test_images_cut_off_at_white_are_doubted(seen, gain_db, doubted):
     decibel = 10 * np.log10(np.maximum(seen, 1e-9) / seen.mean()) + gain_db
     grey = np.rint(255 * np.clip(1 + decibel / 60.0, 0, 1)).astype(np.uint8)
