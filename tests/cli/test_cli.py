@@ -157,12 +157,20 @@ def test_reslice(run, reconstructed, tmp_path, options):
     assert (tmp_path / "r.png").read_bytes().startswith(PNG)
 
 
-def test_convert_copies_a_sweep(run, bench, tmp_path):
-    code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5")
+@pytest.mark.parametrize(("options", "packing"), [((), "gzip"), (("--compression", "none"), None)])
+def test_convert_copies_a_sweep(run, bench, tmp_path, options, packing):
+    code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5", *options)
     assert code == 0, err
+    with h5py.File(tmp_path / "copy.h5") as file:
+        assert file["rf"].compression == packing
     first, second = load_sweep(bench / "sweep.h5"), load_sweep(tmp_path / "copy.h5")
     np.testing.assert_array_equal(first.frames[3], second.frames[3])
     np.testing.assert_allclose(first.truth.as_matrix(), second.truth.as_matrix(), atol=1e-12)
+
+
+def test_an_unknown_compression_is_named(refused, bench, tmp_path):
+    said = refused("convert", bench / "sweep.h5", tmp_path / "copy.h5", "--compression", "zip")
+    assert "--compression: expected gzip, lzf, none, got 'zip'" in said
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("reconstruct", "--help"), ("calibrate", "--help")])
