@@ -36,7 +36,7 @@ from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import doubt_band, doubt_sign
+from speckle3d.matching.texture import doubt_images
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import DepthFactors, doubt_depths, doubt_widths
 from speckle3d.motion.curve_prior import RowsSeen, rows_seen, straightened
@@ -175,7 +175,7 @@ def track(
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
     doubts = unrefuted(
-        [*doubt_depths(curves, matcher.laid, matcher.patches), *doubt_band(sweep), *doubt_sign(sweep)],
+        [*doubt_depths(curves, matcher.laid, matcher.patches), *doubt_images(sweep)],
         sweep.name,
         MismatchError,
     )

@@ -17,6 +17,7 @@ from speckle3d.core.reconstruction import FramePairs, Provenance
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
+from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.points import PickedPoints, write_points
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
@@ -71,6 +72,9 @@ WRITERS = {
     "calibration.h5": lambda path: write_calibration(path, made()),
     "sweep.h5": lambda path: write_sweep(path, SWEEP),
     "plain.h5": lambda path: write_sweep(path, SWEEP, compression=None),
+    "sequence.mha": lambda path: write_sequence(path, SWEEP),
+    "sequence.mhd": lambda path: write_sequence(path, SWEEP, compressed=False),
+    "sequence.nrrd": lambda path: write_sequence(path, SWEEP),
     "attached.h5": lambda path: attach_orientation(path, SWEEP.orientation),
     "reconstruction.h5": reconstruction,
     "volume.nrrd": lambda path: write_volume(path, VOLUME),

@@ -175,8 +175,8 @@ class FrameInspector:
         samples = np.ascontiguousarray(frame)
         if np.iscomplexobj(samples):
             samples = samples.view(samples.real.dtype)
-        # Every eighth vector tells how strong samples as read are, and whether they are counts, as I/Q are, too,
-        # that come from pairs of integers.
+        # Every eighth vector tells how strong samples as read are, and whether they are counts. Those of I/Q
+        # are, if they come from pairs of integers.
         some = samples[::8]
         counted = samples.dtype.kind in "iu" or bool((some == np.rint(some)).all())
         floor, clipped = self._rails(samples, counted)

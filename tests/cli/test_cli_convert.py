@@ -44,6 +44,7 @@ def test_the_suffix_of_out_says_what_is_written(done, sequence, tmp_path):
     assert (tmp_path / "d.zraw").is_file()
     done("convert", h5, mhd, "--compression", "none")
     assert (tmp_path / "d.raw").stat().st_size == grey().size
+    assert not (tmp_path / "d.zraw").exists()  # of the header that was replaced
 
 
 def test_what_a_sequence_does_not_hold_is_said(done, tmp_path):

@@ -153,7 +153,10 @@ def metaimages(folder):
         b"CompressedData = False", f"CompressedData = True\nCompressedDataSize = {len(packed)}".encode()
     )
     (folder / "c.mha").write_bytes(head + b"LOCAL\n" + packed)
-    return [plain, folder / "b.mhd", folder / "c.mha"]
+    pairs = np.random.default_rng(0).integers(-32768, 32767, (3, 4, 6)).astype(np.int16)
+    fields = {"UltrasoundImageOrientation": "NM", "UltrasoundImageType": "RF_I_LINE_Q_LINE"}
+    echoes = image_examples.write_mha(folder / "d.mha", pairs, fields, frames, "0.02 0.3 1")
+    return [plain, folder / "b.mhd", folder / "c.mha", echoes]
 
 
 def nrrds(folder):
@@ -306,14 +309,17 @@ def read_described(reader):
 def read_image(path):
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.metaimage import read_metaimage, read_poses
+    from speckle3d.io.plus.write import write_sequence
 
-    settings = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
-    frames = read_metaimage(path, settings).frames
+    grey = {"column_pitch_mm": 0.1, "row_spacing_mm": 0.2, "dynamic_range_db": 60.0}
+    echoes = {"centre_frequency_hz": 6e6, "bandwidth_hz": (4e6, 8e6), "demodulation_frequency_hz": 0.0}
+    sweep = read_metaimage(path, ImportSettings(**grey, **echoes))
     try:
-        for i in range(frames.shape[0]):
-            frames[i]
+        # Reads all frames, and what is written of their fields is read as well.
+        write_sequence(path.with_name("written.mha"), sweep)
+        read_metaimage(path.with_name("written.mha"))
     finally:
-        frames.close()
+        sweep.frames.close()
     read_poses(path)
 
 

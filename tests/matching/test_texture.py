@@ -11,7 +11,7 @@ from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.texture import doubt_band, doubt_sign, speckle_size
+from speckle3d.matching.texture import doubt_band, doubt_sign, doubt_white, speckle_size
 
 GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
 """Fine enough to hold intensities as they are."""
@@ -136,6 +136,17 @@ def test_i_and_q_in_the_band_are_believed_and_above_it_refuted(low, high):
     wrong = replace(sweep, signal=replace(baseband, demodulation_frequency_hz=12e6))
     (doubt,) = doubt_band(wrong)
     assert doubt.refuted
+
+
+@pytest.mark.parametrize(("gain_db", "doubted"), [(-30.0, False), (-12.0, False), (0.0, True)])
+def test_images_cut_off_at_white_are_doubted(seen, gain_db, doubted):
+    decibel = 10 * np.log10(np.maximum(seen, 1e-9) / seen.mean()) + gain_db
+    grey = np.rint(255 * np.clip(1 + decibel / 60.0, 0, 1)).astype(np.uint8)
+    sweep = grey_sweep(seen)
+    found = doubt_white(replace(sweep, frames=grey, signal=BModeSettings(60.0)))
+    assert [(doubt.suspect, doubt.refuted) for doubt in found] == doubted * [("gain", False)]
+    # Speckle's intensity is above its mean with probability 1 / e.
+    assert not doubted or "at full white, got 3" in found[0].evidence
 
 
 def test_noise_and_grey_levels_tell_nothing_of_the_band(seen):

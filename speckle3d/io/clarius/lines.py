@@ -118,6 +118,17 @@ def require_roi(said: Description) -> None:
             )
 
 
+def probe_name(said: Description, probe: str | None) -> str:
+    """Name a probe in one spelling, so that curves and calibrations of it are found to be of it."""
+    named = probe or said.probe
+    model = _model(named)
+    return f"Clarius {model}" if model in ELEMENT_PITCH_MM else named
+
+
+def _model(named: str) -> str:
+    return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
+
+
 def element_pitch_mm(said: Description, probe: str | None) -> tuple[float | None, str]:
     """Distance between elements and where it is from; None where neither yml nor model tells.
 
@@ -131,7 +142,7 @@ def element_pitch_mm(said: Description, probe: str | None) -> tuple[float | None
     named = probe or said.probe
     if not named:
         return None, ""
-    model = re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
+    model = _model(named)
     if model in ELEMENT_PITCH_MM:
         return ELEMENT_PITCH_MM[model], f"the maker's table, {model}"
     if model.startswith(CONVEX):

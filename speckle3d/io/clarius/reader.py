@@ -16,7 +16,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, OrientationSensor, RFSettings, Sweep
 from speckle3d.io.clarius import imu
 from speckle3d.io.clarius.demodulation import middle_hz, turns_to
-from speckle3d.io.clarius.lines import Place, element_pitch_mm, place_of, require_roi
+from speckle3d.io.clarius.lines import Place, element_pitch_mm, place_of, probe_name, require_roi
 from speckle3d.io.clarius.package import Recording, find_recording
 from speckle3d.io.clarius.raw import SAMPLES, RawFile, RawFrames, RawHeader, read_header, read_times_ns
 from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
@@ -75,7 +75,7 @@ def read_package(path: Path, settings: ImportSettings) -> Sweep:
         frame_time_s=chosen.times_ns / 1e9,
         orientation=orientation_of(recording),
         name=printable(recording.name or path.stem),
-        probe=settings.probe or said.probe,
+        probe=probe_name(said, settings.probe),
     )
 
 

@@ -7,6 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius import imu
@@ -44,6 +46,7 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
         samples = imu.read_samples(recording.sensor)
         rows += imu.sensor_rows(samples, imu.fits_of(samples))
     with suppress(InvalidInputError):  # said where the sweep is
+        rows += _covered_rows(recording)
         rows += [("note", each, "") for each in package_notes(path, settings)]
     return rows
 
@@ -165,6 +168,18 @@ def _chosen_rows(recording: Recording, path: Path, settings: ImportSettings) -> 
     if said.kind == "IQ":
         rows.append(("demodulation frequency from", _shift_source(said, settings), ""))
     return [*rows, ("gain by frame", _gain_said(recording, chosen), "")]
+
+
+def _covered_rows(recording: Recording) -> list[Row]:
+    """Frames of the sweep that the sensor says nothing of."""
+    sensor = orientation_of(recording)
+    if sensor is None:
+        return []
+    frame_s, time_s = choose(recording).times_ns / 1e9, sensor.readings.time_s
+    before, after = int(np.sum(frame_s < time_s[0])), int(np.sum(frame_s > time_s[-1]))
+    in_pauses = int(np.sum(~sensor.covers(frame_s))) - before - after
+    told = f"{before} before the sensor's first sample, {after} after its last, {in_pauses} in pauses"
+    return [("frames without orientation", told, "")]
 
 
 def _is_odd(near_hz: float, far_hz: float, transmit_hz: float) -> bool:

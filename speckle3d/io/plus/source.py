@@ -150,6 +150,8 @@ class Source:
         if lateral is not None:
             return lateral, own.get("row_spacing_mm")
         held = self.header.spacing_mm
+        if held is not None and not min(held) > 0:
+            raise InvalidInputError(f"{self.path}: spacing of pixels: expected above zero, got {held}")
         if held is not None and self.layout.has_lines_in_rows:
             held = held[::-1]
         calibrated = self._calibrated_pixel_mm()

@@ -17,8 +17,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike
+from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
@@ -88,11 +89,17 @@ def write_sequence(
     if suffix == ".mhd":
         beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
         _require_own(target, target.with_name(beside))
-        with FileSet(target.name, (beside,)).replaced(target.parent) as part:
-            with (part / beside).open("wb") as file:
-                size = images.write(file, 15 if compressed else None)
-            with (part / target.name).open("wb") as file:
-                file.write(_meta_header(images, rows, beside, size if compressed else None))
+        files = FileSet(target.name, (beside,), _left_by(target, beside))
+        with files.replaced(target.parent) as part:
+            try:
+                with (part / beside).open("wb") as file:
+                    size = images.write(file, 15 if compressed else None)
+                header = _meta_header(images, rows, beside, size if compressed else None)
+                (part / target.name).write_bytes(header)
+            except Speckle3DError:
+                raise
+            except OSError as error:
+                raise cannot_write(path, error) from error
         return rows.left_out
     with atomic_path(target) as part, part.open("wb") as file:
         if suffix == ".nrrd":
@@ -115,6 +122,14 @@ def _require_own(header: Path, data: Path) -> None:
         return
     if not header.exists() or read_header(header).pixels.path != data.resolve():
         raise InvalidInputError(f"{data}: is there and no part of {header.name}: give another name")
+
+
+def _left_by(header: Path, beside: str) -> tuple[str, ...]:
+    """Name of the pixels that a header leaves behind which is replaced by one with other pixels."""
+    if not header.exists():
+        return ()
+    names = {f"{header.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
+    return tuple(names & {read_header(header).pixels.path.name})
 
 
 _SIZE_FIELD = b"CompressedDataSize = "

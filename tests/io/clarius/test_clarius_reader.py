@@ -53,7 +53,7 @@ def test_what_is_written_is_read(tmp_path, kind, packed, place):
     package = examples.write_package(tmp_path / place, sweep, packed=packed)
     found = load_sweep(package, GIVEN)
     require_equal(found, sweep)
-    assert found.probe == "Clarius L7 HD3"
+    assert found.probe == "Clarius L7HD3"
     assert found.frames.stored_dtype == (np.uint8 if kind == "env" else np.int16)
 
 
@@ -260,6 +260,23 @@ def test_probes_without_a_published_pitch_or_parallel_lines_are_refused(tmp_path
     package = examples.write_package(tmp_path / "p", sweep_of("rf"))
     with pytest.raises(InvalidInputError, match=message):
         load_sweep(package, ImportSettings(probe=probe))
+
+
+@pytest.mark.parametrize("probe", ["l15hd3", "L15 HD3", "Clarius L15-HD3"])
+def test_a_probe_has_one_name_however_it_is_typed(tmp_path, probe):
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"))
+    found = load_sweep(package, ImportSettings(probe=probe, bandwidth_hz=(4e6, 8e6)))
+    assert found.probe == "Clarius L15HD3"
+    assert found.grid.vector_pitch_mm == pytest.approx(0.3 / 0.2 * 0.26)
+
+
+def test_frames_that_the_sensor_does_not_cover_are_told(tmp_path):
+    sweep = sweep_of("rf")
+    times = examples.bursts_s(sweep.frame_time_s[1], sweep.frame_time_s[2] + 0.06)
+    late = replace(sweep, orientation=examples.sensor_of(examples.swayed(times), times))
+    rows = dict(row[:2] for row in describe(examples.write_package(tmp_path / "p", late)))
+    told = "1 before the sensor's first sample, 1 after its last, 0 in pauses"
+    assert rows["frames without orientation"] == told
 
 
 def test_frame_times_that_do_not_rise_are_named(tmp_path):

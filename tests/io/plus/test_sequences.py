@@ -112,9 +112,15 @@ def test_every_field_survives_a_sweep_file_and_each_container(tmp_path, suffix, 
         )
 
 
-@pytest.mark.parametrize("orientation", ["FM", "NM", "FU", "NU", "MF", "UN"])
+@pytest.mark.parametrize(
+    ("orientation", "dtype"),
+    [
+        *((each, np.int16) for each in ("FM", "NM", "FU", "NU", "MF", "UN")),
+        ("FM", np.int32),
+        ("UN", np.float32),
+    ],
+)
 @pytest.mark.parametrize("kind", ["RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE"])
-@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
 def test_rf_and_i_and_q_of_every_layout_survive(tmp_path, orientation, kind, dtype):
     values = np.random.default_rng(3).integers(-3000, 3000, (2, 6, 8)).astype(dtype)
     fields = {"UltrasoundImageOrientation": orientation, "UltrasoundImageType": kind}
@@ -263,6 +269,14 @@ def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
         load_sweep(path)
     wanted = {"sampling_rate_hz", "vector_pitch_mm", "centre_frequency_hz", "bandwidth_hz", "frame_rate_hz"}
     assert {*caught.value.settings} == wanted
+
+
+@pytest.mark.parametrize("spacing", ["0 0.3 1", "0.02 -1 1"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16])
+def test_spacing_is_above_zero(tmp_path, spacing, dtype):
+    path = write_mha(tmp_path / "a.mha", grey().astype(dtype), spacing=spacing)
+    with pytest.raises(InvalidInputError, match=r"a\.mha: spacing of pixels: expected above zero"):
+        load_sweep(path, ImportSettings(dynamic_range_db=60.0))
 
 
 def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
