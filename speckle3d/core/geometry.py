@@ -171,7 +171,9 @@ def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
         index = first[0] if len(first) == 1 else first
-        raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {values[first]}")
+        with np.errstate(invalid="ignore"):  # some NaN of single precision are signals
+            shown = str(values[first])
+        raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {shown}")
 
 
 def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:

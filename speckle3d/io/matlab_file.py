@@ -7,7 +7,6 @@ An array is named as in MATLAB, ``RcvData{1}`` or ``Trans.spacing`` or ``Receive
 from __future__ import annotations
 
 import re
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,21 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.files import open_regular, plausible_bytes
+from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
 from speckle3d.io.hdf5 import SIGNATURE, find_member, one_line, open_hdf5, reading, require_dataset
 from speckle3d.io.hdf5_guard import plain_attribute, require_readable
 from speckle3d.io.lazy import HDF5Slices, Turn
+from speckle3d.io.matlab_guard import require_sound
 
 USER_BLOCK = 512
 """Bytes of text before the HDF5 part of version 7.3."""
 
-_HEADER_BYTES, _PIECE_BYTES = 128, 2**20
-_COMPRESSED = 15
-_MOST_TIMES_PACKED = 256
-"""As of image sequences: an array made in advance and half filled packs well."""
 _MOST_LEVELS, _MOST_LISTED, _MOST_ELEMENTS = 4, 400, 8
 _STEP = re.compile(r"([A-Za-z]\w*)(?:\((\d{1,6})\)|\{(\d{1,6})\})?")
 
@@ -242,7 +238,7 @@ class _OldFile(MatFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        _require_plausible(path)
+        require_sound(path)
         self._loaded: dict[str, Any] = {}
 
     def arrays(self) -> list[Listed]:
@@ -346,41 +342,3 @@ def _kind(dtype: np.dtype[Any]) -> str:
 def _complex(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Complex numbers of HDF5's pairs; others as they are."""
     return values["real"] + 1j * values["imag"] if values.dtype.names else values
-
-
-def _require_plausible(path: Path) -> None:
-    """Refuse a file of version 5 to 7 whose packed variables unpack to far more than any recording does.
-
-    SciPy makes room for what a variable claims; here it is unpacked piece by piece, and thrown away.
-    """
-    with open_regular(path) as stream:
-        size = stream.seek(0, 2)
-        stream.seek(_HEADER_BYTES - 2)
-        order = "<" if stream.read(2) == b"IM" else ">"
-        most, unpacked, at = plausible_bytes(size, _MOST_TIMES_PACKED), 0, _HEADER_BYTES
-        while at + 8 <= size:
-            stream.seek(at)
-            kind, length = np.frombuffer(stream.read(8), f"{order}u4").tolist()
-            if length > size - at - 8:
-                held = size - at - 8
-                raise FileError(
-                    f"{path}: variable at byte {at}: expected {length} bytes, got {held}: truncated"
-                )
-            if kind == _COMPRESSED:
-                unpacked += _unpacked_bytes(stream, length, most - unpacked)
-            at += 8 + length
-            if unpacked > most:
-                raise InvalidInputError(
-                    f"{path}: expected at most {most} bytes of variables, got more packed"
-                )
-
-
-def _unpacked_bytes(stream: Any, length: int, most: int) -> int:
-    unpacker, total = zlib.decompressobj(), 0
-    while length > 0 and not unpacker.eof and total <= most:
-        packed = stream.read(min(length, _PIECE_BYTES))
-        length -= len(packed)
-        while packed and total <= most:
-            total += len(unpacker.decompress(packed, _PIECE_BYTES))
-            packed = unpacker.unconsumed_tail
-    return total
