@@ -16,7 +16,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, OrientationSensor, RFSettings, Sweep
 from speckle3d.io.clarius import imu
 from speckle3d.io.clarius.demodulation import middle_hz, turns_to
-from speckle3d.io.clarius.lines import Place, element_pitch_mm, place_of, probe_name, require_roi
+from speckle3d.io.clarius.lines import Place, pitch_of, place_of, probe_name, require_roi
 from speckle3d.io.clarius.package import Recording, find_recording
 from speckle3d.io.clarius.raw import SAMPLES, RawFile, RawFrames, RawHeader, read_header, read_times_ns
 from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
@@ -149,7 +149,7 @@ def is_padded(chosen: Chosen) -> bool:
     roi = chosen.said.roi
     if roi is None:
         return False
-    every = _frames(chosen, Place(slice(None), slice(None), 0.0, 1.0, 0.0))
+    every = _frames(chosen, Place(slice(None), slice(None), 0.0, 0.0, 1.0, 0.0))
     for i in {0, len(every) // 2, len(every) - 1}:
         frame = np.array(every.whole(i))
         frame[roi.start_line : roi.end_line + 1, roi.start_sample : roi.end_sample + 1] = 0
@@ -165,15 +165,14 @@ def _frames(chosen: Chosen, place: Place, factors: npt.NDArray[Any] | None = Non
 def values_of(path: Path, chosen: Chosen, place: Place, settings: ImportSettings) -> dict[str, float]:
     """Numbers of the sweep, the given ones over the package's own; all that lack are asked for at once."""
     said = chosen.said
-    element_mm, _ = (None, "") if settings.vector_pitch_mm else element_pitch_mm(said, settings.probe)
+    pitch = pitch_of(said, place, settings)
     speed = settings.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
     rate_hz = settings.sampling_rate_hz or said.sampling_rate_hz
-    known = settings.vector_pitch_mm is not None or element_mm is not None
     found: dict[str, float | None] = {
         "sampling_rate_hz": rate_hz,
         "speed_of_sound_m_s": speed,
         # A probe's model is easier told than the distance between its lines.
-        "vector_pitch_mm" if known else "probe": (element_mm or 0.0) * place.elements_per_line or None,
+        "probe" if pitch is None else "vector_pitch_mm": None if pitch is None else pitch.vector_mm,
         "first_sample_depth_mm": place.first_depth_mm(rate_hz, speed),
     }
     if said.kind == "envelope":

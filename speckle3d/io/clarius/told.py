@@ -12,7 +12,7 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius import imu
-from speckle3d.io.clarius.lines import Place, element_pitch_mm, place_of
+from speckle3d.io.clarius.lines import Place, pitch_of, place_of, probe_name
 from speckle3d.io.clarius.package import KINDS, Recording, find_recording
 from speckle3d.io.clarius.reader import (
     Chosen,
@@ -73,6 +73,7 @@ def package_notes(path: Path, settings: ImportSettings) -> Sequence[str]:
                 "were sent, and tissue takes high frequencies away: I/Q were shifted down otherwise than is "
                 "said, Q has the other sign, or it is a harmonic image"
             )
+    notes += _pitch_notes(chosen.said, place_of(chosen.said, is_padded(chosen)), settings)
     source = _shift_source(chosen.said, settings)
     if chosen.said.kind == "IQ" and "turned" in source:
         notes.append(f"demodulation frequency from {source}")
@@ -140,13 +141,9 @@ def _chosen_rows(recording: Recording, path: Path, settings: ImportSettings) -> 
     if said.roi is not None:
         outside = "empty, left out" if padded else "not empty, kept"
         rows.append(("outside the region of interest", outside, ""))
-    element_mm, source = (None, "") if settings.vector_pitch_mm else element_pitch_mm(said, settings.probe)
-    pitch = "as given" if settings.vector_pitch_mm else "not said"
-    if element_mm is not None:
-        pitch = f"{place.elements_per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
     speed = settings.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
     rows += [
-        ("vector pitch from", pitch, ""),
+        *_pitch_rows(said, place, settings),
         ("first line at element", f"{place.first_element:g}, taken as the image's left", ""),
         ("lines taken as", "parallel, of a linear array: its yml does not say", ""),
         ("first sample's depth from", *_depth_source(place, said, speed, settings)),
@@ -168,6 +165,45 @@ def _chosen_rows(recording: Recording, path: Path, settings: ImportSettings) -> 
     if said.kind == "IQ":
         rows.append(("demodulation frequency from", _shift_source(said, settings), ""))
     return [*rows, ("gain by frame", _gain_said(recording, chosen), "")]
+
+
+def _pitch_rows(said: Description, place: Place, settings: ImportSettings) -> list[Row]:
+    """Where the distance between lines is from, and how large it makes elements, array and image."""
+    rows: list[Row] = [("elements per line", f"{place.elements_per_line:.6g}", "")]
+    pitch = pitch_of(said, place, settings)
+    if pitch is None:
+        return [*rows, ("vector pitch from", "not said", "")]
+    first, last = said.geometry.receive_element[[0, -1]]
+    width_mm = (place.last_element - place.first_element) * pitch.element_mm
+    return [
+        *rows,
+        ("vector pitch from", pitch.source, ""),
+        ("element pitch, by it", f"{pitch.element_mm:.4g}", "mm"),
+        ("width of the image, by it", f"{width_mm:.2f}", "mm"),
+        (
+            f"array from element {first:g} to {last:g}, by it",
+            f"{(last - first) * pitch.element_mm:.2f}",
+            "mm",
+        ),
+    ]
+
+
+def _pitch_notes(said: Description, place: Place, settings: ImportSettings) -> list[str]:
+    """Say what a distance between lines means where it is none between elements, and what options replace."""
+    pitch = pitch_of(said, place, settings)
+    notes = []
+    if pitch is not None and settings.vector_pitch_mm and round(place.elements_per_line, 3) != 1:
+        notes.append(
+            f"lines are {place.elements_per_line:.4g} elements apart: {pitch.vector_mm:g} mm between lines "
+            f"is an element pitch of {pitch.element_mm:.4g} mm; if {pitch.vector_mm:g} mm is that of the data "
+            "sheet, give --element-pitch-mm"
+        )
+    own_mm = said.element_pitch_mm
+    if pitch is not None and own_mm is not None and abs(pitch.element_mm - own_mm) > 1e-6 * own_mm:
+        notes.append(f"element pitch {pitch.element_mm:.4g} mm as given, {own_mm:.4g} mm in its yml")
+    if settings.probe and said.probe and probe_name(said, None) != probe_name(said, settings.probe):
+        notes.append(f"probe {settings.probe} as given, {printable(said.probe)} in its yml")
+    return notes
 
 
 def _covered_rows(recording: Recording) -> list[Row]:

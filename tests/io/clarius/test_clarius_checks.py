@@ -1,0 +1,71 @@
+"""What a package and the options say is checked against each other."""
+
+import clarius_examples as examples
+import pytest
+from clarius_examples import GIVEN, sweep_of
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.describe import describe
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.load import import_notes, load_sweep
+
+BAND = {"bandwidth_hz": (4e6, 8e6)}
+
+
+def rows_of(path):
+    return dict(row[:2] for row in describe(path))
+
+
+def test_an_element_pitch_is_multiplied_by_the_elements_per_line(tmp_path):
+    """Lines of the examples are 0.3 mm apart, of 0.2 mm elements: 1.5 elements."""
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"))
+    by_element = load_sweep(package, ImportSettings(element_pitch_mm=0.26, **BAND))
+    assert by_element.grid.vector_pitch_mm == pytest.approx(1.5 * 0.26)
+    by_line = load_sweep(package, ImportSettings(vector_pitch_mm=0.26, **BAND))
+    assert by_line.grid.vector_pitch_mm == 0.26
+    notes = import_notes(package, ImportSettings(vector_pitch_mm=0.26, **BAND))
+    assert any("lines are 1.5 elements apart" in each and "0.1733 mm" in each for each in notes)
+    package.with_name("import.toml").write_text("vector_pitch_mm = 0.26\nbandwidth_hz = [4e6, 8e6]\n")
+    rows = rows_of(package)
+    assert (rows["elements per line"], rows["vector pitch from"]) == ("1.5", "as given")
+    assert (rows["element pitch, by it"], rows["width of the image, by it"]) == ("0.1733", "1.04")
+    assert rows["array from element 0 to 6, by it"] == "1.04"
+
+
+@pytest.mark.parametrize(
+    ("given", "own", "message"),
+    [
+        ({"probe": "L15 HD3"}, "0.2 mm", r"got 0.2 mm \(probe: pitch\) and 0.26 mm \(--probe L15 HD3\)"),
+        (
+            {"probe": "L15 HD3", "vector_pitch_mm": 0.26},
+            None,
+            r"got 0.1733 mm \(--vector-pitch-mm / 1.5 elem",
+        ),
+        ({"element_pitch_mm": 0.26, "vector_pitch_mm": 0.26}, None, r"got 0.1733 mm .* and 0.26 mm"),
+        ({"probe": "C3 HD3", "element_pitch_mm": 0.3}, "0.3 mm", "expected parallel lines"),
+    ],
+)
+def test_pitches_that_contradict_each_other_are_refused(tmp_path, given, own, message):
+    yml = examples.yml_text(sweep_of("rf")) + (f"probe: {{pitch: {own}}}\n" if own else "")
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml)
+    with pytest.raises(InvalidInputError, match=message):
+        load_sweep(package, ImportSettings(**given, **BAND))
+
+
+def test_a_given_pitch_replaces_the_ymls_and_it_is_said(tmp_path):
+    yml = examples.yml_text(sweep_of("rf")) + "probe: {pitch: 0.2 mm}\n"
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml)
+    given = ImportSettings(element_pitch_mm=0.3, **BAND)
+    assert load_sweep(package, given).grid.vector_pitch_mm == pytest.approx(0.45)
+    assert "element pitch 0.3 mm as given, 0.2 mm in its yml" in import_notes(package, given)
+
+
+def test_lines_from_the_highest_element_down_are_named(tmp_path):
+    rows = examples.yml_text(sweep_of("rf")).split("\n")
+    first = next(i for i, row in enumerate(rows) if "rx element" in row)
+    rows[first : first + 5] = rows[first : first + 5][::-1]
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml="\n".join(rows))
+    with pytest.raises(
+        InvalidInputError, match=r"lines\[1\].*expected lines from the lowest element up, got 4.5"
+    ):
+        load_sweep(package, GIVEN)
