@@ -32,6 +32,7 @@ References
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -44,8 +45,8 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import RIGID_TOLERANCE
 from speckle3d.core.streams import DEFAULT_MAX_GAP_S, TimedRotations
 from speckle3d.core.sweep import OrientationSensor
+from speckle3d.io.clarius.documents import documents_of, quantity, shown
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import documents_of, quantity
 
 G_M_S2 = 9.80665
 
@@ -58,6 +59,7 @@ MEANINGS = (
 """What a quaternion q0 to q3 may mean, the likeliest first."""
 
 _AXES = "xyz"
+_STAMP = re.compile(r"[0-9]{1,19}")
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
 
@@ -161,9 +163,12 @@ def read_samples(member: Member) -> SensorSamples:
     seen: dict[int, int] = {}
     repeated = 0
     for i, fields in enumerate(documents_of(member.text(), where)):
-        time_ns = fields.get("timestamp")
-        if not isinstance(time_ns, int) or isinstance(time_ns, bool) or not 0 <= time_ns < 2**63:
-            raise InvalidInputError(f"{where}: sample {i}: timestamp: expected nanoseconds, got {time_ns!r}")
+        stamp = fields.get("timestamp")
+        if not isinstance(stamp, str) or _STAMP.fullmatch(stamp) is None or int(stamp) >= 2**63:
+            raise InvalidInputError(
+                f"{where}: sample {i}: timestamp: expected nanoseconds, got {shown(stamp)}"
+            )
+        time_ns = int(stamp)
         row = _row(fields, f"{where}: sample {i}")
         known = seen.get(time_ns, len(rows) - 1 if rows else None)
         if known is not None and np.array_equal(rows[known], row, equal_nan=True):
@@ -276,7 +281,7 @@ def _row(fields: Mapping[str, Any], where: str) -> FloatArray:
     if quaternion is None:
         return np.array([*values, *[np.nan] * 4])
     if not isinstance(quaternion, dict):
-        raise InvalidInputError(f"{where}: orientation: expected q0 to q3, got {str(quaternion)[:40]!r}")
+        raise InvalidInputError(f"{where}: orientation: expected q0 to q3, got {shown(quaternion)}")
     turn = [quantity(quaternion.get(f"q{i}"), "", f"{where}: orientation: q{i}") for i in range(4)]
     return np.array([*values, *turn])
 

@@ -16,6 +16,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, OrientationSensor, RFSettings, Sweep
 from speckle3d.io.clarius import imu
 from speckle3d.io.clarius.demodulation import middle_hz, turns_to
+from speckle3d.io.clarius.documents import shown
 from speckle3d.io.clarius.lines import Place, pitch_of, place_of, probe_name, require_roi
 from speckle3d.io.clarius.package import Recording, find_recording
 from speckle3d.io.clarius.raw import SAMPLES, RawFile, RawFrames, RawHeader, read_header, read_times_ns
@@ -139,7 +140,7 @@ def _require_same(said: Description, raw: RawFile, header: RawHeader) -> None:
         )
     if said.compression.lower() != "none":
         raise InvalidInputError(
-            f"{said.where}: compression: expected none, got {said.compression!r}: frames are not decoded"
+            f"{said.where}: compression: expected none, got {shown(said.compression)}: frames are not decoded"
         )
     require_roi(said)
 

@@ -32,6 +32,9 @@ _MOST_RISE, _MOST_ABOVE = 1.05, 1.15
 0.91 and 0.79; with the other sign of Q 1.05 and 1.22; with another phase of a falling oscillator 1.16 and
 0.87."""
 
+_MOST_SHOWN = 30
+"""Fields that are not read, and knots of a gain curve."""
+
 
 def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     """Tell what a package holds, also where it is no sweep."""
@@ -114,13 +117,16 @@ def _said_rows(recording: Recording, name: str) -> list[Row]:
         if value is not None:
             rows.append((f"{name}: {what}", f"{value * scale:g}", unit))
     if said.gain:
-        rows.append((f"{name}: gain", ", ".join(f"{g:g} dB at {d:g} mm" for d, g in said.gain), ""))
+        knots = (f"{g:g} dB at {d:g} mm" for d, g in said.gain[:_MOST_SHOWN])
+        rows.append((f"{name}: gain", ", ".join(knots), ""))
     if said.roi is not None:
         roi = said.roi
         where = f"lines {roi.start_line} to {roi.end_line}, samples {roi.start_sample} to {roi.end_sample}"
         rows.append((f"{name}: region of interest", where, ""))
     if said.unused:
-        rows.append((f"{name}: fields not read", ", ".join(map(printable, said.unused)), ""))
+        shown = ", ".join(printable(each[:40]) for each in said.unused[:_MOST_SHOWN])
+        more = f" and {len(said.unused) - _MOST_SHOWN} more" if len(said.unused) > _MOST_SHOWN else ""
+        rows.append((f"{name}: fields not read", shown + more, ""))
     return rows
 
 
@@ -195,8 +201,8 @@ def _pitch_notes(said: Description, place: Place, settings: ImportSettings) -> l
     if pitch is not None and settings.vector_pitch_mm and round(place.elements_per_line, 3) != 1:
         notes.append(
             f"lines are {place.elements_per_line:.4g} elements apart: {pitch.vector_mm:g} mm between lines "
-            f"is an element pitch of {pitch.element_mm:.4g} mm; if {pitch.vector_mm:g} mm is that of the data "
-            "sheet, give --element-pitch-mm"
+            f"is an element pitch of {pitch.element_mm:.4g} mm; if {pitch.vector_mm:g} mm is that of the "
+            "data sheet, give --element-pitch-mm"
         )
     own_mm = said.element_pitch_mm
     if pitch is not None and own_mm is not None and abs(pitch.element_mm - own_mm) > 1e-6 * own_mm:

@@ -69,3 +69,41 @@ def test_lines_from_the_highest_element_down_are_named(tmp_path):
         InvalidInputError, match=r"lines\[1\].*expected lines from the lowest element up, got 4.5"
     ):
         load_sweep(package, GIVEN)
+
+
+BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("frames: 4", f"{BOMB}frames: 4", "line 3: expected no anchors and aliases"),
+        ("frames: 4", "frames: [[*x]]", "expected no anchors and aliases, got one"),
+        ("frames: 4", "x: !!python/name:os.system y\nframes: 4", "line 3: expected no tags"),
+        ("frames: 4", "frames: 0x" + "f" * 9000, "frames: expected a number, got '0xf{38}'...$"),
+        ("frames: 4", "frames: " + "9" * 9000, "frames: expected a number, got '9{40}'...$"),
+        ("frames: 4", "frames: {a: [" + "x, " * 9000 + "x]}", "frames: expected a number, got fields$"),
+        ("frames: 4", "frames: " + "[" * 9000, "at most 16 levels of fields"),
+        ("frames: 4", "frames: 4\nframes: 4", "line 4: frames: expected it once, got it twice"),
+        ("{samples", "{number of lines: 5, samples", "number of lines: expected it once, got it twice"),
+        ("type: RF", "type: {a: {b: RF}}", "type: expected RF, IQ or B pre-scan, got fields$"),
+    ],
+)
+def test_yaml_that_the_scanner_does_not_write_is_refused_in_a_line(tmp_path, old, new, message):
+    text = examples.yml_text(sweep_of("rf"))
+    assert old in text
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=text.replace(old, new, 1))
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        load_sweep(package, GIVEN)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(tmp_path)) + 300
+
+
+def test_numbers_are_decimal():
+    from speckle3d.io.clarius.documents import documents_of
+
+    text = "a: 010\nb: 1:30\nc: ''\nd:\ne: [1, {f: null}]\n---\n---\ng: true\n"
+    assert list(documents_of(text, "x")) == [
+        {"a": "010", "b": "1:30", "c": "", "d": None, "e": ["1", {"f": None}]},
+        {"g": "true"},
+    ]
