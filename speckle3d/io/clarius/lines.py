@@ -61,8 +61,8 @@ class Place:
         Places of the first and the last kept line in the array.
     elements_per_line : float
         Distance between lines, in elements.
-    first_sample : float
-        Samples between transmission and the first kept one.
+    first_sample : float, optional
+        Samples between transmission and the first kept one; None where the yml does not say.
     """
 
     lines: slice
@@ -70,12 +70,19 @@ class Place:
     first_element: float
     last_element: float
     elements_per_line: float
-    first_sample: float
+    first_sample: float | None
 
-    def first_depth_mm(self, sampling_rate_hz: float, speed_of_sound_m_s: float) -> float:
-        """Depth of the first kept sample."""
-        after_s = max(self.first_sample / sampling_rate_hz - BEFORE_DEPTH_S, 0.0)
-        return after_s * speed_of_sound_m_s * 1e3 / 2
+    def first_depth_mm(self, sampling_rate_hz: float, speed_of_sound_m_s: float) -> float | None:
+        """Depth of the first kept sample; None where it is not said, or would be above depth 0.
+
+        Less than a sample above is 0: the delay is a whole number of samples.
+        """
+        if self.first_sample is None:
+            return None
+        after_s = self.first_sample / sampling_rate_hz - BEFORE_DEPTH_S
+        if after_s * sampling_rate_hz <= -1:
+            return None
+        return max(after_s, 0.0) * speed_of_sound_m_s * 1e3 / 2
 
 
 def place_of(said: Description, cropped: bool) -> Place:
@@ -100,9 +107,8 @@ def place_of(said: Description, cropped: bool) -> Place:
         lines, samples = slice(roi.start_line, roi.end_line + 1), slice(roi.start_sample, roi.end_sample + 1)
     elements = said.geometry.receive_element[lines]
     step = _step(said, elements, lines.start)
-    return Place(
-        lines, samples, float(elements[0]), float(elements[-1]), step, said.delay_samples + samples.start
-    )
+    first_sample = None if said.delay_samples is None else said.delay_samples + samples.start
+    return Place(lines, samples, float(elements[0]), float(elements[-1]), step, first_sample)
 
 
 def require_roi(said: Description) -> None:

@@ -92,7 +92,7 @@ class Description:
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
-    delay_samples : float
+    delay_samples : float, optional
         Samples between transmission and the first sample.
     gain : tuple of pairs
         Depth in mm and gain in dB.
@@ -109,7 +109,7 @@ class Description:
     samples: int
     sample_bytes: int
     sampling_rate_hz: float
-    delay_samples: float
+    delay_samples: float | None
     geometry: Lines
     compression: str = "none"
     frame_rate_hz: float | None = None
@@ -160,7 +160,7 @@ def read_description(member: Member) -> Description:
         samples=size.whole("samples per line"),
         sample_bytes=size.whole("sample size", "bytes"),
         sampling_rate_hz=fields.positive("sampling rate", "Hz"),
-        delay_samples=fields.number("delay samples", "", 0.0),
+        delay_samples=fields.optional("delay samples", ""),
         geometry=_read_lines(fields, lines),
         compression=_compression(fields),
         frame_rate_hz=fields.optional("frame rate", "Hz"),
@@ -213,9 +213,7 @@ class _Fields:
             raise InvalidInputError(f"{self.where}: {name}: expected fields, got {shown(inner)}")
         return _Fields(inner, f"{self.where}: {name}")
 
-    def number(self, name: str, unit: str = "", default: float | None = None) -> float:
-        if name not in self.values and default is not None:
-            return default
+    def number(self, name: str, unit: str = "") -> float:
         return quantity(self.values.get(name), unit, f"{self.where}: {name}")
 
     def positive(self, name: str, unit: str) -> float:

@@ -107,3 +107,107 @@ def test_numbers_are_decimal():
         {"a": "010", "b": "1:30", "c": "", "d": None, "e": ["1", {"f": None}]},
         {"g": "true"},
     ]
+
+
+def with_field(kind, field, value, samples=400):
+    """A description with another value; samples at 15 or 40 MHz that start at 2 mm or so."""
+    sweep = sweep_of(kind, samples=samples)
+    rows = examples.yml_text(sweep).split("\n")
+    i = next(i for i, row in enumerate(rows) if row.startswith(f"{field}:"))
+    rows[i : i + 1] = [] if value is None else [f"{field}: {value}"]
+    return sweep, "\n".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("kind", "factor", "message"),
+    [
+        ("rf", 0.5, r"reach the imaging depth of .* mm, got 400 that reach .*: --sampling-rate-hz replaces"),
+        ("iq", 0.5, "reach the imaging depth"),
+        ("env", 2.5, "reach the imaging depth"),
+        ("rf", 2.5, ""),  # may be cropped to a region of interest
+        ("env", 1.3, ""),
+        ("env", 1.0, None),
+    ],
+)
+def test_a_sampling_rate_that_the_imaging_depth_contradicts(tmp_path, kind, factor, message):
+    sweep = sweep_of(kind, samples=400)
+    rate = getattr(sweep.signal, "sampling_rate_hz", 1540e3 / (2 * sweep.grid.sample_spacing_mm)) / 1e6
+    # The delay stays the same time.
+    delay = factor * rate * (sweep.grid.first_sample_depth_mm * 2e3 / 1540 + 1)
+    sweep, yml = with_field(kind, "sampling rate", f"{factor * rate!r} MHz")
+    text = "\n".join(f"delay samples: {delay}" if "delay" in row else row for row in yml.split("\n"))
+    package = examples.write_package(tmp_path / "p", sweep, yml=text)
+    if message:
+        with pytest.raises(InvalidInputError, match=message):
+            load_sweep(package, GIVEN)
+        given = GIVEN.model_copy(update={"sampling_rate_hz": factor * rate * 1e6})
+        assert load_sweep(package, given).grid.sample_spacing_mm == pytest.approx(0.77 / rate / factor)
+        return
+    load_sweep(package, GIVEN)
+    told = any("the imaging depth in the yml is" in each for each in import_notes(package, GIVEN))
+    assert told == (message == "")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("-5", r"delay samples: expected from 0 to less than .*, got -5 samples"),
+        ("9999", r"delay samples: expected from 0 .*, got 9999 samples, which begin at 191.7 mm"),
+        (None, "--first-sample-depth-mm"),
+        ("0", "--first-sample-depth-mm"),
+    ],
+)
+def test_a_delay_that_cannot_be_is_no_depth(tmp_path, value, message):
+    sweep, yml = with_field("rf", "delay samples", value)
+    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    with pytest.raises(InvalidInputError, match=message) as caught:
+        load_sweep(package, GIVEN)
+    if value in (None, "0"):
+        assert caught.value.settings == ("first_sample_depth_mm",)
+        assert rows_of(package)["first sample's depth from"].startswith("not said")
+    given = GIVEN.model_copy(update={"first_sample_depth_mm": 1.5})
+    assert load_sweep(package, given).grid.first_sample_depth_mm == 1.5
+
+
+def test_a_delay_of_a_microsecond_less_part_of_a_sample_is_depth_0(tmp_path):
+    sweep, yml = with_field("rf", "delay samples", "39.5")  # at 40 MHz
+    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    assert load_sweep(package, GIVEN).grid.first_sample_depth_mm == 0.0
+
+
+@pytest.mark.parametrize(
+    ("steps_s", "message"),
+    [
+        ([0.09] * 9, None),
+        ([0.5] * 2 + [0.09] * 7, None),
+        ([0.3] * 9, None),  # every third
+        ([0.09] * 3 + [61.0] + [0.09] * 5, "frame 4: expected a time within 60 s of the frame before, got 61 s"),
+        ([0.00009] * 9, "frame 1: expected about 0.09091 s .* frame rate of 11 Hz in the yml, got 9e-05 s"),
+        ([1.5] * 9, "frame 1: expected about 0.09091 s"),
+    ],
+)  # fmt: skip
+def test_frame_times_that_are_not_of_the_frame_rate_are_named(tmp_path, steps_s, message):
+    sweep = replace(sweep_of("rf", frames=10), frame_time_s=10 + np.cumsum([0.0, *steps_s]))
+    package = examples.write_package(tmp_path / "p", sweep)
+    if message is None:
+        load_sweep(package, GIVEN)
+        return
+    with pytest.raises(InvalidInputError, match=rf"_rf\.raw: {message}"):
+        load_sweep(package, GIVEN)
+
+
+def test_info_measures_the_band_whatever_else_is_missing_and_keeps_its_rows(tmp_path):
+    files = examples.package_files(sweep_of("rf")) | {f"{examples.NAME}_rf.tgc": b"timestamp: 5 { 1.00mm }"}
+    package = examples.write_files(tmp_path / "p", files)
+    for probe, told in (
+        ("", "not said"),
+        ('probe = "C3"', "cannot be told: "),
+        ('probe = "X"', "cannot be t"),
+    ):
+        package.with_name("import.toml").write_text(f"{probe}\nbandwidth_hz = [4e6, 8e6]\n")
+        rows = rows_of(package)
+        assert rows["vector pitch from"].startswith(told)
+        assert rows["band from"] == "4.00 to 8.00 MHz, as given"
+        assert rows["gain by frame"].startswith("cannot be told: ")
+        assert rows["quaternion"].startswith("scalar first")
+        assert rows["sweep"].startswith("none: ")
