@@ -89,7 +89,7 @@ def shown(value: object) -> str:
     """Show a wrong value in a message: the beginning of a text, or what else it is."""
     if isinstance(value, str):
         return repr(value[:_SHOWN]) + ("..." if len(value) > _SHOWN else "")
-    return {dict: "fields", list: "a list"}.get(type(value), "nothing")
+    return "fields" if isinstance(value, dict) else "a list" if isinstance(value, list) else "nothing"
 
 
 def _document(yaml: Any, events: Iterator[Any], where: str) -> Any:

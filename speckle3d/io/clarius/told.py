@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     rows: list[Row] = [("recording", printable(recording.name) or "without a name", "")]
     for name in KINDS:
         if name in recording.settings:
-            rows += _told(f"{name}: fields", lambda name=name: _said_rows(recording, name))
+            rows += _told(f"{name}: fields", partial(_said_rows, recording, name))
     if recording.raw:
         rows += _chosen_rows(recording, settings)
     if recording.sensor is not None:

@@ -1,6 +1,9 @@
 """What a package and the options say is checked against each other."""
 
+from dataclasses import replace
+
 import clarius_examples as examples
+import numpy as np
 import pytest
 from clarius_examples import GIVEN, sweep_of
 
@@ -181,7 +184,7 @@ def test_a_delay_of_a_microsecond_less_part_of_a_sample_is_depth_0(tmp_path):
         ([0.09] * 9, None),
         ([0.5] * 2 + [0.09] * 7, None),
         ([0.3] * 9, None),  # every third
-        ([0.09] * 3 + [61.0] + [0.09] * 5, "frame 4: expected a time within 60 s of the frame before, got 61 s"),
+        ([0.09] * 3 + [61.0] + [0.09] * 5, "frame 4: .* within 60 s of the frame before, got 61 s"),
         ([0.00009] * 9, "frame 1: expected about 0.09091 s .* frame rate of 11 Hz in the yml, got 9e-05 s"),
         ([1.5] * 9, "frame 1: expected about 0.09091 s"),
     ],
@@ -199,11 +202,8 @@ def test_frame_times_that_are_not_of_the_frame_rate_are_named(tmp_path, steps_s,
 def test_info_measures_the_band_whatever_else_is_missing_and_keeps_its_rows(tmp_path):
     files = examples.package_files(sweep_of("rf")) | {f"{examples.NAME}_rf.tgc": b"timestamp: 5 { 1.00mm }"}
     package = examples.write_files(tmp_path / "p", files)
-    for probe, told in (
-        ("", "not said"),
-        ('probe = "C3"', "cannot be told: "),
-        ('probe = "X"', "cannot be t"),
-    ):
+    unfit = "cannot be told: "
+    for probe, told in (("", "not said"), ('probe = "C3"', unfit), ('probe = "X"', unfit)):
         package.with_name("import.toml").write_text(f"{probe}\nbandwidth_hz = [4e6, 8e6]\n")
         rows = rows_of(package)
         assert rows["vector pitch from"].startswith(told)
