@@ -63,6 +63,9 @@ _STAMP = re.compile(r"[0-9]{1,19}")
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
 
+_LEAST_G, _MOST_G = 0.8, 1.2
+"""0.92 and 0.96 in the recordings at hand."""
+
 _SURE_DEG = 1.0
 _WINDOW_S = 0.25
 _STILL_DEG = 2.0
@@ -265,6 +268,18 @@ def sensor_rows(samples: SensorSamples, fits: tuple[Fit, ...]) -> list[tuple[str
         rows.append(("magnetic field, from the world's x", f"{np.rad2deg(np.arctan2(y, x)):.0f}", "deg"))
         rows.append(("magnetic field, dip", f"{np.rad2deg(np.arctan2(-z, np.hypot(x, y))):.0f}", "deg"))
     return rows
+
+
+def sensor_notes(samples: SensorSamples) -> list[str]:
+    """Say what a hand cannot feel: another acceleration than about 1 g."""
+    norm_g = _norm(samples.accelerometer_g)
+    if _LEAST_G <= norm_g <= _MOST_G:
+        return []
+    guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
+    return [
+        f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale is "
+        f"another than assumed{guess}"
+    ]
 
 
 def _row(fields: Mapping[str, Any], where: str) -> FloatArray:

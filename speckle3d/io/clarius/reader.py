@@ -18,9 +18,18 @@ from speckle3d.io.clarius import imu
 from speckle3d.io.clarius.checks import require_depth, require_times
 from speckle3d.io.clarius.demodulation import middle_hz, turns_to
 from speckle3d.io.clarius.documents import shown
+from speckle3d.io.clarius.gains import GainFactors
 from speckle3d.io.clarius.lines import Place, pitch_of, place_of, probe_name, require_roi
 from speckle3d.io.clarius.package import Recording, find_recording
-from speckle3d.io.clarius.raw import SAMPLES, RawFile, RawFrames, RawHeader, read_header, read_times_ns
+from speckle3d.io.clarius.raw import (
+    SAMPLES,
+    Factors,
+    RawFile,
+    RawFrames,
+    RawHeader,
+    read_header,
+    read_times_ns,
+)
 from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
 from speckle3d.io.clarius.spectrum import measured_band_hz, measured_centres_hz
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
@@ -28,8 +37,6 @@ from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 FORMAT = "Clarius raw package"
 
 _ORDER = ("RF", "IQ", "envelope")
-_SAME_GAIN_DB = 0.005
-"""Gains are written to 0.01 dB."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +72,9 @@ def read_package(path: Path, settings: ImportSettings) -> Sweep:
     spacing_mm = 1e3 * values["speed_of_sound_m_s"] / (2.0 * values["sampling_rate_hz"])
     _, vectors, samples = _frames(chosen, place).shape
     grid = ImageGrid(vectors, samples, values["vector_pitch_mm"], spacing_mm, values["first_sample_depth_mm"])
-    gains = None if said.kind == "envelope" else _gain_factors(recording, chosen, grid)
     turns = _turns(chosen, place, values, settings)
-    frames = _frames(chosen, place, turns if gains is None else gains if turns is None else gains * turns)
+    gains = None if said.kind == "envelope" else _gain_factors(recording, chosen, grid, turns)
+    frames = _frames(chosen, place, turns if gains is None else gains)
     with naming(said.where):
         signal = _signal(said, values)
     return Sweep(
@@ -162,7 +169,7 @@ def is_padded(chosen: Chosen) -> bool:
     return True
 
 
-def _frames(chosen: Chosen, place: Place, factors: npt.NDArray[Any] | None = None) -> RawFrames:
+def _frames(chosen: Chosen, place: Place, factors: Factors | None = None) -> RawFrames:
     return RawFrames(chosen.raw, chosen.header, chosen.said.kind, place.lines, place.samples, factors)
 
 
@@ -291,8 +298,10 @@ def curves_of(recording: Recording, chosen: Chosen) -> tuple[Curve, ...] | None:
     return None
 
 
-def _gain_factors(recording: Recording, chosen: Chosen, grid: ImageGrid) -> FloatArray | None:
-    """The first frame's gain over each one's, shape (frame, sample); None where it is the same."""
+def _gain_factors(
+    recording: Recording, chosen: Chosen, grid: ImageGrid, turns: ComplexArray | None
+) -> GainFactors | None:
+    """The first frame's gain over each one's, times `turns`; None where it is the same."""
     curves = curves_of(recording, chosen)
     if curves is None or len(set(curves)) == 1:
         return None
@@ -301,7 +310,6 @@ def _gain_factors(recording: Recording, chosen: Chosen, grid: ImageGrid) -> Floa
         raise InvalidInputError(
             f"{chosen.said.where}: frame {i}: expected a gain curve as other frames have, got none"
         )
-    depth_mm = grid.first_sample_depth_mm + grid.sample_spacing_mm * np.arange(grid.samples)
-    gain_db = np.array([np.interp(depth_mm, *np.array(curve).T) for curve in curves])
-    apart_db = gain_db - gain_db[0]
-    return None if np.abs(apart_db).max() < _SAME_GAIN_DB else 10.0 ** (-apart_db / 20.0)
+    depth_mm = np.asarray(grid.first_sample_depth_mm + grid.sample_spacing_mm * np.arange(grid.samples))
+    found = GainFactors(depth_mm, curves, turns)
+    return found if found.differ else None

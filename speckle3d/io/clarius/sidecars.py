@@ -192,11 +192,13 @@ def read_gains(member: Member) -> dict[int, Curve]:
     stamps = list(_STAMP.finditer(text))
     stops = [*(stamp.start() for stamp in stamps), len(text)][1:]
     curves: dict[int, Curve] = {}
+    alike: dict[Curve, Curve] = {}
     for stamp, after in zip(stamps, stops, strict=bool(stamps)):
         time_ns = int(stamp[1])
         if time_ns in curves:
             raise InvalidInputError(f"{where}: expected one curve at {time_ns} ns, got two")
-        curves[time_ns] = tuple(_knots(text[stamp.end() : after], f"{where}: timestamp {time_ns}"))
+        curve = tuple(_knots(text[stamp.end() : after], f"{where}: timestamp {time_ns}"))
+        curves[time_ns] = alike.setdefault(curve, curve)
     return curves
 
 

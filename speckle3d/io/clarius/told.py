@@ -33,6 +33,10 @@ _MOST_RISE, _MOST_ABOVE = 1.05, 1.15
 0.91 and 0.79; with the other sign of Q 1.05 and 1.22; with another phase of a falling oscillator 1.16 and
 0.87."""
 
+_CUT = (
+    "the tar file ends without the blocks that close one: it may be truncated, and files missing, as the "
+    "sensor's"
+)
 _MOST_SHOWN = 30
 """Fields that are not read, and knots of a gain curve."""
 
@@ -41,6 +45,8 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     """Tell what a package holds, also where it is no sweep."""
     recording = find_recording(path)
     rows: list[Row] = [("recording", printable(recording.name) or "without a name", "")]
+    if recording.cut:
+        rows.append(("note", _CUT, ""))
     for name in KINDS:
         if name in recording.settings:
             rows += _told(f"{name}: fields", partial(_said_rows, recording, name))
@@ -51,7 +57,8 @@ def describe_package(path: Path, settings: ImportSettings) -> list[Row]:
     with suppress(InvalidInputError):  # told above, and where the sweep is
         rows += _covered_rows(recording)
     with suppress(InvalidInputError):
-        rows += [("note", each, "") for each in package_notes(path, settings)]
+        told = {row[1] for row in rows if row[0] == "note"}
+        rows += [("note", each, "") for each in package_notes(path, settings) if each not in told]
     return rows
 
 
@@ -93,6 +100,10 @@ def package_notes(path: Path, settings: ImportSettings) -> Sequence[str]:
     gain = _gain_said(recording, chosen)
     if gain.startswith("differs"):
         notes.append(f"gain {gain}")
+    if recording.cut:
+        notes.append(_CUT)
+    if recording.sensor is not None:
+        notes += imu.sensor_notes(imu.read_samples(recording.sensor))
     if recording.sensor is not None and orientation_of(recording) is None:
         notes.append(
             "the sensor's quaternion fits none of its other readings: the sweep has no orientation, which "
@@ -105,7 +116,8 @@ def _sensor_rows(recording: Recording) -> list[Row]:
     if recording.sensor is None:
         return []
     samples = imu.read_samples(recording.sensor)
-    return imu.sensor_rows(samples, imu.fits_of(samples))
+    notes: list[Row] = [("note", each, "") for each in imu.sensor_notes(samples)]
+    return [*imu.sensor_rows(samples, imu.fits_of(samples)), *notes]
 
 
 def _count(samples: float | None) -> tuple[str, str]:

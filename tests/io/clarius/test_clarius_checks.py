@@ -211,3 +211,15 @@ def test_info_measures_the_band_whatever_else_is_missing_and_keeps_its_rows(tmp_
         assert rows["gain by frame"].startswith("cannot be told: ")
         assert rows["quaternion"].startswith("scalar first")
         assert rows["sweep"].startswith("none: ")
+
+
+def test_an_accelerometer_in_other_units_is_told(tmp_path):
+    sweep = sweep_of("rf")
+    package = examples.write_package(tmp_path / "p", sweep)
+    assert not any("accelerometer's" in each for each in import_notes(package, GIVEN))
+    strong = replace(sweep.orientation, accelerometer_m_s2=9.81 * sweep.orientation.accelerometer_m_s2)
+    package = examples.write_package(tmp_path / "q", replace(sweep, orientation=strong))
+    told = [each for each in import_notes(package, GIVEN) if "9.81 g, and 1 g is felt at rest" in each]
+    assert len(told) == 1
+    assert "(in m/s^2?)" in told[0]
+    assert [row[1] for row in describe(package)].count(told[0]) == 1
