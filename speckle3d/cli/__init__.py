@@ -65,11 +65,11 @@ def main() -> None:
     the end stop the command as Ctrl-C does, with exit code 128 and their number.
     """
     with _stoppable() as heard, warnings.catch_warnings():
-        warnings.showwarning = _warn
+        warnings.showwarning = _warn  # type: ignore[assignment]
         _run(heard)
 
 
-def _warn(message: Warning | str, *_: object) -> None:
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
     note(f"speckle3d: {' '.join(str(message).split())}")
 
 

@@ -131,7 +131,7 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path):
 
 
 def test_a_folder_that_no_reader_claims_is_refused(tmp_path):
-    with pytest.raises(FileError, match="expected a recording.*got a folder that none"):
+    with pytest.raises(FileError, match=r"expected a recording.*got a folder that none"):
         load_sweep(tmp_path)
 
 
