@@ -65,7 +65,7 @@ def main() -> None:
     the end stop the command as Ctrl-C does, with exit code 128 and their number.
     """
     with _stoppable() as heard, warnings.catch_warnings():
-        warnings.showwarning = _warn  # type: ignore[assignment]
+        warnings.showwarning = _warn
         _run(heard)
 
 

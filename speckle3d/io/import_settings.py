@@ -159,9 +159,9 @@ def _of_folder(beside: Path, name: str) -> Path:
 
 def settings_file(path: PathLike) -> Path | None:
     """Find the file that gives what a recording lacks: beside it, or in it if it is a folder."""
-    own = Path(os.path.abspath(Path(path)))  # of "." and "..", too, with links as they are named
-    inside = (own / _FOLDER_FILE,) if own.is_dir() else ()
-    for file in (own.with_name(f"{own.name}.toml"), *inside, own.with_name(_FOLDER_FILE)):
+    own = Path(os.path.abspath(path))  # of "." and "..", too, with links as they are named
+    inside = [own / _FOLDER_FILE] if own.is_dir() else []
+    for file in [own.with_name(f"{own.name}.toml"), *inside, own.with_name(_FOLDER_FILE)]:
         if file.is_file():
             return file
     return None

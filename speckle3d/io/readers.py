@@ -86,7 +86,7 @@ def find_reader(path: PathLike) -> Reader | None:
 
 def _claims(reader: Reader, path: Path, start: bytes) -> bool:
     """Ask a reader; one of another package that fails is told of and does not claim."""
-    if reader not in _others():
+    if reader in _own():
         return reader.claims(path, start)
     try:
         return reader.claims(path, start)
@@ -117,10 +117,14 @@ def first_bytes(path: PathLike) -> bytes:
 @cache
 def readers() -> tuple[Reader, ...]:
     """All readers, those of other packages first."""
-    return (*_others(), *(import_module(f"speckle3d.io.{name}").READER for name in _OWN))
+    return (*_others(), *_own())
 
 
 @cache
+def _own() -> tuple[Reader, ...]:
+    return tuple(import_module(f"speckle3d.io.{name}").READER for name in _OWN)
+
+
 def _others() -> tuple[Reader, ...]:
     """Readers of other packages; one that cannot be loaded is told of and left out."""
     found = []
