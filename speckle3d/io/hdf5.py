@@ -180,7 +180,7 @@ def open_hdf5(path: PathLike) -> h5py.File:
 
 @lru_cache(maxsize=16)
 def _require_sound_once(path: str, *_: int) -> None:
-    """Look through a file's heaps unless that was done and the file is as it was: each reader opens it anew."""
+    """Look through a file's heaps, unless that was done and it is as it was: each reader opens it anew."""
     require_sound_heaps(path)
 
 
