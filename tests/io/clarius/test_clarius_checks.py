@@ -8,6 +8,9 @@ import pytest
 from clarius_examples import GIVEN, sweep_of
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.clarius.checks import depth_notes, require_depth
+from speckle3d.io.clarius.package import Member
+from speckle3d.io.clarius.sidecars import read_description
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_notes, load_sweep
@@ -21,7 +24,7 @@ def rows_of(path):
 
 def test_an_element_pitch_is_multiplied_by_the_elements_per_line(tmp_path):
     """Lines of the examples are 0.3 mm apart, of 0.2 mm elements: 1.5 elements."""
-    package = examples.write_package(tmp_path / "p", sweep_of("rf"))
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), sensor=False)
     by_element = load_sweep(package, ImportSettings(element_pitch_mm=0.26, **BAND))
     assert by_element.grid.vector_pitch_mm == pytest.approx(1.5 * 0.26)
     by_line = load_sweep(package, ImportSettings(vector_pitch_mm=0.26, **BAND))
@@ -50,14 +53,14 @@ def test_an_element_pitch_is_multiplied_by_the_elements_per_line(tmp_path):
 )
 def test_pitches_that_contradict_each_other_are_refused(tmp_path, given, own, message):
     yml = examples.yml_text(sweep_of("rf")) + (f"probe: {{pitch: {own}}}\n" if own else "")
-    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml)
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml, sensor=False)
     with pytest.raises(InvalidInputError, match=message):
         load_sweep(package, ImportSettings(**given, **BAND))
 
 
 def test_a_given_pitch_replaces_the_ymls_and_it_is_said(tmp_path):
     yml = examples.yml_text(sweep_of("rf")) + "probe: {pitch: 0.2 mm}\n"
-    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml)
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml, sensor=False)
     given = ImportSettings(element_pitch_mm=0.3, **BAND)
     assert load_sweep(package, given).grid.vector_pitch_mm == pytest.approx(0.45)
     assert "element pitch 0.3 mm as given, 0.2 mm in its yml" in import_notes(package, given)
@@ -67,7 +70,7 @@ def test_lines_from_the_highest_element_down_are_named(tmp_path):
     rows = examples.yml_text(sweep_of("rf")).split("\n")
     first = next(i for i, row in enumerate(rows) if "rx element" in row)
     rows[first : first + 5] = rows[first : first + 5][::-1]
-    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml="\n".join(rows))
+    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml="\n".join(rows), sensor=False)
     with pytest.raises(
         InvalidInputError, match=r"lines\[1\].*expected lines from the lowest element up, got 4.5"
     ):
@@ -95,7 +98,9 @@ BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 def test_yaml_that_the_scanner_does_not_write_is_refused_in_a_line(tmp_path, old, new, message):
     text = examples.yml_text(sweep_of("rf"))
     assert old in text
-    package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=text.replace(old, new, 1))
+    package = examples.write_package(
+        tmp_path / "p", sweep_of("rf"), yml=text.replace(old, new, 1), sensor=False
+    )
     with pytest.raises(InvalidInputError, match=message) as caught:
         load_sweep(package, GIVEN)
     assert "\n" not in str(caught.value)
@@ -139,7 +144,7 @@ def test_a_sampling_rate_that_the_imaging_depth_contradicts(tmp_path, kind, fact
     delay = factor * rate * (sweep.grid.first_sample_depth_mm * 2e3 / 1540 + 1)
     sweep, yml = with_field(kind, "sampling rate", f"{factor * rate!r} MHz")
     text = "\n".join(f"delay samples: {delay}" if "delay" in row else row for row in yml.split("\n"))
-    package = examples.write_package(tmp_path / "p", sweep, yml=text)
+    package = examples.write_package(tmp_path / "p", sweep, yml=text, sensor=False)
     if message:
         with pytest.raises(InvalidInputError, match=message):
             load_sweep(package, GIVEN)
@@ -162,7 +167,7 @@ def test_a_sampling_rate_that_the_imaging_depth_contradicts(tmp_path, kind, fact
 )
 def test_a_delay_that_cannot_be_is_no_depth(tmp_path, value, message):
     sweep, yml = with_field("rf", "delay samples", value)
-    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    package = examples.write_package(tmp_path / "p", sweep, yml=yml, sensor=False)
     with pytest.raises(InvalidInputError, match=message) as caught:
         load_sweep(package, GIVEN)
     if value in (None, "0"):
@@ -174,7 +179,7 @@ def test_a_delay_that_cannot_be_is_no_depth(tmp_path, value, message):
 
 def test_a_delay_of_a_microsecond_less_part_of_a_sample_is_depth_0(tmp_path):
     sweep, yml = with_field("rf", "delay samples", "39.5")  # at 40 MHz
-    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    package = examples.write_package(tmp_path / "p", sweep, yml=yml, sensor=False)
     assert load_sweep(package, GIVEN).grid.first_sample_depth_mm == 0.0
 
 
@@ -191,7 +196,7 @@ def test_a_delay_of_a_microsecond_less_part_of_a_sample_is_depth_0(tmp_path):
 )  # fmt: skip
 def test_frame_times_that_are_not_of_the_frame_rate_are_named(tmp_path, steps_s, message):
     sweep = replace(sweep_of("rf", frames=10), frame_time_s=10 + np.cumsum([0.0, *steps_s]))
-    package = examples.write_package(tmp_path / "p", sweep)
+    package = examples.write_package(tmp_path / "p", sweep, sensor=False)
     if message is None:
         load_sweep(package, GIVEN)
         return
@@ -223,3 +228,29 @@ def test_an_accelerometer_in_other_units_is_told(tmp_path):
     assert len(told) == 1
     assert "(in m/s^2?)" in told[0]
     assert [row[1] for row in describe(package)].count(told[0]) == 1
+
+
+def test_info_measures_the_band_without_a_pitch(tmp_path):
+    """Lines of the same noise, which has equal power from 4 to 8 MHz."""
+    sweep = sweep_of("rf", samples=1200)
+    mhz = np.fft.rfftfreq(1200, 1 / 40)
+    spectrum = np.fft.rfft(np.random.default_rng(0).normal(0, 9000, (4, 1, 1200))) * ((mhz > 4) & (mhz < 8))
+    echoes = np.round(np.fft.irfft(spectrum) + np.zeros((4, 5, 1))).astype(np.int16)
+    package = examples.write_package(tmp_path / "p", replace(sweep, frames=echoes), sensor=False)
+    rows = rows_of(package)
+    assert rows["vector pitch from"] == "not said"
+    low, high = (float(each) for each in rows["band from"].split(" MHz, measured at -6 dB")[0].split(" to "))
+    # The resolution is 0.5 MHz.
+    assert (low, high) == pytest.approx((4.0, 8.0), abs=0.5)
+
+
+@pytest.mark.realdata
+def test_no_real_description_contradicts_itself(realdata):
+    files = [each for each in (realdata / "clarius").rglob("*.yml") if not each.stem.endswith("imu")]
+    assert len(files) == 8
+    for file in files:
+        said = read_description(Member(file, file.name, 0, file.stat().st_size))
+        require_depth(file.stem.split("_")[1], said, ImportSettings())
+        # Doppler frames lie in a region of interest.
+        told = bool(depth_notes(said, ImportSettings()))
+        assert told == (file.name == "carotid_iq.yml" and file.parent.name == "doppler"), file
