@@ -203,6 +203,7 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(tmp_path_
     # The skew is shared by both axes, so the nearest square pair is the one without it.
     x, y = np.cos(skew) * x + np.sin(skew) * y, np.sin(skew) * x + np.cos(skew) * y
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 3] = scale[0] * x, scale[1] * y, place
+    matrix[:3, 2] = np.cross(x, y)
     _, _, frames = tracked(3)
     path = write_mha(tmp_path_factory.mktemp("calibration") / "a.mha", grey(), frames=frames)
     settings_ = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
@@ -282,6 +283,40 @@ def test_bad_headers_are_refused(tmp_path, fields, message):
         read_metaimage(
             write_mha(tmp_path / "a.mha", pixels, fields), BMODE.model_copy(update={"bandwidth_hz": (1, 2)})
         )
+
+
+@pytest.mark.parametrize("column", range(3))
+def test_a_mirrored_image_calibration_is_refused(tmp_path, column):
+    axes = np.diag([0.2, 0.2, 0.2, 1.0])
+    axes[:, column] *= -1
+    path = write_mha(tmp_path / "a.mha", grey(), {"ImageToProbeTransform": text_of(axes)}, tracked(3)[2])
+    with pytest.raises(InvalidInputError, match=r"ImageToProbeTransform: expected right-handed.*-1\)"):
+        read_metaimage(path, BMODE)
+    axes[:, 2] = 0  # never measured
+    path = write_mha(tmp_path / "a.mha", grey(), {"ImageToProbeTransform": text_of(axes)}, tracked(3)[2])
+    found = read_metaimage(path, BMODE).tracker.sensor_from_image.rotation.as_matrix()
+    np.testing.assert_allclose(found[:, :2], axes[:3, :2] / 0.2, atol=1e-12)
+
+
+def test_poses_both_ways_round_are_inverses_or_refused(tmp_path):
+    _, _, frames = tracked(3)
+    name = "ProbeToTrackerTransform"
+    both = [
+        {"TrackerToProbeTransform": inverted(f["ProbeToTrackerTransform"])}
+        | {"TrackerToProbeTransformStatus": "OK"}
+        for f in frames
+    ]
+    both = [a | b for a, b in zip(frames, back, strict=True)]
+    path = write_mha(tmp_path / "a.mha", grey(), frames=both)
+    alone = read_poses(write_mha(tmp_path / "b.mha", grey(), frames=frames))
+    expected = alone.readings.world_from_sensor.as_matrix()
+    np.testing.assert_array_equal(read_poses(path).readings.world_from_sensor.as_matrix(), expected)
+    both[1]["TrackerToProbeTransform"] = both[1]["ProbeToTrackerTransform"]
+    path = write_mha(tmp_path / "a.mha", grey(), frames=both)
+    with pytest.raises(InvalidInputError, match=r"TrackerToProbeTransform\[1\].*inverse of ProbeToTracker"):
+        read_poses(path)
+    both[1]["TrackerToProbeTransformStatus"] = "INVALID"
+    assert len(read_poses(write_mha(tmp_path / "a.mha", grey(), frames=both)).readings) == 3
 
 
 def test_a_turned_image_calibration_is_refused(tmp_path):
