@@ -302,11 +302,9 @@ def test_poses_both_ways_round_are_inverses_or_refused(tmp_path):
     _, _, frames = tracked(3)
     name = "ProbeToTrackerTransform"
     both = [
-        {"TrackerToProbeTransform": inverted(f["ProbeToTrackerTransform"])}
-        | {"TrackerToProbeTransformStatus": "OK"}
+        f | {"TrackerToProbeTransform": inverted(f[name]), "TrackerToProbeTransformStatus": "OK"}
         for f in frames
     ]
-    both = [a | b for a, b in zip(frames, back, strict=True)]
     path = write_mha(tmp_path / "a.mha", grey(), frames=both)
     alone = read_poses(write_mha(tmp_path / "b.mha", grey(), frames=frames))
     expected = alone.readings.world_from_sensor.as_matrix()
