@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -63,8 +64,13 @@ def main() -> None:
     A wrong input is one line on stderr and exit code 2, a full disk one and exit code 1. Signals that ask for
     the end stop the command as Ctrl-C does, with exit code 128 and their number.
     """
-    with _stoppable() as heard:
+    with _stoppable() as heard, warnings.catch_warnings():
+        warnings.showwarning = _warn
         _run(heard)
+
+
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    note(f"speckle3d: {' '.join(str(message).split())}")
 
 
 def _run(heard: list[int]) -> None:

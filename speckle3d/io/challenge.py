@@ -208,4 +208,5 @@ READER = Reader(
     hdf5_claim(is_challenge_scan),
     lambda path, _: read_challenge_scan(path),
     companions=companion_files,
+    takes_settings=False,
 )

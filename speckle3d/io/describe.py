@@ -21,7 +21,7 @@ from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
 from speckle3d.io.hdf5_guard import plain_attribute
 from speckle3d.io.import_settings import settings_for
-from speckle3d.io.load import kind_of
+from speckle3d.io.load import kind_of, read_by
 from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
 
@@ -53,7 +53,7 @@ def _told(reader: Reader, path: Path) -> list[Row]:
     settings = settings_for(path)
     own = [] if reader.describe is None else reader.describe(path, settings)
     try:
-        return [*own, *sweep_rows(reader.read(path, settings))]
+        return [*own, *sweep_rows(read_by(reader, path, settings))]
     except InvalidInputError as error:
         if not own:
             raise

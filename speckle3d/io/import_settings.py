@@ -1,11 +1,13 @@
 """What a recording's own files do not say, and is given instead: by options, or by a TOML file beside them.
 
 The numbers for ``scan.mha`` are looked for in ``scan.mha.toml`` and else in ``import.toml``, which serves
-every recording of its folder; options replace them one by one.
+every recording of its folder; those for a folder ``scan`` in ``scan.toml``, ``scan/import.toml``, or
+``import.toml`` beside it. Options replace them one by one.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -156,9 +158,10 @@ def _of_folder(beside: Path, name: str) -> Path:
 
 
 def settings_file(path: PathLike) -> Path | None:
-    """Find the file beside a recording that gives what it lacks."""
-    own = Path(path)
-    for file in (own.with_name(f"{own.name}.toml"), own.with_name(_FOLDER_FILE)):
+    """Find the file that gives what a recording lacks: beside it, or in it if it is a folder."""
+    own = Path(os.path.abspath(path))  # of "." and "..", too, with links as they are named
+    inside = [own / _FOLDER_FILE] if own.is_dir() else []
+    for file in [own.with_name(f"{own.name}.toml"), *inside, own.with_name(_FOLDER_FILE)]:
         if file.is_file():
             return file
     return None

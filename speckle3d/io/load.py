@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
@@ -13,10 +13,13 @@ from speckle3d.io.challenge import Landmarks
 from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
-from speckle3d.io.readers import find_reader, first_bytes, readers
+from speckle3d.io.plausible import require_plausible
+from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
 
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
+
+_GZIP = b"\x1f\x8b"
 
 SIZED = (sweeps.FORMAT, challenge.FORMAT)
 """Kinds that always say how large their pixels are."""
@@ -57,7 +60,25 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     if reader is None:
         kind_of(path)  # names a file of no known kind
         return sweeps.read_sweep(path)  # refuses the family's other formats
-    return reader.read(Path(path), settings_for(path, settings))
+    return read_by(reader, Path(path), settings_for(path, settings))
+
+
+def read_by(reader: Reader, path: Path, settings: ImportSettings) -> Sweep:
+    """Read the sweep of a recording that a reader claims; its errors name the recording.
+
+    Raises
+    ------
+    InvalidInputError
+        Also if a number is none that a scanner has.
+    """
+    if not reader.takes_settings and (own := settings_file(path)) is not None and own.stem == path.name:
+        raise InvalidInputError(
+            f"{own}: expected none beside a {reader.format}, which says all itself: it would not be read"
+        )
+    with naming(str(path)):
+        sweep = reader.read(path, settings)
+        require_plausible(sweep)
+    return sweep
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:
@@ -76,7 +97,7 @@ def companion_files(path: PathLike) -> list[Path]:
     reader, beside = find_reader(path), settings_file(path)
     if reader is None:
         return []
-    if beside is None:
+    if beside is None or not reader.takes_settings:
         return [*reader.companions(Path(path))]
     config = settings_for(path).plus_config
     return [*reader.companions(Path(path)), beside, *([] if config is None else [Path(config)])]
@@ -130,6 +151,9 @@ def sniff(path: PathLike) -> str:
     InvalidInputError
         If it is neither.
     """
+    if Path(path).is_dir():
+        known = ", ".join(reader.format for reader in readers())
+        raise FileError(f"{path}: expected a recording ({known}), got a folder that none of them is in")
     require_file(path)
     start = first_bytes(path)
     if start.startswith(SIGNATURE):
@@ -137,5 +161,7 @@ def sniff(path: PathLike) -> str:
     if _IMAGES.claims(Path(path), start):
         return IMAGE
     got = "an empty file" if not start else "something else"
+    if start.startswith(_GZIP):
+        got = "a file packed by gzip: unpack it first"
     known = ", ".join(reader.format for reader in readers())
     raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")

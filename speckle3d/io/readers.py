@@ -5,14 +5,15 @@ A package adds a format by an entry point of the group ``speckle3d.readers`` tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import FileError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.import_settings import ImportSettings
@@ -57,6 +58,8 @@ class Reader:
         Other files that the sweep's content depends on.
     notes : callable
         What a user should know of how a sweep was made: what was assumed, measured or left out.
+    takes_settings : bool
+        Whether `read` uses its settings; false of formats that say all themselves.
     """
 
     format: str
@@ -65,6 +68,7 @@ class Reader:
     describe: Callable[[Path, ImportSettings], list[Row]] | None = None
     companions: Callable[[Path], Sequence[Path]] = _nothing_beside
     notes: Callable[[Path, ImportSettings], Sequence[str]] = _nothing_to_say
+    takes_settings: bool = True
 
 
 def find_reader(path: PathLike) -> Reader | None:
@@ -77,7 +81,21 @@ def find_reader(path: PathLike) -> Reader | None:
     """
     place = Path(path)
     start = first_bytes(place)
-    return next((reader for reader in readers() if reader.claims(place, start)), None)
+    return next((reader for reader in readers() if _claims(reader, place, start)), None)
+
+
+def _claims(reader: Reader, path: Path, start: bytes) -> bool:
+    """Ask a reader; one of another package that fails is told of and does not claim."""
+    if reader in _own():
+        return reader.claims(path, start)
+    try:
+        return reader.claims(path, start)
+    except Exception as error:  # noqa: BLE001 - a lab's own code must not stop all others
+        warnings.warn(
+            f"reader of {reader.format}: left out for {path}: it fails: {type(error).__name__}: {error}",
+            stacklevel=2,
+        )
+        return False
 
 
 def first_bytes(path: PathLike) -> bytes:
@@ -99,14 +117,26 @@ def first_bytes(path: PathLike) -> bytes:
 @cache
 def readers() -> tuple[Reader, ...]:
     """All readers, those of other packages first."""
-    return (*_others(), *(import_module(f"speckle3d.io.{name}").READER for name in _OWN))
+    return (*_others(), *_own())
 
 
-def _others() -> Iterator[Reader]:
+@cache
+def _own() -> tuple[Reader, ...]:
+    return tuple(import_module(f"speckle3d.io.{name}").READER for name in _OWN)
+
+
+def _others() -> tuple[Reader, ...]:
+    """Readers of other packages; one that cannot be loaded is told of and left out."""
+    found = []
     for entry in sorted(entry_points(group=GROUP), key=lambda each: each.name):
-        reader = entry.load()
-        if not isinstance(reader, Reader):
-            raise InvalidInputError(
-                f"entry point {entry.name} of {GROUP}: expected a Reader, got {type(reader).__name__}"
-            )
-        yield reader
+        try:
+            reader = entry.load()
+        except Exception as error:  # noqa: BLE001 - a lab's own code must not stop all others
+            fault = f"it cannot be loaded: {type(error).__name__}: {error}"
+        else:
+            if isinstance(reader, Reader):
+                found.append(reader)
+                continue
+            fault = f"expected a Reader, got {type(reader).__name__}"
+        warnings.warn(f"entry point {entry.name} of {GROUP}: left out: {fault}", stacklevel=2)
+    return tuple(found)

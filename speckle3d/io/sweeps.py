@@ -240,4 +240,5 @@ READER = Reader(
     FORMAT,
     hdf5_claim(lambda file: has_format(file, FORMAT)),
     lambda path, _: read_sweep(path),
+    takes_settings=False,
 )

@@ -16,6 +16,8 @@ Model = TypeVar("Model", bound=BaseModel)
 _MOST_BYTES = 2**20
 """A hundred times what every setting takes."""
 
+_SHOWN = 200
+
 
 def load_toml(model: type[Model], path: Path) -> Model:
     """Read settings of a model from a TOML file; those that it does not give keep their defaults.
@@ -52,7 +54,16 @@ def parsed(text: str, where: str) -> dict[str, Any]:
 def first_fault(error: ValidationError) -> tuple[str, str]:
     """Return the name of the first setting that is wrong, and what is wrong with it."""
     first = error.errors()[0]
-    return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {first['input']!r}"
+    return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {_shown(first['input'])}"
+
+
+def _shown(value: Any) -> str:
+    """A value as it is written, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def validated(values: dict[str, Any], where: str, model: type[Model]) -> Model:

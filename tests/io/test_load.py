@@ -40,7 +40,7 @@ def test_what_is_of_no_known_kind_is_refused(tmp_path, read):
         read(tmp_path / "a.h5")
     with pytest.raises(FileError, match="expected a file, got none"):
         read(tmp_path / "none.h5")
-    with pytest.raises(FileError, match="expected a file, got a folder"):
+    with pytest.raises(FileError, match="got a folder that none of them is in"):
         read(tmp_path)
 
 

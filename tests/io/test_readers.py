@@ -1,5 +1,8 @@
 """One door: what a recording lacks comes from options or from a file beside it, and is asked for at once."""
 
+import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +107,7 @@ def folders(monkeypatch):
         lambda path, _: [("frames", "as many as there are", "")],
         lambda path: [path / "frames.npy"],
     )
-    monkeypatch.setattr(readers, "_others", lambda: iter([reader]))
+    monkeypatch.setattr(readers, "_others", lambda: (reader,))
     readers.readers.cache_clear()
     yield reader
     readers.readers.cache_clear()
@@ -128,17 +131,78 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path):
 
 
 def test_a_folder_that_no_reader_claims_is_refused(tmp_path):
-    with pytest.raises(FileError, match="expected a file, got a folder"):
+    with pytest.raises(FileError, match=r"expected a recording.*got a folder that none"):
         load_sweep(tmp_path)
 
 
-def test_an_entry_point_that_is_no_reader_is_named(monkeypatch):
-    class Entry:
-        name = "lab"
+class Entry:
+    """An entry point whose object is loaded, or fails."""
 
-        def load(self):
-            return "text"
+    name = "lab"
 
-    monkeypatch.setattr(readers, "entry_points", lambda group: [Entry()])
-    with pytest.raises(InvalidInputError, match=r"entry point lab of speckle3d\.readers: .*got str"):
-        list(readers._others())
+    def __init__(self, load):
+        self.load = load
+
+
+def failing(*_):
+    raise RuntimeError("no licence")
+
+
+@pytest.mark.parametrize(
+    ("load", "said"), [(lambda: "text", "expected a Reader, got str"), (failing, "RuntimeError: no licence")]
+)
+def test_an_entry_point_that_is_of_no_use_is_told_of_and_left_out(monkeypatch, load, said):
+    monkeypatch.setattr(readers, "entry_points", lambda group: [Entry(load)])
+    with pytest.warns(UserWarning, match=rf"entry point lab of speckle3d\.readers: left out: .*{said}"):
+        assert readers._others() == ()
+
+
+def test_a_reader_that_fails_to_tell_does_not_claim(folders, monkeypatch, shipped):
+    broken = replace(folders, claims=failing)
+    monkeypatch.setattr(readers, "_others", lambda: (broken,))
+    readers.readers.cache_clear()
+    with pytest.warns(UserWarning, match="reader of folder of a lab: left out"):
+        assert find_reader(shipped / "phantom.h5").format == "speckle3d.sweep"
+
+
+def test_a_folders_own_file_of_settings_is_read(folders, tmp_path, monkeypatch):
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    np.save(scan / "frames.npy", np.zeros((3, 4, 5), dtype=np.uint8))
+    (scan / "import.toml").write_text("frame_rate_hz = 10\ncolumn_pitch_mm = 0.3\n")
+    assert load_sweep(scan).grid.vector_pitch_mm == 0.3
+    monkeypatch.chdir(scan)
+    assert load_sweep(".").grid.vector_pitch_mm == 0.3
+
+
+def test_a_sweep_files_own_numbers_are_not_replaced_unseen(shipped, tmp_path):
+    shutil.copy(shipped / "phantom.h5", tmp_path / "a.h5")
+    alone = recording_sha256(tmp_path / "a.h5")
+    (tmp_path / "import.toml").write_text("speed_of_sound_m_s = 1482\n")
+    assert recording_sha256(tmp_path / "a.h5") == alone
+    assert load_sweep(tmp_path / "a.h5").signal.speed_of_sound_m_s == 1540.0
+    (tmp_path / "a.h5.toml").write_text("speed_of_sound_m_s = 1482\n")
+    with pytest.raises(InvalidInputError, match=r"a\.h5\.toml: expected none beside a speckle3d\.sweep"):
+        load_sweep(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "column_pitch_mm = 300.0",
+            "vector_pitch_mm: expected 0.005 to 5 mm, got 300: is it in another unit",
+        ),
+        ("row_spacing_mm = 0.0002", "sample_spacing_mm: expected 0.0005 to 5 mm, got 0.0002"),
+        ("frame_rate_hz = 25000.0", "frame times: expected frames 0.0001 to 20 s apart, got 4e-05 s"),
+    ],
+)
+def test_numbers_in_another_unit_are_refused(tmp_path, text, said):
+    path = write_mha(tmp_path / "a.mha", grey())
+    given = dict(line.split(" = ") for line in (BMODE + "frame_rate_hz = 10").splitlines())
+    name, value = text.split(" = ")
+    lines = given | {name: value}
+    (tmp_path / "import.toml").write_text("".join(f"{key} = {number}\n" for key, number in lines.items()))
+    with pytest.raises(InvalidInputError, match=re.escape(said)) as caught:
+        load_sweep(path)
+    assert str(path) in str(caught.value)

@@ -122,14 +122,14 @@ def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
 
 def test_the_pitch_of_rf_lines_but_not_the_image_of_them(tmp_path):
     scan = '<ScanConversion TransducerGeometry="{}" TransducerWidthMm="38.4" ImagingDepthMm="40"/>'
-    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 4, 30), np.int16), frames=tracked(2)[2])
+    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 12, 30), np.int16), frames=tracked(2)[2])
     config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()), scan=scan.format("LINEAR"))
     more = {"centre_frequency_hz": 5e6, "bandwidth_hz": (3e6, 7e6)}
     with pytest.raises(MissingSettingsError) as caught:  # the shown depth is not that of the samples
         load_sweep(rf, given(config, **more))
     assert caught.value.settings == ("sampling_rate_hz",)
     sweep = load_sweep(rf, given(config, sampling_rate_hz=40e6, **more))
-    assert sweep.grid.vector_pitch_mm == pytest.approx(38.4 / 4)
+    assert sweep.grid.vector_pitch_mm == pytest.approx(38.4 / 12)
     assert sweep.tracker.sensor_from_image is None  # of the B-mode image's pixels
     config = written(tmp_path / "set.xml", scan=scan.format("CURVILINEAR"))
     with pytest.raises(InvalidInputError, match=r"rf\.mha: .*curvilinear.*parallel"):
