@@ -149,4 +149,5 @@ READER = Reader(
     read_metaimage,
     describe_sequence,
     _companions,
+    lambda path, settings: Source.open(path, settings).contradictions(),
 )
