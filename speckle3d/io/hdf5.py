@@ -7,6 +7,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeAlias
@@ -172,8 +173,15 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
-        require_sound_heaps(path)
+        held = os.stat(path)
+        _require_sound_once(os.fspath(path), held.st_ino, held.st_size, held.st_mtime_ns)
         return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
+
+
+@lru_cache(maxsize=16)
+def _require_sound_once(path: str, *_: int) -> None:
+    """Look through a file's heaps, unless that was done and it is as it was: each reader opens it anew."""
+    require_sound_heaps(path)
 
 
 def require_file(path: PathLike) -> None:

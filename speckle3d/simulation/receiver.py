@@ -90,8 +90,11 @@ class Demodulator:
     @cached_property
     def _taps(self) -> FloatArray:
         half_rate = self.rf.sampling_rate_hz / 2.0
+        low, high = self.rf.bandwidth_hz
+        # Real echoes have a mirror image of their band, which mixing shifts down, too.
+        mirror_hz = low + self.frequency_hz - GUARD * (high - low)
         # What aliases may fall where nothing is kept, and only there.
-        stop_hz = min(self.rf.sampling_rate_hz / self.every - self.reach_hz, half_rate)
+        stop_hz = min(self.rf.sampling_rate_hz / self.every - self.reach_hz, half_rate, mirror_hz)
         if stop_hz <= self.reach_hz:
             return np.ones(1)
         count, beta = filters.kaiserord(_STOP_DB, (stop_hz - self.reach_hz) / half_rate)

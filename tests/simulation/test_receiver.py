@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import sweep_examples
+from scipy import signal as filters
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
@@ -93,3 +94,16 @@ def test_beyond_the_range_is_black_or_white():
 def test_only_rf_can_be_received(signal):
     with pytest.raises(InvalidInputError, match="expected RF"):
         received_as_iq(sweep_examples.iq_sweep() if signal == "iq" else sweep_examples.bmode_sweep())
+
+
+@pytest.mark.parametrize("decimation", [1, 2, 3, 5, 8])
+def test_the_magnitude_is_the_envelope_at_every_rate(decimation):
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=(2, 4000))
+    band = filters.firwin(301, (5.2e6, 9.8e6), pass_zero=False, fs=RF.sampling_rate_hz)
+    echoes = filters.convolve(noise, band[None], mode="same")
+    found = np.abs(Demodulator(RF, 7.5e6, decimation)(echoes))
+    envelope = np.abs(filters.hilbert(echoes, axis=1))[:, ::decimation]
+    inner = slice(400 // decimation, -400 // decimation)  # away from the ends of the filters
+    # The passband is flat to 80 dB; what the window cuts of the band's edges is within a percent.
+    np.testing.assert_allclose(found[:, inner], envelope[:, inner], atol=0.01 * envelope.max())
