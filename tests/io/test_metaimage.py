@@ -271,6 +271,7 @@ def test_bad_fields_are_named_with_their_frame(tmp_path, frames, message):
     [
         ({"UltrasoundImageOrientation": "MM"}, "UltrasoundImageOrientation.*MM"),
         ({"UltrasoundImageOrientation": "F"}, "UltrasoundImageOrientation"),
+        ({"UltrasoundImageOrientation": "MFX"}, "expected as MF, FM or MFA, got MFX"),
         ({"UltrasoundImageType": "RGB_COLOR"}, "RGB_COLOR"),
         ({"UltrasoundImageType": "RF_I_LINE_Q_LINE", "ElementType": "MET_UCHAR"}, "I and Q"),
         ({"DimSize": "5 x 3"}, "DimSize"),

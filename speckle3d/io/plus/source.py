@@ -97,7 +97,8 @@ class Source:
             )
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
-                f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space"
+                f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space by "
+                "its Kinds; if it is time, say so by --frame-rate-hz"
             )
         if header.pixels.count != size[0] * size[1] * header.frame_count:
             raise InvalidInputError(
@@ -230,6 +231,10 @@ class Source:
     def contradictions(self) -> list[str]:
         """Tell what is given and is another than header or device set say."""
         notes = contradictions(self.path, self.found(), self.settings)
+        if self.header.is_volume:
+            notes.append(
+                "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
+            )
         held, given = self._held_mm(), self.settings.image_to_probe
         if held is not None and given is not None:
             sizes = pixel_axes(np.asarray(given, dtype=float), "image_to_probe")
@@ -259,6 +264,9 @@ class Source:
             ("tracker of", "none" if self.poses is None else " and ".join(self.poses.names), ""),
             ("image calibration", "none" if calibrated is None else calibrated[1], ""),
         ]
+        if self.header.is_volume:
+            as_time = "time, as the frame rate that is given says; in space by its Kinds"
+            rows.append(("third axis", as_time if self.settings.frame_rate_hz else "in space", ""))
         if self.settings.plus_config is not None:
             rows.append(("device set", self.settings.plus_config, ""))
         return [*rows, *rows_of(self.path, self.found(), self.settings)]
