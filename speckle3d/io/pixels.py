@@ -240,10 +240,20 @@ def _require_plausible(where: str, pixels: Pixels) -> None:
         raise InvalidInputError(f"{where}: expected at most {most} bytes of pixels, got {got}")
 
 
+_PATTERN_NUMBERS = 2
+"""Behind a pattern of files: the first and the last number, and the step."""
+
+
 def _beside(path: Path, name: str, field: str) -> Path:
     """Path of a data file in the header's folder, symbolic links followed."""
     where = f"{path}: {field}"
     folder = path.parent.resolve()
+    first, *more = name.split() or [""]
+    if first == "LIST" or ("%" in first and len(more) >= _PATTERN_NUMBERS):
+        raise InvalidInputError(
+            f"{where}: expected LOCAL or the name of one file, got a list of files ({name!r}), which is not "
+            "read: write the images into one file"
+        )
     try:
         data = (folder / name).resolve()
     except (OSError, ValueError, RuntimeError) as error:
