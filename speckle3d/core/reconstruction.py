@@ -68,14 +68,37 @@ class SourceFile:
 
 
 @dataclass(frozen=True)
+class ImportRecord:
+    """Settings over what a recording says itself, which were in force when it was read.
+
+    Attributes
+    ----------
+    name : str
+        Of the file that gave them, beside the recording.
+    settings_json : str
+        All that it gave, by the names of the import settings.
+    """
+
+    name: str
+    settings_json: str
+
+
+@dataclass(frozen=True)
 class Provenance:
-    """Input files and package version that a reconstruction was made with."""
+    """Input files and package version that a reconstruction was made with.
+
+    Attributes
+    ----------
+    imported : ImportRecord or None
+        None where no settings were in force, and in older files.
+    """
 
     input_path: str
     input_sha256: str
     package_version: str
     calibrations: tuple[CalibrationFile, ...] = ()
     crossing: SourceFile | None = None
+    imported: ImportRecord | None = None
 
 
 @dataclass(frozen=True)

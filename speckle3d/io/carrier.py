@@ -1,4 +1,4 @@
-"""Whether complex samples still carry their frequency, told by how their phase turns along depth."""
+"""What complex samples carry, told by how their phase turns along depth: their frequency, the sign of Q."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from speckle3d.core.sweep import Frames
 
 _LEAST_COHERENCE = 0.1
 """Of neighbouring samples, below which they are noise and tell nothing."""
+_LEAST_SIGMAS = 4.0
+"""Of the mean of so many phases of noise, below which coherence tells nothing either: of few samples."""
+_PARTS, _LEAST_SHARE = 10, 0.5
+"""Parts of the depth, of which those count that are so coherent, by the most coherent."""
 _FASTEST = 0.85 * np.pi
 """Turn of a carrier from sample to sample, above which it may seem to turn backwards."""
 _REMOVED, _CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
@@ -17,9 +21,6 @@ _REMOVED, _CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
 
 def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
     """Frequency that complex samples were shifted down by: `frequency_hz`, or 0 where they still carry it.
-
-    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
-    spectrum [1]_: nothing, or 2 pi f / fs.
 
     Returns
     -------
@@ -30,33 +31,77 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     ------
     InvalidInputError
         If the carrier turns backwards: Q has the other sign.
-
-    References
-    ----------
-    .. [1] C. Kasai et al., "Real-time two-dimensional blood flow imaging using an autocorrelation
-       technique", IEEE Trans. Sonics Ultrason. 32, 1985.
     """
-    lag, count = 0j, 0
-    for i in sorted({0, frames.shape[0] // 2, frames.shape[0] - 1}):
-        frame = np.asarray(frames[i], dtype=np.complex128)
-        # Each pair counts the same: a near field may be a thousand times as strong as the rest.
-        pairs = np.conj(frame[:, :-1]) * frame[:, 1:]
-        pairs = pairs[pairs != 0]
-        lag += complex((pairs / np.abs(pairs)).sum())
-        count += pairs.size
-    if not abs(lag) > _LEAST_COHERENCE * count:
-        return None
-    carried = 2.0 * np.pi * frequency_hz / sampling_rate_hz
-    measured = float(np.angle(lag)) / carried
-    if carried > _FASTEST:
+    measured = carried_share(frames, frequency_hz, sampling_rate_hz)
+    if measured is None:
         return None
     if _REMOVED[0] <= measured <= _REMOVED[1]:
         return frequency_hz
     if _CARRIED[0] <= measured <= _CARRIED[1]:
         return 0.0
     if _REVERSED[0] <= measured <= _REVERSED[1]:
+        carried = _turn(frequency_hz, sampling_rate_hz)
         raise InvalidInputError(
             f"expected I/Q whose phase turns by {carried:.2f} rad a sample, or by none, got "
             f"{measured * carried:.2f}: Q has the other sign"
         )
     return None
+
+
+def sign_of_q(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> int:
+    """Sign of Q of complex samples that still carry their frequency: 1, or -1 if it is the other way round.
+
+    Samples that are said to carry it can turn one way or the other, and not stand still as in
+    `demodulation_of`; so a reversed carrier may be as far lowered as one that is not.
+
+    Returns
+    -------
+    int
+        0 where the phase does not tell: noise, samples too far apart, or another carrier than `frequency_hz`.
+    """
+    measured = carried_share(frames, frequency_hz, sampling_rate_hz)
+    if measured is None or not _CARRIED[0] <= abs(measured) <= _CARRIED[1]:
+        return 0
+    return 1 if measured > 0 else -1
+
+
+def carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
+    """Mean turn of the phase from sample to sample, over that of a carrier of `frequency_hz`.
+
+    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
+    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
+
+    Returns
+    -------
+    float or None
+        None where the phase does not tell: noise, or samples too far apart for the frequency.
+
+    References
+    ----------
+    .. [1] C. Kasai et al., "Real-time two-dimensional blood flow imaging using an autocorrelation
+       technique", IEEE Trans. Sonics Ultrason. 32, 1985.
+    """
+    carried = _turn(frequency_hz, sampling_rate_hz)
+    if carried > _FASTEST:
+        return None
+    lags, counts = np.zeros(_PARTS, dtype=complex), np.zeros(_PARTS)
+    for i in sorted({0, frames.shape[0] // 2, frames.shape[0] - 1}):
+        frame = np.asarray(frames[i], dtype=np.complex128)
+        pairs = np.conj(frame[:, :-1]) * frame[:, 1:]
+        # Each pair counts the same: a near field may be a thousand times as strong as the rest.
+        size = np.abs(pairs)
+        turns = np.divide(pairs, size, out=np.zeros_like(pairs), where=size > 0)
+        lags += [part.sum() for part in np.array_split(turns, _PARTS, axis=1)]
+        counts += [np.count_nonzero(part) for part in np.array_split(turns, _PARTS, axis=1)]
+    coherence = np.abs(lags) / np.maximum(counts, 1.0)
+    # Deep down there may be noise alone, whose own mean turn is another.
+    seen = coherence >= _LEAST_SHARE * coherence.max()
+    lag, count = lags[seen].sum(), counts[seen].sum()
+    if not abs(lag) > max(_LEAST_COHERENCE * count, _LEAST_SIGMAS * count**0.5):
+        return None
+    return float(np.angle(lag)) / carried
+
+
+def _turn(frequency_hz: float, sampling_rate_hz: float) -> float:
+    """Turn of a carrier from sample to sample, rad."""
+    return 2.0 * np.pi * frequency_hz / sampling_rate_hz

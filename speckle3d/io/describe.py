@@ -15,6 +15,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
+from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
@@ -154,7 +155,14 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
         ("input SHA-256", result.provenance.input_sha256, ""),
         ("package version", result.provenance.package_version, ""),
         *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
+        *_import_rows(result.provenance.imported),
     ]
+
+
+def _import_rows(imported: ImportRecord | None) -> list[Row]:
+    if imported is None:
+        return []
+    return [("import settings of", imported.name, ""), ("import settings", imported.settings_json, "")]
 
 
 def _describe_calibration(path: PathLike) -> list[Row]:

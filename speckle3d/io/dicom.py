@@ -20,10 +20,11 @@ from speckle3d.core.files import open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.dicom_elements import read_header, reading_dicom, text_of, whole_of
+from speckle3d.io.found import Found
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import LazyFrames, OpenFrames
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Found, Recording
+from speckle3d.io.recordings import Recording
 
 FORMAT = "DICOM"
 
@@ -362,4 +363,8 @@ def _notes(header: Any, syntax: Any) -> tuple[Row, ...]:
     return tuple(rows)
 
 
-READER = Reader(FORMAT, _claims, read_dicom, _describe)
+def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
+    return _recording(path).contradictions(settings)
+
+
+READER = Reader(FORMAT, _claims, read_dicom, _describe, notes=_contradictions)

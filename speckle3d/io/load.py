@@ -7,6 +7,8 @@ from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike
+from speckle3d.core.printable import written_path
+from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
@@ -101,6 +103,14 @@ def companion_files(path: PathLike) -> list[Path]:
         return [*reader.companions(Path(path))]
     config = settings_for(path).plus_config
     return [*reader.companions(Path(path)), beside, *([] if config is None else [Path(config)])]
+
+
+def import_record(path: PathLike) -> ImportRecord | None:
+    """Settings that a file beside a recording gives; None where there is none, or it would not be read."""
+    reader, beside = find_reader(path), settings_file(path)
+    if reader is None or beside is None or not reader.takes_settings:
+        return None
+    return ImportRecord(written_path(beside.name), settings_for(path).model_dump_json(exclude_defaults=True))
 
 
 def recording_files(path: PathLike) -> list[Path]:

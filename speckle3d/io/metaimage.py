@@ -5,16 +5,16 @@ PLUS's names stay in this module, in `headers` and in `plus`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep, Tracker
+from speckle3d.io.carrier import sign_of_q
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.import_settings import ImportSettings
@@ -43,7 +43,7 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
     chosen = source.require_images()
     values = source.settings.over(path, **source.wanted())
     frames = SequenceFrames(source.header, source.layout, source.record(), chosen)
-    if values.get("demodulation_frequency_hz") == 0 and _turns_backwards(frames[0]):
+    if _sign_of_q(frames, values) == -1:
         frames.record = source.record(conjugated=True)
     with naming(str(path)):
         grid, signal = source.geometry(values, frames.shape)
@@ -83,17 +83,31 @@ def lacking_poses(path: PathLike) -> str:
     return f"{', '.join(header.transforms) or 'none'}{advice}"
 
 
-def _turns_backwards(frame: npt.NDArray[Any]) -> bool:
-    """Whether the carrier turns backwards, as it does in a reversed line or with the other sign of Q.
+def _sign_of_q(frames: SequenceFrames, values: Mapping[str, Any]) -> int:
+    """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell.
 
-    The phase between neighbouring samples is the carrier's mean turn, the first moment of the spectrum [1]_.
-
-    References
-    ----------
-    .. [1] C. Kasai et al., "Real-time two-dimensional blood flow imaging using an autocorrelation
-       technique", IEEE Trans. Sonics Ultrason. 32, 1985.
+    It does not of I/Q that were shifted down, which turn either way. In lines that are stored from the far
+    end on, depth runs backwards and so does the phase, unless the writer thought of it.
     """
-    return bool(np.angle(np.vdot(frame[:, :-1], frame[:, 1:])) < 0)
+    if values.get("demodulation_frequency_hz") != 0:
+        return 0
+    return sign_of_q(frames, values["centre_frequency_hz"], values["sampling_rate_hz"])
+
+
+_SIGNS = {1: "told by the phase", -1: "turned, as told by the phase", 0: "as stored, not told by the phase"}
+
+
+def _sign_rows(source: Source) -> list[Row]:
+    """What is known of the sign of Q; nothing of other samples, or while a sweep cannot be read."""
+    if not source.layout.is_complex:
+        return []
+    try:
+        chosen = source.require_images()
+        values = source.settings.over(source.path, **source.wanted())
+        frames = SequenceFrames(source.header, source.layout, source.record(), chosen)
+        return [("sign of Q", _SIGNS[_sign_of_q(frames, values)], "")]
+    except InvalidInputError:
+        return []  # Why there is no sweep is told beside these rows.
 
 
 def describe_sequence(path: PathLike, settings: ImportSettings) -> list[Row]:
@@ -115,7 +129,7 @@ def describe_sequence(path: PathLike, settings: ImportSettings) -> list[Row]:
         ("time stamps", "yes" if source.has_times else "no", ""),
     ]
     try:
-        return [*rows, *source.sources()]
+        return [*rows, *source.sources(), *_sign_rows(source)]
     except InvalidInputError as error:
         return [*rows, ("poses", f"none: {error}", "")]
 
@@ -135,4 +149,5 @@ READER = Reader(
     read_metaimage,
     describe_sequence,
     _companions,
+    lambda path, settings: Source.open(path, settings).contradictions(),
 )

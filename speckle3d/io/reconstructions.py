@@ -15,6 +15,7 @@ from speckle3d.core.reconstruction import (
     MODES,
     CalibrationFile,
     FramePairs,
+    ImportRecord,
     Provenance,
     Reconstruction,
     SourceFile,
@@ -30,6 +31,7 @@ from speckle3d.io.hdf5 import (
     opened,
     read_attributes,
     read_checked,
+    read_text,
     read_texts,
     read_transforms,
     require_group,
@@ -129,6 +131,11 @@ class ReconstructionWriter(HDF5Writer):
             write_attributes(self._file.require_group(f"calibrations/{used.sensor}"), used, _SOURCE)
         if provenance.crossing is not None:
             write_attributes(self._file.require_group("crossing"), provenance.crossing, _SOURCE)
+        if provenance.imported is not None:
+            group = self._file.create_group("import")
+            write_attributes(group, provenance.imported, ("name",))
+            # A mapping of arrays may be more than an attribute holds.
+            group["settings_json"] = provenance.imported.settings_json
         self._file["config_toml"] = config_toml
         self._finished = True
 
@@ -204,8 +211,15 @@ def _read_provenance(file: h5py.File) -> Provenance:
     ]
     crossed = find_group(file, "crossing")
     crossing = None if crossed is None else SourceFile(**read_attributes(crossed, _SOURCE))
+    held = find_group(file, "import")
+    imported = None
+    if held is not None:
+        imported = ImportRecord(read_text(held, "name"), read_texts(held, "settings_json", ()))
     return Provenance(
-        **read_attributes(file, _PROVENANCE), calibrations=tuple(calibrations), crossing=crossing
+        **read_attributes(file, _PROVENANCE),
+        calibrations=tuple(calibrations),
+        crossing=crossing,
+        imported=imported,
     )
 
 

@@ -17,27 +17,12 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, Tracker
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
+from speckle3d.io.found import ASSUMED, Found, contradictions, rows_of
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Row
 
 SPREAD = 1e-3
 """How far steps of an axis may be from their mean, as a share: rounding of single precision in metres."""
-
-UNITS = {"hz": "Hz", "mm": "mm", "db": "dB", "s": "m/s"}
-
-
-@dataclass(frozen=True)
-class Found:
-    """A number that a recording gives, and where; None if it does not."""
-
-    value: Any = None
-    source: str = ""
-
-
-ASSUMED = {
-    "speed_of_sound_m_s": Found(SPEED_OF_SOUND_M_S, "assumed"),
-    "first_sample_depth_mm": Found(0.0, "assumed"),
-}
 
 
 @dataclass(frozen=True)
@@ -97,7 +82,11 @@ class Recording:
 
     def rows(self, settings: ImportSettings) -> list[Row]:
         """Tell what each number is and where it comes from."""
-        return [*self.notes, *(_row(name, one, settings) for name, one in self._needed(settings).items())]
+        return [*self.notes, *rows_of(self.path, self._needed(settings), settings)]
+
+    def contradictions(self, settings: ImportSettings) -> list[str]:
+        """Tell what is given and is another than the recording says."""
+        return contradictions(self.path, self._needed(settings), settings)
 
     def _needed(self, settings: ImportSettings) -> dict[str, Found]:
         names = ["first_sample_depth_mm"]
@@ -111,6 +100,8 @@ class Recording:
         if self.frames.shape[0] > 1 and (self.time_s is None or settings.frame_rate_hz is not None):
             names.append("frame_rate_hz")
         needed = {name: self.found.get(name, ASSUMED.get(name, Found())) for name in names}
+        if "frame_rate_hz" in needed and self.time_s is not None:
+            needed["frame_rate_hz"] = Found(rate_of(self.time_s), "of its times")
         if "sampling_rate_hz" in needed and self.sample_spacing_mm is not None:
             speed = settings.speed_of_sound_m_s or needed["speed_of_sound_m_s"].value
             needed["sampling_rate_hz"] = Found(
@@ -150,23 +141,10 @@ class Recording:
         return np.arange(self.frames.shape[0]) / float(rate)
 
 
-def _row(name: str, one: Found, settings: ImportSettings) -> Row:
-    given = getattr(settings, name)
-    *words, unit = name.split("_")
-    if unit == "s":
-        words = words[:-1]
-    spoken, unit = " ".join(words), UNITS[unit]
-    if unit == "Hz" and words[0] != "frame":
-        unit = "MHz"
-    if given is not None:
-        return spoken, f"{_shown(given, unit)} (given)", unit
-    if one.value is None:
-        return spoken, f"missing: --{name.replace('_', '-')}", ""
-    return spoken, f"{_shown(one.value, unit)} ({one.source})", unit
-
-
-def _shown(value: Any, unit: str) -> str:
-    return " to ".join(f"{each / (1e6 if unit == 'MHz' else 1.0):.7g}" for each in np.ravel(value))
+def rate_of(time_s: FloatArray) -> float | None:
+    """Mean frame rate of times, Hz; None of fewer than two, or where they do not rise."""
+    span = float(time_s[-1] - time_s[0]) if time_s.size > 1 else 0.0
+    return (time_s.size - 1) / span if span > 0 else None
 
 
 def step_of(axis: FloatArray, where: str) -> float:

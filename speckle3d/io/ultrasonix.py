@@ -21,10 +21,11 @@ import numpy as np
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.core.sweep import Sweep
+from speckle3d.io.found import Found
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import Layout, RawFrames, Real
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Found, Recording
+from speckle3d.io.recordings import Recording
 
 FORMAT = "Ultrasonix"
 
@@ -187,4 +188,8 @@ def _unpacked(content: bytes) -> _Header:
     )
 
 
-READER = Reader(FORMAT, _claims, read_ultrasonix, _describe)
+def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
+    return _recording(path).contradictions(settings)
+
+
+READER = Reader(FORMAT, _claims, read_ultrasonix, _describe, notes=_contradictions)

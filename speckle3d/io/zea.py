@@ -24,6 +24,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.carrier import demodulation_of
+from speckle3d.io.found import Found
 from speckle3d.io.greys import grey_frames
 from speckle3d.io.hdf5 import (
     find_group,
@@ -42,7 +43,7 @@ from speckle3d.io.hdf5_values import single
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.lazy import HDF5Slices, Layout, Pairs, Real
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Found, Recording, step_of
+from speckle3d.io.recordings import Recording, step_of
 
 FORMAT = "zea"
 
@@ -338,4 +339,8 @@ def _notes(file: h5py.File, array: _Array | None = None) -> list[Row]:
     return rows
 
 
-READER = Reader(FORMAT, hdf5_claim(is_zea), read_zea, _describe)
+def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
+    return _recording(path, settings).contradictions(settings)
+
+
+READER = Reader(FORMAT, hdf5_claim(is_zea), read_zea, _describe, notes=_contradictions)

@@ -27,7 +27,7 @@ from speckle3d.corrections import Correction, correct
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.load import kind_of, recording_sha256
+from speckle3d.io.load import import_record, kind_of, recording_sha256
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Progress, Tracked, after, track
@@ -175,6 +175,7 @@ def write_results(
             version("speckle3d"),
             mounted,
             request.crossing_file,
+            import_record(source),
         )
         writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
     if request.reference is None and compared is not None and compared.name == "tracker":

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import speckle
 import sweep_examples
-from image_examples import grey, tracked, write_mha
+from image_examples import grey, text_of, tracked, write_mha
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.io.curves import write_curves
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import import_notes, load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import write_sweep
 
@@ -108,3 +108,44 @@ def test_an_image_sequence_is_described_from_its_header(tmp_path):
     assert rows["image type"] == ("BRIGHTNESS (assumed)", "")
     assert rows["transforms"] == ("ProbeToTracker, ReferenceToTracker", "")
     assert rows["time stamps"] == ("yes", "")
+
+
+def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
+    pixels = np.zeros((3, 4, 30), np.int16)
+    fields = {"UltrasoundImageType": "RF_REAL"}
+    path = write_mha(tmp_path / "a.mha", pixels, fields, tracked(3)[2], spacing="0.01925 0.2 1")
+    (tmp_path / "import.toml").write_text(
+        "sampling_rate_hz = 80e6\ncentre_frequency_hz = 5e6\n"
+        "bandwidth_hz = [3e6, 7e6]\nvector_pitch_mm = 0.2005"
+    )
+    rows = values(path)
+    assert rows["sampling rate"][0] == "80"
+    told = {name: value for name, value, _ in describe(path) if "(" in value}
+    assert told["sampling rate"] == "80 (given by import.toml, the file says 40)"
+    assert told["vector pitch"] == "0.2005 (given by import.toml, the file says 0.2)"
+    assert told["centre frequency"] == "5 (given by import.toml)"
+    assert told["speed of sound"] == "1540 (assumed)"
+    assert import_notes(path) == [  # 0.2005 is within 1 %
+        "sampling rate 80 MHz, given by import.toml: the file says 40 (of samples 0.01925 mm apart, by "
+        "ElementSpacing, at 1540 m/s)"
+    ]
+    option = ImportSettings(vector_pitch_mm=0.05)
+    assert import_notes(path, option)[1] == "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)"
+    rated = ImportSettings(frame_rate_hz=20.0)
+    assert import_notes(path, rated)[1] == "frame rate 20 Hz, given: the file says 10 (of its time stamps)"
+
+
+def test_a_calibration_that_is_given_is_told_against_the_spacing(tmp_path):
+    frames = [
+        each | {"ImageToProbeTransform": text_of(np.diag([0.2, 0.2, 0.2, 1]))} for each in tracked(3)[2]
+    ]
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
+    (tmp_path / "a.mha.toml").write_text("column_pitch_mm = 0.1\ndynamic_range_db = 60")
+    told = {name: value for name, value, _ in describe(path) if "(" in value}
+    assert told["column pitch"] == "0.1 (given by a.mha.toml, the file says 0.2)"
+    assert told["row spacing"] == "0.2 (ImageToProbeTransform)"
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frames, spacing="0.1 0.1 1")
+    given = ImportSettings(image_to_probe=np.diag([0.2, 0.2, 0.2, 1]).tolist(), column_pitch_mm=0.2)
+    assert import_notes(path, given) == [
+        "pixels of 0.2 x 0.2 mm, given by image_to_probe: the file says 0.1 x 0.1"
+    ]

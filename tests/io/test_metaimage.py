@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.metaimage import read_metaimage, read_poses
+from speckle3d.io.metaimage import describe_sequence, read_metaimage, read_poses
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 RF = ImportSettings(
@@ -77,6 +77,40 @@ def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orien
     assert sweep.frames.dtype == np.complex64
     assert sweep.signal.demodulation_frequency_hz == 0
     np.testing.assert_array_equal(frames_of(sweep)[0], signal)
+
+
+@pytest.mark.parametrize(
+    ("carrier_hz", "sampling_hz", "told"),
+    [
+        (4e6, 15e6, "told by the phase"),
+        (-4e6, 15e6, "turned, as told by the phase"),
+        (9e6, 15e6, "as stored, not told by the phase"),  # A turn of 3.8 rad seems to be one of -2.5.
+        (14e6, 15e6, "as stored, not told by the phase"),
+        (None, 40e6, "as stored, not told by the phase"),  # noise
+    ],
+)
+def test_the_sign_of_q_is_turned_only_where_the_phase_tells(tmp_path, carrier_hz, sampling_hz, told):
+    rng = np.random.default_rng(4)
+    signal = 1e3 * rng.normal(size=(2, 4, 64, 2)).view(np.complex128)[..., 0]
+    if carrier_hz is not None:
+        signal = np.tile(3e3 * np.exp(2j * np.pi * carrier_hz / sampling_hz * np.arange(64)), (2, 4, 1))
+    pixels = np.stack([signal.real, signal.imag], 3).reshape(2, 4, 128).round().astype(np.int16)
+    given = RF.model_copy(
+        update={
+            "sampling_rate_hz": sampling_hz,
+            "demodulation_frequency_hz": 0.0,
+            "centre_frequency_hz": abs(carrier_hz or 9e6),
+            "bandwidth_hz": (2e6, 15e6),
+            "frame_rate_hz": 20.0,
+        }
+    )
+    path = write_mha(tmp_path / "a.mha", pixels, {"UltrasoundImageType": "RF_IQ_LINE"}, frames=())
+    sweep = read_metaimage(path, given)
+    assert ("sign of Q", told, "") in describe_sequence(path, given)
+    stored = pixels[..., 0::2] + 1j * pixels[..., 1::2]
+    turned = told.startswith("turned")
+    np.testing.assert_array_equal(frames_of(sweep), np.conj(stored) if turned else stored)
+    assert sweep.frames.record.conjugated == turned
 
 
 def test_an_invalid_frame_is_left_out_and_an_invalid_pose_is_dropped(tmp_path):
@@ -169,6 +203,7 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(tmp_path_
     # The skew is shared by both axes, so the nearest square pair is the one without it.
     x, y = np.cos(skew) * x + np.sin(skew) * y, np.sin(skew) * x + np.cos(skew) * y
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 3] = scale[0] * x, scale[1] * y, place
+    matrix[:3, 2] = np.cross(x, y)
     _, _, frames = tracked(3)
     path = write_mha(tmp_path_factory.mktemp("calibration") / "a.mha", grey(), frames=frames)
     settings_ = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
@@ -236,6 +271,7 @@ def test_bad_fields_are_named_with_their_frame(tmp_path, frames, message):
     [
         ({"UltrasoundImageOrientation": "MM"}, "UltrasoundImageOrientation.*MM"),
         ({"UltrasoundImageOrientation": "F"}, "UltrasoundImageOrientation"),
+        ({"UltrasoundImageOrientation": "MFX"}, "expected as MF, FM or MFA, got MFX"),
         ({"UltrasoundImageType": "RGB_COLOR"}, "RGB_COLOR"),
         ({"UltrasoundImageType": "RF_I_LINE_Q_LINE", "ElementType": "MET_UCHAR"}, "I and Q"),
         ({"DimSize": "5 x 3"}, "DimSize"),
@@ -248,6 +284,38 @@ def test_bad_headers_are_refused(tmp_path, fields, message):
         read_metaimage(
             write_mha(tmp_path / "a.mha", pixels, fields), BMODE.model_copy(update={"bandwidth_hz": (1, 2)})
         )
+
+
+@pytest.mark.parametrize("column", range(3))
+def test_a_mirrored_image_calibration_is_refused(tmp_path, column):
+    axes = np.diag([0.2, 0.2, 0.2, 1.0])
+    axes[:, column] *= -1
+    path = write_mha(tmp_path / "a.mha", grey(), {"ImageToProbeTransform": text_of(axes)}, tracked(3)[2])
+    with pytest.raises(InvalidInputError, match=r"ImageToProbeTransform: expected right-handed.*-1\)"):
+        read_metaimage(path, BMODE)
+    axes[:, 2] = 0  # never measured
+    path = write_mha(tmp_path / "a.mha", grey(), {"ImageToProbeTransform": text_of(axes)}, tracked(3)[2])
+    found = read_metaimage(path, BMODE).tracker.sensor_from_image.rotation.as_matrix()
+    np.testing.assert_allclose(found[:, :2], axes[:3, :2] / 0.2, atol=1e-12)
+
+
+def test_poses_both_ways_round_are_inverses_or_refused(tmp_path):
+    _, _, frames = tracked(3)
+    name = "ProbeToTrackerTransform"
+    both = [
+        f | {"TrackerToProbeTransform": inverted(f[name]), "TrackerToProbeTransformStatus": "OK"}
+        for f in frames
+    ]
+    path = write_mha(tmp_path / "a.mha", grey(), frames=both)
+    alone = read_poses(write_mha(tmp_path / "b.mha", grey(), frames=frames))
+    expected = alone.readings.world_from_sensor.as_matrix()
+    np.testing.assert_array_equal(read_poses(path).readings.world_from_sensor.as_matrix(), expected)
+    both[1]["TrackerToProbeTransform"] = both[1]["ProbeToTrackerTransform"]
+    path = write_mha(tmp_path / "a.mha", grey(), frames=both)
+    with pytest.raises(InvalidInputError, match=r"TrackerToProbeTransform\[1\].*inverse of ProbeToTracker"):
+        read_poses(path)
+    both[1]["TrackerToProbeTransformStatus"] = "INVALID"
+    assert len(read_poses(write_mha(tmp_path / "a.mha", grey(), frames=both)).readings) == 3
 
 
 def test_a_turned_image_calibration_is_refused(tmp_path):

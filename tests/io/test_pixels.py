@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from image_examples import grey, tracked, write_mha
 
-from speckle3d.core.errors import FileError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
@@ -143,3 +143,11 @@ def test_pixels_of_others_are_what_the_image_library_finds(realdata, name):
     got = read_pixels(read_header(realdata / name).pixels)
     assert got.dtype == expected.dtype
     np.testing.assert_array_equal(got, expected.ravel())
+
+
+@pytest.mark.parametrize("name", ["LIST", "LIST 2", "a%03d.raw 1 10 1"])
+def test_lists_of_files_are_said_not_to_be_read(tmp_path, name):
+    path = write_mha(tmp_path / "a.mha", grey())
+    path.write_bytes(path.read_bytes().replace(b"LOCAL", name.encode()))
+    with pytest.raises(InvalidInputError, match=r"ElementDataFile: expected LOCAL .*a list of files"):
+        read_header(path)

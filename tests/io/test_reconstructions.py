@@ -1,14 +1,19 @@
+import json
 from dataclasses import fields, replace
 
 import h5py
 import numpy as np
 import pytest
 import sweep_examples
+from image_examples import grey, write_mha
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import FramePairs, Provenance, SourceFile, Trust
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.describe import describe
+from speckle3d.io.load import import_record
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
+from speckle3d.io.sweep_writer import write_sweep
 
 N, PATCHES = 8, 6
 GRID = ImageGrid(128, 2000, 0.3, 0.01925, 1.5)
@@ -202,3 +207,23 @@ def test_the_crossing_sweep_is_on_record(tmp_path):
     with ReconstructionWriter(tmp_path / "r.h5", TIMES, GRID) as writer:
         writer.finish(POSES, crossed, CONFIG, TRUST)
     assert read_reconstruction(tmp_path / "r.h5").provenance == crossed
+
+
+def test_settings_that_were_in_force_are_on_record(tmp_path):
+    recording = write_mha(tmp_path / "a.mha", grey())
+    assert import_record(recording) is None
+    toml = "dynamic_range_db = 50\nbandwidth_hz = [3e6, 7e6]\narrays = {rf = 'A'}"
+    (tmp_path / "import.toml").write_text(toml)
+    record = import_record(recording)
+    assert record.name == "import.toml"
+    expected = {"dynamic_range_db": 50, "bandwidth_hz": [3e6, 7e6], "arrays": {"rf": "A"}}
+    assert json.loads(record.settings_json) == expected
+    with ReconstructionWriter(tmp_path / "r.h5", TIMES, GRID) as writer:
+        writer.finish(POSES, replace(PROVENANCE, imported=record), CONFIG, TRUST)
+    assert read_reconstruction(tmp_path / "r.h5").provenance.imported == record
+    rows = describe(tmp_path / "r.h5")
+    assert ("import settings of", "import.toml", "") in rows
+    assert ("import settings", record.settings_json, "") in rows
+    # A sweep file says all itself.
+    write_sweep(tmp_path / "s.h5", sweep_examples.bmode_sweep())
+    assert import_record(tmp_path / "s.h5") is None

@@ -22,6 +22,9 @@ from speckle3d.io.plus.transforms import pixel_axes
 from speckle3d.io.plus.xml import read_xml, vector
 
 _PLACES = (".//CoordinateDefinitions/Transform", ".//CalibrationResults/Transform")
+_INVERSE_TOLERANCE = 0.1
+"""How far the product of a transform and its inverse, both of some digits, may be from the identity, mm or
+pixels."""
 _ALGORITHMS = (".//vtkPlusProbeCalibrationAlgo", ".//vtkProbeCalibrationAlgo", ".//fCal")
 
 
@@ -157,12 +160,31 @@ def read_device_set(path: PathLike) -> DeviceSet:
 
 
 def _transforms(root: Element) -> dict[tuple[str, str], FloatArray]:
-    found = {}
+    """Transforms by their ends; what is said twice, or both ways round, must be said alike."""
+    found: dict[tuple[str, str], FloatArray] = {}
     for place in _PLACES:
         for each in root.iterfind(place):
-            ends = each.get("From", ""), each.get("To", "")
-            found[ends] = np.reshape(vector(each, "Matrix", 16), (4, 4))
+            a, b = each.get("From", ""), each.get("To", "")
+            matrix = np.reshape(vector(each, "Matrix", 16), (4, 4))
+            if (a, b) in found and not np.array_equal(found[a, b], matrix):
+                raise InvalidInputError(
+                    f"Transform From={a} To={b}: expected one, or the same again, got two: "
+                    f"{_text(found[a, b])} and {_text(matrix)}"
+                )
+            back = found.get((b, a))
+            if back is not None and not np.allclose(
+                back @ matrix, np.eye(4), rtol=0, atol=_INVERSE_TOLERANCE
+            ):
+                raise InvalidInputError(
+                    f"Transform From={a} To={b}: expected the inverse of From={b} To={a}, got another: "
+                    f"{_text(matrix)} and {_text(back)}"
+                )
+            found[a, b] = matrix
     return found
+
+
+def _text(matrix: FloatArray) -> str:
+    return "[" + " ".join(f"{value:g}" for value in matrix.ravel()) + "]"
 
 
 def _scan_conversion(element: Element | None) -> ScanConversion:

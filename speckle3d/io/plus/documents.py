@@ -19,7 +19,7 @@ _CONFIG = "--plus-config of convert"
 def _device_rows(path: Path, root: Element) -> list[Row]:
     device = read_device_set(path)
     pixel = device.pixel_mm(device.scan.output_size)
-    devices = [f"{each.get('Id', '?')} ({each.get('Type', '?')})" for each in root.iterfind(".//Device")]
+    devices = [_device(each) for each in root.iterfind(".//Device")]
     wires = len(root.findall(".//PhantomDefinition/Geometry/Pattern/Wire"))
     rows = [
         ("devices", ", ".join(devices) or "none", ""),
@@ -30,6 +30,12 @@ def _device_rows(path: Path, root: Element) -> list[Row]:
         ("wires of a phantom", str(wires), ""),
     ]
     return [*rows, ("for", _CONFIG + (", --phantom of calibrate wires" if wires else ""), "")]
+
+
+def _device(element: Element) -> str:
+    """Name and type of a device, as far as the set says them."""
+    name, kind = element.get("Id", "one without a name"), element.get("Type")
+    return name if kind is None else f"{name} ({kind})"
 
 
 def _lag_rows(_: Path, root: Element) -> list[Row]:

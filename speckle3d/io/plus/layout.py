@@ -20,6 +20,8 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.headers import SequenceHeader
 
 RF_TYPES = ("RF_REAL", "RF_IQ_LINE", "RF_I_LINE_Q_LINE")
+_THIRD_AXES = ("", "A", "D")
+"""Of a third letter: ascending or descending, which of an image of two axes says nothing."""
 _PAIRED = RF_TYPES[1:]
 
 
@@ -65,9 +67,13 @@ class Layout:
             raise InvalidInputError(f"{path}: expected a grey B-mode or RF image, got type {self.kind}")
         if self.kind == "BRIGHTNESS" and dtype != np.uint8:
             raise InvalidInputError(f"{path}: expected B-mode of type uint8, got {dtype}")
-        if {*self.orientation[:2]} not in ({"M", "F"}, {"M", "N"}, {"U", "F"}, {"U", "N"}):
+        sides = {*self.orientation[:2]}
+        if (
+            sides not in ({"M", "F"}, {"M", "N"}, {"U", "F"}, {"U", "N"})
+            or self.orientation[2:] not in _THIRD_AXES
+        ):
             raise InvalidInputError(
-                f"{path}: UltrasoundImageOrientation: expected as MF or FM, got {self.orientation}"
+                f"{path}: UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
             )
         if self.is_complex and size[1 - self._pair_axis] % 2:
             raise InvalidInputError(f"{path}: expected I and Q in pairs, got {size[1 - self._pair_axis]}")

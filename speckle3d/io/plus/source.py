@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,9 +13,10 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Tracker
+from speckle3d.io.found import ASSUMED, Found, contradictions, differs, rows_of
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.headers import SequenceHeader, read_header
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.device_set import DeviceSet, read_device_set
 from speckle3d.io.plus.layout import Layout, layout_of
 from speckle3d.io.plus.own_fields import own_values
@@ -32,10 +33,14 @@ from speckle3d.io.plus.transforms import (
     tracked_poses,
 )
 from speckle3d.io.readers import Row
+from speckle3d.io.recordings import rate_of
 
 _SIZE_TOLERANCE = 0.1
 """How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured
 one were seen to differ by 8 %."""
+
+
+_DEVICE = "the device set"
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,8 @@ class Source:
             )
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
-                f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space"
+                f"{self.path}: expected a sequence of images, got a volume, whose third axis is in space by "
+                "its Kinds; if it is time, say so by --frame-rate-hz"
             )
         if header.pixels.count != size[0] * size[1] * header.frame_count:
             raise InvalidInputError(
@@ -117,62 +123,125 @@ class Source:
 
     def wanted(self) -> dict[str, Any]:
         """What a sweep of this kind needs, as far as file or device set have it; else None."""
-        own, device = self.own, self.device
-        first = {"first_sample_depth_mm": own.get("first_sample_depth_mm", 0.0)}
-        times = {} if self.has_times else {"frame_rate_hz": None}
-        lateral_mm, axial_mm = self.pixel_mm()
+        return {name: one.value for name, one in self.found().items()}
+
+    def found(self) -> dict[str, Found]:
+        """What a sweep of this kind needs, and where file or device set have it."""
+        sizes = self.pixel_mm()
         if not self.layout.is_rf:
-            sizes = {"column_pitch_mm": lateral_mm, "row_spacing_mm": axial_mm}
-            return sizes | {"dynamic_range_db": own.get("dynamic_range_db")} | first | times
-        speed = self.settings.speed_of_sound_m_s or own.get("speed_of_sound_m_s", SPEED_OF_SOUND_M_S)
-        implied = None if axial_mm is None else 1e3 * speed / (2.0 * axial_mm)
-        vectors, _ = self.layout.shape(self.header.size)
-        middle = (
-            {"demodulation_frequency_hz": own.get("demodulation_frequency_hz")}
-            if self.layout.is_complex
-            else {}
-        )
+            lateral, axial = (
+                Found() if sizes.value is None else replace(sizes, value=size)
+                for size in sizes.value or (None, None)
+            )
+            return {
+                "column_pitch_mm": self._own("column_pitch_mm", self._own("vector_pitch_mm", lateral)),
+                "row_spacing_mm": self._own("row_spacing_mm", axial),
+                "dynamic_range_db": self._own("dynamic_range_db"),
+                "first_sample_depth_mm": self._own("first_sample_depth_mm"),
+                **self._found_rate(),
+            }
+        middle = ["demodulation_frequency_hz"] if self.layout.is_complex else []
         return {
-            "sampling_rate_hz": own.get("sampling_rate_hz", implied),
-            "vector_pitch_mm": lateral_mm or device.line_pitch_mm(self.path, vectors),
-            "centre_frequency_hz": own.get("centre_frequency_hz"),
-            "bandwidth_hz": own.get("bandwidth_hz"),
-            "speed_of_sound_m_s": speed,
-            **middle,
-            **first,
-            **times,
+            "sampling_rate_hz": self._own("sampling_rate_hz", self._implied_rate(sizes)),
+            "vector_pitch_mm": self._line_pitch(sizes),
+            **{
+                name: self._own(name)
+                for name in ("centre_frequency_hz", "bandwidth_hz", "speed_of_sound_m_s", *middle)
+            },
+            "first_sample_depth_mm": self._own("first_sample_depth_mm"),
+            **self._found_rate(),
         }
 
-    def pixel_mm(self) -> tuple[float | None, float | None]:
-        """Lateral and axial distance of samples as far as known, mm."""
-        own = self.own
-        lateral = own.get("vector_pitch_mm", own.get("column_pitch_mm"))
-        if lateral is not None:
-            return lateral, own.get("row_spacing_mm")
-        held = self.header.spacing_mm
-        if held is not None and not min(held) > 0:
-            raise InvalidInputError(f"{self.path}: spacing of pixels: expected above zero, got {held}")
-        if held is not None and self.layout.has_lines_in_rows:
-            held = held[::-1]
-        calibrated = self._calibrated_pixel_mm()
+    def _own(self, name: str, otherwise: Found | None = None) -> Found:
+        """What a field says that this package wrote, else another, else what is assumed of all scanners."""
+        value = self.own.get(name)
+        if value is not None:
+            return Found(value, "as this package wrote it")
+        return otherwise or ASSUMED.get(name, Found())
+
+    def _implied_rate(self, sizes: Found) -> Found:
+        """Sampling rate of samples so far apart."""
+        if sizes.value is None:
+            return Found()
+        speed = self.settings.speed_of_sound_m_s or self._own("speed_of_sound_m_s").value
+        spacing_mm = sizes.value[1]
+        source = f"of samples {spacing_mm:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
+        return Found(1e3 * speed / (2.0 * spacing_mm), source, sizes.said_by)
+
+    def _line_pitch(self, sizes: Found) -> Found:
+        if "vector_pitch_mm" in self.own:
+            return self._own("vector_pitch_mm")
+        if sizes.value is not None:
+            return replace(sizes, value=sizes.value[0])
+        vectors, _ = self.layout.shape(self.header.size)
+        pitch = self.device.line_pitch_mm(self.path, vectors)
+        return Found(pitch, "ScanConversion of the device set", _DEVICE) if pitch else Found()
+
+    def _found_rate(self) -> dict[str, Found]:
+        """The frame rate, where it is needed or given."""
+        if not self.has_times:
+            return {"frame_rate_hz": Found()}
+        if self.settings.frame_rate_hz is None:
+            return {}
+        try:
+            stamped = rate_of(time_stamps(self.path, self.header.frames))
+        except InvalidInputError:  # which is why a rate is given
+            stamped = None
+        return {"frame_rate_hz": Found(stamped, "of its time stamps")}
+
+    def pixel_mm(self) -> Found:
+        """Lateral and axial distance of samples, mm, but for those of fields that this package wrote."""
+        if {"vector_pitch_mm", "column_pitch_mm"} & self.own.keys():
+            return Found()
+        held, calibrated = self._held_mm(), self._calibrated_pixel_mm()
         if (
             held is not None
-            and calibrated is not None
+            and calibrated.value is not None
             and self.settings.image_to_probe is None
-            and not np.allclose(held, calibrated, rtol=_SIZE_TOLERANCE, atol=0)
+            and not np.allclose(held, calibrated.value, rtol=_SIZE_TOLERANCE, atol=0)
         ):
-            given, got = (" x ".join(f"{size:g}" for size in sizes) for sizes in (held, calibrated))
+            given, got = (" x ".join(f"{size:g}" for size in sizes) for sizes in (held, calibrated.value))
             raise InvalidInputError(
                 f"{self.path}: expected an image calibration for pixels of {given} mm, as ElementSpacing "
                 f"says, got one for {got} mm"
             )
+        spaced = Found(held, "ElementSpacing") if held is not None else Found()
         if self.layout.is_rf:  # whose sampling rate is known better than by a calibration
-            return held or (None, None)
-        return calibrated or held or self.device.pixel_mm(self.header.size) or (None, None)
+            return spaced
+        device_mm = self.device.pixel_mm(self.header.size)
+        device = Found(device_mm, "device set", _DEVICE) if device_mm is not None else Found()
+        return next((one for one in (calibrated, spaced, device) if one.value is not None), Found())
 
-    def _calibrated_pixel_mm(self) -> tuple[float, float] | None:
+    def _held_mm(self) -> tuple[float, float] | None:
+        """Pixel size by the header's spacing, lateral and axial, mm."""
+        held = self.header.spacing_mm
+        if held is not None and not min(held) > 0:
+            raise InvalidInputError(f"{self.path}: spacing of pixels: expected above zero, got {held}")
+        return held[::-1] if held is not None and self.layout.has_lines_in_rows else held
+
+    def _calibrated_pixel_mm(self) -> Found:
         found = self.image_to_probe()
-        return None if found is None else pixel_axes(*found)
+        if found is None:
+            return Found()
+        if self.settings.image_to_probe is not None:
+            return Found(pixel_axes(*found), "image_to_probe", "image_to_probe")
+        name = found[1].rsplit(": ", 1)[-1]
+        return Found(pixel_axes(*found), name, "the file" if found[1].startswith(self.path) else _DEVICE)
+
+    def contradictions(self) -> list[str]:
+        """Tell what is given and is another than header or device set say."""
+        notes = contradictions(self.path, self.found(), self.settings)
+        if self.header.is_volume:
+            notes.append(
+                "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
+            )
+        held, given = self._held_mm(), self.settings.image_to_probe
+        if held is not None and given is not None:
+            sizes = pixel_axes(np.asarray(given, dtype=float), "image_to_probe")
+            if differs(sizes, held):
+                shown, own = (" x ".join(f"{size:g}" for size in each) for each in (sizes, held))
+                notes.append(f"pixels of {shown} mm, given by image_to_probe: the file says {own}")
+        return notes
 
     def image_to_probe(self) -> tuple[FloatArray, str] | None:
         """Transform of this image's pixels to mm on the tracked tool, and where it is from."""
@@ -189,20 +258,18 @@ class Source:
         return None if found is None else (found, f"{self.settings.plus_config}: {name}")
 
     def sources(self) -> list[Row]:
-        """Rows that tell where values which the header does not say come from."""
-        given, own = self.settings, self.own
+        """Rows that tell what values are and where they come from."""
         calibrated = self.image_to_probe()
         rows = [
             ("tracker of", "none" if self.poses is None else " and ".join(self.poses.names), ""),
             ("image calibration", "none" if calibrated is None else calibrated[1], ""),
         ]
-        if given.plus_config is not None:
-            rows.append(("device set", given.plus_config, ""))
-        if given.first_sample_depth_mm is None and "first_sample_depth_mm" not in own:
-            rows.append(("first sample depth", "0 (assumed)", "mm"))
-        if self.layout.is_rf and given.speed_of_sound_m_s is None and "speed_of_sound_m_s" not in own:
-            rows.append(("speed of sound", f"{SPEED_OF_SOUND_M_S:g} (assumed)", "m/s"))
-        return rows
+        if self.header.is_volume:
+            as_time = "time, as the frame rate that is given says; in space by its Kinds"
+            rows.append(("third axis", as_time if self.settings.frame_rate_hz else "in space", ""))
+        if self.settings.plus_config is not None:
+            rows.append(("device set", self.settings.plus_config, ""))
+        return [*rows, *rows_of(self.path, self.found(), self.settings)]
 
     @property
     def tool(self) -> str:

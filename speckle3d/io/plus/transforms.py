@@ -27,6 +27,10 @@ ROUNDING_TOLERANCE = 2e-3
 """How far R^T R of a pose in a header may be from the identity before it is made rigid. An electromagnetic
 tracker that rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
 
+_INVERSE_TOLERANCE_MM = 1.0
+"""How far poses and their inverses, both in a header, may be apart: rotations rounded by up to
+`ROUNDING_TOLERANCE` move a place 1,000 mm off by so much."""
+
 IMAGE = "Image"
 ORIENTATION = "OrientationSensor"
 """Name of the frame of an orientation sensor, which PLUS's devices do not use: its transform to World is a
@@ -173,10 +177,32 @@ def sensor_from_image(matrix: FloatArray, first_sample_depth_mm: float, where: s
     cosine = float(axes[:, 0] @ axes[:, 1])
     if abs(cosine) > SKEW_TOLERANCE:
         raise InvalidInputError(f"{where}: expected square axes, got cosine {cosine:.3f}")
+    _require_right_handed(matrix[:3, :3], where)
     turned = nearest_rotation(axes)
     return RigidTransform.from_components(
         matrix[:3, 3] - turned[:, 1] * first_sample_depth_mm, Rotation.from_matrix(turned)
     )
+
+
+def _require_right_handed(axes: FloatArray, where: str) -> None:
+    """Refuse a mirrored calibration: a plane alone does not show it, its third column does.
+
+    PLUS's calibrations write z = x cross y there [1]_; a column of zeros says nothing.
+
+    References
+    ----------
+    .. [1] PLUS, vtkPlusProbeCalibrationAlgo.
+    """
+    lengths = np.linalg.norm(axes, axis=0)
+    if lengths[2] == 0:
+        return
+    volume = float(np.linalg.det(axes / lengths))
+    if volume < 0:
+        raise InvalidInputError(
+            f"{where}: expected right-handed axes (x to the marked side, y away from the probe, z = x cross "
+            f"y), got mirrored ones (determinant {volume:.3g}): an axis has the wrong sign, or images were "
+            "flipped before they were calibrated; if the third column was never measured, make it zeros"
+        )
 
 
 def image_matrix(
@@ -211,13 +237,37 @@ def _find(path: str, frames: Sequence[Fields], given: str | None, default: str) 
     if name == "none":
         return None
     moving, world = ends(name)
-    for held in (name, f"{world}To{moving}"):
-        if any(f"{held}Transform" in frame for frame in frames):
-            return _Transform(name, held)
+    there = [
+        held for held in (name, f"{world}To{moving}") if any(f"{held}Transform" in frame for frame in frames)
+    ]
+    if len(there) == 2:
+        _require_inverse(path, frames, *there)
+    if there:
+        return _Transform(name, there[0])
     if given is not None:
-        there = ", ".join(names_of(frames)) or "none"
-        raise InvalidInputError(f"{path}: expected a transform {name}, got {there}")
+        known = ", ".join(names_of(frames)) or "none"
+        raise InvalidInputError(f"{path}: expected a transform {name}, got {known}")
     return None
+
+
+def _require_inverse(path: str, frames: Sequence[Fields], name: str, back: str) -> None:
+    """Refuse poses that a header holds both ways round, where the two are not each other's inverses."""
+    valid = valid_frames(frames, f"{name}TransformStatus", f"{back}TransformStatus")
+    valid &= [f"{name}Transform" in each and f"{back}Transform" in each for each in frames]
+    if not valid.any():
+        return
+    there, again = (_poses(path, frames, _Transform(held, held), valid)[valid] for held in (name, back))
+    product = there * again
+    off = np.flatnonzero(
+        (product.rotation.magnitude() > ROUNDING_TOLERANCE)
+        | (np.linalg.norm(product.translation, axis=-1) > _INVERSE_TOLERANCE_MM)
+    )
+    if off.size:
+        i = int(np.flatnonzero(valid)[off[0]])
+        raise InvalidInputError(
+            f"{path}: {back}Transform[{i}]: expected the inverse of {name}Transform, got another: "
+            "one of the two is wrong"
+        )
 
 
 def names_of(frames: Sequence[Fields]) -> list[str]:

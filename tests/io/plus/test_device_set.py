@@ -176,3 +176,13 @@ def test_what_is_wrong_is_named(tmp_path, sequence, content, message):
     assert len(str(caught.value).splitlines()) == 1
     with pytest.raises(FileError, match=r"none\.xml"):
         read_device_set(tmp_path / "none.xml")
+
+
+def test_a_transform_said_twice_is_said_alike(tmp_path):
+    image, back = ("Image", "Probe", matrix()), ("Probe", "Image", np.linalg.inv(matrix()))
+    assert len(read_device_set(written(tmp_path / "set.xml", image, image, back)).transforms) == 2
+    other = matrix(place=(10.0, 20.0, 31.0))
+    with pytest.raises(InvalidInputError, match=r"set\.xml: Transform From=Image To=Probe.* 30 .* 31 "):
+        read_device_set(written(tmp_path / "set.xml", image, ("Image", "Probe", other)))
+    with pytest.raises(InvalidInputError, match=r"From=Image To=Probe: expected the inverse of From=Probe"):
+        read_device_set(written(tmp_path / "set.xml", back, ("Image", "Probe", other)))

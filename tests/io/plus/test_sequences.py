@@ -13,7 +13,7 @@ from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import import_notes, load_sweep
 from speckle3d.io.pixels import read_pixels
 from speckle3d.io.plus.layout import layout_of
 from speckle3d.io.plus.record import record_of
@@ -281,9 +281,13 @@ def test_spacing_is_above_zero(tmp_path, spacing, dtype):
 
 def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     path = write_mha(tmp_path / "a.mha", grey(), {"Kinds": "domain domain domain"}, frames=[])
-    with pytest.raises(InvalidInputError, match=r"a\.mha: .*got a volume"):
+    with pytest.raises(InvalidInputError, match=r"a\.mha: .*got a volume.*--frame-rate-hz"):
         load_sweep(path, BMODE)
-    assert len(load_sweep(path, BMODE.model_copy(update={"frame_rate_hz": 10.0}))) == 3
+    timed = BMODE.model_copy(update={"frame_rate_hz": 10.0})
+    assert len(load_sweep(path, timed)) == 3
+    assert import_notes(path, timed) == [
+        "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
+    ]
 
 
 @pytest.mark.parametrize("compressed", [True, False])
