@@ -134,7 +134,8 @@ def yml_text(sweep, element_mm=ELEMENT_MM, kind=None, delay=None):
         focus = f"focus:\n  - depth: 20 mm\n    receive:\n      - {{{ends}}}\n"
     return (
         "# raw data parameters\n\n"
-        f"frames: {n}\nframe rate: 11 Hz\ntransmit frequency: {centre_mhz!r} MHz\nimaging depth: 40 mm\n"
+        f"frames: {n}\nframe rate: 11 Hz\ntransmit frequency: {centre_mhz!r} MHz\n"
+        f"imaging depth: {grid.depth_mm:.4f} mm\n"
         "focal depth: 20 mm\ntgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }\n"
         f"size: {{samples per line: {samples}, number of lines: {lines}, "
         f"sample size: {sample_bytes(sweep)} bytes}}\n"

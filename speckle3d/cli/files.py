@@ -154,6 +154,7 @@ def convert(
     ],
     sampling_rate_hz: Number = None,
     vector_pitch_mm: Number = None,
+    element_pitch_mm: Number = None,
     speed_of_sound_m_s: Number = None,
     centre_frequency_hz: Number = None,
     bandwidth_hz: Annotated[tuple[float, float] | None, typer.Option()] = None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from speckle3d.core.streams import TimedRotations
     from speckle3d.core.sweep import OrientationSensor
     from xsens.fusion.orient import Orientation
-    from xsens.logs.samples import ImuLog
+    from xsens.logs.samples import Gap, ImuLog
 
 imu = typer.Typer(help="The orientation sensor: logs, live data, orientation.", no_args_is_help=True)
 app.add_typer(imu, name="imu")
@@ -224,6 +225,7 @@ def _ridden_along(path: Path) -> OrientationSensor | None:
 def _inside_probe(path: Path) -> ImuLog | None:
     """Log of the sensor inside a handheld scanner, whatever its images are; None of other recordings."""
     from speckle3d.io.clarius import READER
+    from speckle3d.io.clarius.imu import sensor_notes
     from speckle3d.io.clarius.reader import sensor_of
     from speckle3d.io.readers import find_reader
     from xsens.logs.clocks import timeline_of_times
@@ -240,8 +242,8 @@ def _inside_probe(path: Path) -> ImuLog | None:
         samples.gyroscope_rad_s,
         samples.magnetometer_gauss,
         world_from_sensor=None if fit is None else fit.world_from_sensor,
-        gaps=clock.gaps,
-        notes=(*clock.notes, f"the sensor's quaternion {found}"),
+        gaps=_pauses(clock.gaps),
+        notes=(*clock.notes, f"the sensor's quaternion {found}", *sensor_notes(samples)),
         source=path.name,
     )
 
@@ -257,10 +259,15 @@ def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
         clock.time_s,
         **{name: getattr(sensor, name) for name in INERTIAL},
         world_from_sensor=sensor.readings.world_from_sensor,
-        gaps=clock.gaps,
+        gaps=_pauses(clock.gaps),
         notes=clock.notes,
         source=source,
     )
+
+
+def _pauses(gaps: Sequence[Gap]) -> tuple[Gap, ...]:
+    """Gaps of a sensor without a counter that may send in bursts: how many were lost is not known."""
+    return tuple(replace(gap, lost=0) for gap in gaps)
 
 
 def tell(log: ImuLog) -> None:
@@ -269,7 +276,7 @@ def tell(log: ImuLog) -> None:
         note(text)
     if log.gaps:
         longest = max(gap.duration_s for gap in log.gaps)
-        lost = f"{log.lost} samples lost in {len(log.gaps)} gaps"
+        lost = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
         note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
 
 

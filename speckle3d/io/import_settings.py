@@ -61,6 +61,12 @@ class ImportSettings(BaseModel):
         description="distance between lines; a linear probe's element pitch, in its data sheet, where each "
         "element has one line",
     )
+    element_pitch_mm: float | None = Field(
+        None,
+        gt=0,
+        description="distance between elements of the array, in the probe's data sheet, where the file "
+        "places its lines in elements",
+    )
     speed_of_sound_m_s: float | None = Field(
         None, gt=0, description="assumed by the scanner; 1540 unless its manual says otherwise"
     )
@@ -90,7 +96,7 @@ class ImportSettings(BaseModel):
     frame_rate_hz: float | None = Field(None, gt=0, description="frames per second, on the scanner's screen")
     probe: str | None = Field(
         None,
-        description="model of the probe, printed on it, for its element pitch; or --vector-pitch-mm",
+        description="model of the probe, printed on it, for its element pitch; or --element-pitch-mm",
     )
     tracker_transform: str | None = Field(
         None,

@@ -132,7 +132,7 @@ def meta_pixels(path: Path, fields: Mapping[str, str], size: tuple[int, ...], st
         data = path
     else:
         data, start = _beside(path, name, "ElementDataFile"), skipped
-    found = _found(data, start)
+    found = _found(path, data, start)
     announced = _whole(where, fields, "CompressedDataSize", 0)
     dtype = np.dtype(order + _META_TYPES[word])
     return _checked(where, Pixels(data, start, found, dtype, count, packing), announced)
@@ -162,7 +162,7 @@ def nrrd_pixels(path: Path, fields: Mapping[str, str], size: tuple[int, ...], st
             raise InvalidInputError(f"{where}: {skip}: expected 0, got {fields[skip]!r}")
     count = _count(where, "sizes", size)
     dtype = np.dtype(order + _NRRD_TYPES[kind])
-    pixels = Pixels(data, start, _found(data, start), dtype, count, _NRRD_PACKINGS[packing])
+    pixels = Pixels(data, start, _found(path, data, start), dtype, count, _NRRD_PACKINGS[packing])
     return _checked(where, pixels, 0)
 
 
@@ -263,9 +263,13 @@ def _beside(path: Path, name: str, field: str) -> Path:
     return data
 
 
-def _found(data: Path, start: int) -> int:
-    with open_regular(data) as stream:
-        return max(stream.seek(0, 2) - start, 0)
+def _found(header: Path, data: Path, start: int) -> int:
+    """Bytes that the file of the pixels holds from `start` on; the header that names it is named in errors."""
+    try:
+        with open_regular(data) as stream:
+            return max(stream.seek(0, 2) - start, 0)
+    except FileError as error:
+        raise FileError(f"{header}: expected its pixels in a file that is there: {error}") from error
 
 
 def _count(where: str, field: str, size: tuple[int, ...]) -> int:

@@ -39,6 +39,9 @@ def test_the_orientation_of_a_package_is_found_anew(run, tmp_path):
     assert code == 0
     assert "the sweep has no orientation" in err
     assert load_sweep(out).orientation is None
+    rows = {row["description"]: row["value"] for row in json.loads(run("imu", "info", package, "--json")[1])}
+    assert rows["lost"] == "0"
+    assert int(rows["gaps"]) > 3  # between bursts
     code, _, err = run("imu", "orient", package, "--into", out)
     assert code == 0
     assert "quaternion is not used" in err

@@ -32,6 +32,7 @@ References
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -44,8 +45,8 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import RIGID_TOLERANCE
 from speckle3d.core.streams import DEFAULT_MAX_GAP_S, TimedRotations
 from speckle3d.core.sweep import OrientationSensor
+from speckle3d.io.clarius.documents import documents_of, quantity, shown
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import documents_of, quantity
 
 G_M_S2 = 9.80665
 
@@ -58,8 +59,12 @@ MEANINGS = (
 """What a quaternion q0 to q3 may mean, the likeliest first."""
 
 _AXES = "xyz"
+_STAMP = re.compile(r"[0-9]{1,19}")
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
+
+_LEAST_G, _MOST_G = 0.8, 1.2
+"""0.92 and 0.96 in the recordings at hand."""
 
 _SURE_DEG = 1.0
 _WINDOW_S = 0.25
@@ -161,9 +166,12 @@ def read_samples(member: Member) -> SensorSamples:
     seen: dict[int, int] = {}
     repeated = 0
     for i, fields in enumerate(documents_of(member.text(), where)):
-        time_ns = fields.get("timestamp")
-        if not isinstance(time_ns, int) or isinstance(time_ns, bool) or not 0 <= time_ns < 2**63:
-            raise InvalidInputError(f"{where}: sample {i}: timestamp: expected nanoseconds, got {time_ns!r}")
+        stamp = fields.get("timestamp")
+        if not isinstance(stamp, str) or _STAMP.fullmatch(stamp) is None or int(stamp) >= 2**63:
+            raise InvalidInputError(
+                f"{where}: sample {i}: timestamp: expected nanoseconds, got {shown(stamp)}"
+            )
+        time_ns = int(stamp)
         row = _row(fields, f"{where}: sample {i}")
         known = seen.get(time_ns, len(rows) - 1 if rows else None)
         if known is not None and np.array_equal(rows[known], row, equal_nan=True):
@@ -262,6 +270,18 @@ def sensor_rows(samples: SensorSamples, fits: tuple[Fit, ...]) -> list[tuple[str
     return rows
 
 
+def sensor_notes(samples: SensorSamples) -> list[str]:
+    """Say what a hand cannot feel: another acceleration than about 1 g."""
+    norm_g = _norm(samples.accelerometer_g)
+    if _LEAST_G <= norm_g <= _MOST_G:
+        return []
+    guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
+    return [
+        f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale is "
+        f"another than assumed{guess}"
+    ]
+
+
 def _row(fields: Mapping[str, Any], where: str) -> FloatArray:
     values = [
         quantity(fields.get(f"{name} {axis}"), "", f"{where}: {name} {axis}")
@@ -276,7 +296,7 @@ def _row(fields: Mapping[str, Any], where: str) -> FloatArray:
     if quaternion is None:
         return np.array([*values, *[np.nan] * 4])
     if not isinstance(quaternion, dict):
-        raise InvalidInputError(f"{where}: orientation: expected q0 to q3, got {str(quaternion)[:40]!r}")
+        raise InvalidInputError(f"{where}: orientation: expected q0 to q3, got {shown(quaternion)}")
     turn = [quantity(quaternion.get(f"q{i}"), "", f"{where}: orientation: q{i}") for i in range(4)]
     return np.array([*values, *turn])
 

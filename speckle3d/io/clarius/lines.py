@@ -1,9 +1,10 @@
 """Where the samples of a frame lie: pitch of the lines, first line and first sample, what is left out.
 
 Trusted for the line pitch is the yml's ``rx element``, the place of a line in elements of the array, times
-the distance between elements. That is given by ``vector_pitch_mm``, by the yml's probe where it says, or by
-the probe's model. Lines that are steered, unevenly spaced, or repeated (several packets a line, as in
-Doppler modes) are refused. The first line is taken as the left of the image.
+the distance between elements. That is given by ``element_pitch_mm``, by the yml's probe where it says, or by
+the probe's model; ``vector_pitch_mm`` replaces the product. Pitches that differ by more than 5 % are refused,
+unless one is an option that replaces the yml's. Lines that are steered, unevenly spaced, or repeated (several
+packets a line, as in Doppler modes) are refused. The first line is taken as the left of the image.
 
 The first sample's depth is (``delay samples`` / ``sampling rate`` - 1 us) x c / 2. The maker calls the
 samples "leading samples before the first valid sample (acquisition delay)" [1]_. In every B-mode recording
@@ -30,6 +31,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.clarius.sidecars import Description
+from speckle3d.io.import_settings import ImportSettings
 
 ELEMENT_PITCH_MM = {"L20HD3": 0.13, "L15HD3": 0.26, "L7HD3": 0.2, "PALHD3": 0.26}
 """Of the linear arrays in the maker's table of HD3 probes [2]_; of the PAL, its linear side."""
@@ -39,6 +41,9 @@ CONVEX = ("C3", "C7", "EC7", "PH", "PA2", "PA", "TV")
 
 BEFORE_DEPTH_S = 1e-6
 """Delay that is not depth; see above."""
+
+_ALIKE = 0.05
+"""Published pitches are rounded to 0.01 mm, as 0.13."""
 
 _EVEN = 1e-3
 """How far a line may be from its place, in pitches; places are written to 17 digits."""
@@ -52,24 +57,32 @@ class Place:
     ----------
     lines, samples : slice
         Kept, of those in the file.
-    first_element : float
-        Place of the first kept line in the array.
+    first_element, last_element : float
+        Places of the first and the last kept line in the array.
     elements_per_line : float
         Distance between lines, in elements.
-    first_sample : float
-        Samples between transmission and the first kept one.
+    first_sample : float, optional
+        Samples between transmission and the first kept one; None where the yml does not say.
     """
 
     lines: slice
     samples: slice
     first_element: float
+    last_element: float
     elements_per_line: float
-    first_sample: float
+    first_sample: float | None
 
-    def first_depth_mm(self, sampling_rate_hz: float, speed_of_sound_m_s: float) -> float:
-        """Depth of the first kept sample."""
-        after_s = max(self.first_sample / sampling_rate_hz - BEFORE_DEPTH_S, 0.0)
-        return after_s * speed_of_sound_m_s * 1e3 / 2
+    def first_depth_mm(self, sampling_rate_hz: float, speed_of_sound_m_s: float) -> float | None:
+        """Depth of the first kept sample; None where it is not said, or would be above depth 0.
+
+        Less than a sample above is 0: the delay is a whole number of samples.
+        """
+        if self.first_sample is None:
+            return None
+        after_s = self.first_sample / sampling_rate_hz - BEFORE_DEPTH_S
+        if after_s * sampling_rate_hz <= -1:
+            return None
+        return max(after_s, 0.0) * speed_of_sound_m_s * 1e3 / 2
 
 
 def place_of(said: Description, cropped: bool) -> Place:
@@ -94,7 +107,8 @@ def place_of(said: Description, cropped: bool) -> Place:
         lines, samples = slice(roi.start_line, roi.end_line + 1), slice(roi.start_sample, roi.end_sample + 1)
     elements = said.geometry.receive_element[lines]
     step = _step(said, elements, lines.start)
-    return Place(lines, samples, float(elements[0]), step, said.delay_samples + samples.start)
+    first_sample = None if said.delay_samples is None else said.delay_samples + samples.start
+    return Place(lines, samples, float(elements[0]), float(elements[-1]), step, first_sample)
 
 
 def require_roi(said: Description) -> None:
@@ -129,29 +143,73 @@ def _model(named: str) -> str:
     return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
 
 
-def element_pitch_mm(said: Description, probe: str | None) -> tuple[float | None, str]:
-    """Distance between elements and where it is from; None where neither yml nor model tells.
+@dataclass(frozen=True)
+class Pitch:
+    """Distance between lines, between elements, and where they are from."""
+
+    vector_mm: float
+    element_mm: float
+    source: str
+
+
+def pitch_of(said: Description, place: Place, settings: ImportSettings) -> Pitch | None:
+    """Find the distance between lines; None where nothing tells.
 
     Raises
     ------
     InvalidInputError
-        If the model's lines are not parallel, or it is not known.
+        If two sources contradict each other, the model's lines are not parallel, or it is not known.
     """
-    if said.element_pitch_mm is not None:
-        return said.element_pitch_mm, "its yml"
-    named = probe or said.probe
-    if not named:
-        return None, ""
+    model_mm = _model_pitch_mm(said, settings)
+    per_line = place.elements_per_line
+    given_mm, line_mm = settings.element_pitch_mm, settings.vector_pitch_mm
+    if given_mm is not None and line_mm is not None:
+        _require_alike(said, "--vector-pitch-mm", line_mm / per_line, "--element-pitch-mm", given_mm)
+    option = None if line_mm is None else line_mm / per_line
+    option = given_mm if option is None else option
+    named = "--element-pitch-mm" if line_mm is None else f"--vector-pitch-mm / {per_line:g} elements a line"
+    if settings.probe is not None and model_mm is not None:
+        if option is not None:
+            _require_alike(said, named, option, f"--probe {settings.probe}", model_mm)
+        if said.element_pitch_mm is not None:
+            _require_alike(said, "probe: pitch", said.element_pitch_mm, f"--probe {settings.probe}", model_mm)
+    if line_mm is not None:
+        return Pitch(line_mm, line_mm / per_line, "as given")
+    for element_mm, source in (
+        (given_mm, "as given"),
+        (said.element_pitch_mm, "its yml"),
+        (model_mm, f"the maker's table, {_model(settings.probe or said.probe)}"),
+    ):
+        if element_mm is not None:
+            whole = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
+            return Pitch(element_mm * per_line, element_mm, whole)
+    return None
+
+
+def _model_pitch_mm(said: Description, settings: ImportSettings) -> float | None:
+    """Published pitch of the probe's model; None without a model, or where another source serves."""
+    named = settings.probe or said.probe
     model = _model(named)
-    if model in ELEMENT_PITCH_MM:
-        return ELEMENT_PITCH_MM[model], f"the maker's table, {model}"
+    if not model or model in ELEMENT_PITCH_MM:
+        return ELEMENT_PITCH_MM.get(model)
     if model.startswith(CONVEX):
         raise InvalidInputError(_polar(said.where, f"the probe {named}"))
+    if settings.element_pitch_mm or settings.vector_pitch_mm or said.element_pitch_mm:
+        return None
     known = ", ".join(ELEMENT_PITCH_MM)
     raise InvalidInputError(
-        f"{said.where}: --probe: expected a model whose element pitch is published ({known}), got {named!r}: "
-        "give --vector-pitch-mm"
+        f"{said.where}: --probe: expected a model whose element pitch is published ({known}), got "
+        f"{named[:40]!r}: give --element-pitch-mm"
     )
+
+
+def _require_alike(said: Description, one: str, one_mm: float, other: str, other_mm: float) -> None:
+    """Refuse two element pitches that are not of one array."""
+    if abs(one_mm - other_mm) > _ALIKE * other_mm:
+        raise InvalidInputError(
+            f"{said.where}: expected one distance between elements, got {one_mm:.4g} mm ({one}) and "
+            f"{other_mm:.4g} mm ({other})"
+        )
 
 
 def _require_straight(said: Description) -> None:
@@ -176,11 +234,17 @@ def _step(said: Description, elements: FloatArray, first: int) -> float:
             f"{elements[again[0]]:g}: packets of a Doppler mode are no image"
         )
     step = float((elements[-1] - elements[0]) / (elements.size - 1))
-    off = np.abs(elements - elements[0] - step * np.arange(elements.size))
-    if step <= 0 or off.max() > _EVEN * step:
-        i = int(np.argmax(off)) if step > 0 else 1
+    if step <= 0:
+        i = 1 + int(np.argmax(steps < 0))
         raise InvalidInputError(
-            f"{where}[{first + i}]: rx element: expected evenly spaced lines of rising place, got "
+            f"{where}[{first + i}]: rx element: expected lines from the lowest element up, got "
+            f"{elements[i]:g} after {elements[i - 1]:g}"
+        )
+    off = np.abs(elements - elements[0] - step * np.arange(elements.size))
+    if off.max() > _EVEN * step:
+        i = int(np.argmax(off))
+        raise InvalidInputError(
+            f"{where}[{first + i}]: rx element: expected evenly spaced lines, got "
             f"{elements[i]:g} where {elements[0] + step * i:g} is even"
         )
     return step

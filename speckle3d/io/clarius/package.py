@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import re
 import tarfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -23,6 +23,9 @@ KINDS = ("rf", "iq", "env")
 
 _RAW = re.compile(r"(?:(?P<name>.*)_)?(?P<kind>rf|iq|env)\.raw(?:\.lzo)?")
 _SIDE = re.compile(r"(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>tgc\.yml|tgc|yml|yaml)")
+
+_FIELD = re.compile(rb"^(?:# raw data parameters|# tgc curves|sampling rate:|size:|timestamp:)", re.MULTILINE)
+_LOOKED_AT = 4096
 
 _MOST_MEMBERS = 10_000
 """A package has a dozen."""
@@ -54,6 +57,12 @@ class Member:
     def where(self) -> str:
         """Name for messages: the file, and the member where it is one."""
         return str(self.path) if self.path.name == Path(self.name).name else f"{self.path}: {self.name}"
+
+    def begins(self, size: int) -> bytes:
+        """Read its first bytes."""
+        with open_regular(self.path) as stream:
+            stream.seek(self.start)
+            return stream.read(min(size, self.size))
 
     def text(self) -> str:
         """Read all of it as text in UTF-8.
@@ -90,6 +99,8 @@ class Recording:
         By `KINDS`: samples, their description (yml), and gain by frame (tgc).
     sensor : Member, optional
         Samples of the sensor (imu).
+    cut : bool
+        Whether a tar file ends without the blocks that close one: what came after may be missing.
     """
 
     path: Path
@@ -98,6 +109,7 @@ class Recording:
     settings: Mapping[str, Member] = field(default_factory=dict)
     gains: Mapping[str, Member] = field(default_factory=dict)
     sensor: Member | None = None
+    cut: bool = False
 
     @property
     def members(self) -> tuple[Member, ...]:
@@ -110,17 +122,31 @@ def is_package(path: Path, start: bytes) -> bool:
     """Whether a file or folder looks like a package, or one raw file of one."""
     try:
         if path.is_dir():
-            return any(_parsed(each.name) for each in path.iterdir())
-        if _parsed(path.name) and not path.name.endswith(".lzo") and not _RAW.fullmatch(path.name):
-            return True
+            return any(_is_own(each, each.name) for each in path.iterdir())
+        if _SIDE.fullmatch(path.name):
+            return _is_own(path, path.name)
         if _RAW.fullmatch(path.name):
             return bool(_sidecar(path, "yml"))
         if path.suffix.lower() != ".tar" and start[257:262] != b"ustar":
             return False
         with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
-            return any(_parsed(Path(each.name).name) for each in archive)
+            return any(
+                _is_own(path, Path(each.name).name, each.offset_data) for each in archive if each.isfile()
+            )
     except (OSError, ValueError, tarfile.TarError, EOFError, MemoryError):
         return False
+
+
+def _is_own(file: Path, name: str, start: int = 0) -> bool:
+    """Whether a file is one of a package by its name and, but for raw files, its content."""
+    if _parsed(name) is None:
+        return False
+    return _RAW.fullmatch(name) is not None or _has_fields(Member(file, name, start, _LOOKED_AT))
+
+
+def _has_fields(member: Member) -> bool:
+    """Whether a sidecar begins as the scanner writes them, unlike others' ``my_env.yml``."""
+    return _FIELD.search(member.begins(_LOOKED_AT)) is not None
 
 
 def find_recording(path: Path) -> Recording:
@@ -141,7 +167,8 @@ def find_recording(path: Path) -> Recording:
     if path.is_dir():
         return _only(path, _folder_members(path))
     if (named := _parsed(path.name)) is None:
-        return _only(path, list(_tar_members(path)))
+        members, cut = _tar_members(path)
+        return replace(_only(path, members), cut=cut)
     prefix, kind = named
     beside = [each for each in _folder_members(path.parent) if _parsed(Path(each.name).name) == named]
     kinds = (kind,) if kind != "imu" else KINDS
@@ -190,7 +217,9 @@ def _folder_members(folder: Path) -> list[Member]:
     return members
 
 
-def _tar_members(path: Path) -> Iterator[Member]:
+def _tar_members(path: Path) -> tuple[list[Member], bool]:
+    """Members that are files of packages, and whether the archive lacks its end."""
+    members = []
     try:
         with open_regular(path) as stream:
             size = stream.seek(0, 2)
@@ -207,11 +236,34 @@ def _tar_members(path: Path) -> Iterator[Member]:
                             f"{path}: {entry.name}: expected {entry.size} bytes, got "
                             f"{size - entry.offset_data}: truncated"
                         )
-                    yield Member(path, entry.name, entry.offset_data, entry.size)
+                    members.append(Member(path, entry.name, entry.offset_data, entry.size))
+                return members, _is_cut(path, archive.offset, size)
     except (tarfile.TarError, EOFError, ValueError, OverflowError) as error:
         if isinstance(error, InvalidInputError):
             raise
         raise FileError(f"{path}: expected a tar file, got a damaged one: {error}") from error
+
+
+def _is_cut(path: Path, end: int, size: int) -> bool:
+    """Whether nothing closes an archive whose members end at `end`, as some writers leave it.
+
+    Raises
+    ------
+    FileError
+        If part of a header is there, or something that is none: `tarfile` ends in silence.
+    """
+    if size <= end:
+        return True
+    with open_regular(path) as stream:
+        stream.seek(end)
+        block = stream.read(tarfile.BLOCKSIZE)
+    if len(block) < tarfile.BLOCKSIZE:
+        raise FileError(
+            f"{path}: expected a member or the archive's end at byte {end}, got {len(block)} bytes: truncated"
+        )
+    if any(block):
+        raise FileError(f"{path}: expected a member or the archive's end at byte {end}, got other bytes")
+    return False
 
 
 def _require_inside(path: Path, entry: tarfile.TarInfo) -> None:
@@ -226,12 +278,13 @@ def _require_inside(path: Path, entry: tarfile.TarInfo) -> None:
 
 
 def _only(path: Path, members: list[Member]) -> Recording:
-    """Sort members by recording, of which there must be one."""
+    """Sort members by recording, of which there must be one; others' sidecars alone are none."""
     found: dict[tuple[str, str], list[tuple[str, Member]]] = {}
     for each in members:
         folder, file = str(Path(each.name).parent), Path(each.name).name
         prefix, kind = _parsed(file) or ("", "")
         found.setdefault((folder, prefix), []).append((kind, each))
+    found = {name: parts for name, parts in found.items() if any(map(_is_of_package, parts))}
     if not found:
         raise InvalidInputError(
             f"{path}: expected files like 2024-05-01_rf.raw, _iq.raw, _env.raw and their .yml, got none"
@@ -246,11 +299,17 @@ def _only(path: Path, members: list[Member]) -> Recording:
     return _sorted(path, prefix, parts)
 
 
+def _is_of_package(part: tuple[str, Member]) -> bool:
+    return _RAW.fullmatch(Path(part[1].name).name) is not None or _has_fields(part[1])
+
+
 def _sorted(path: Path, prefix: str, parts: list[tuple[str, Member]]) -> Recording:
     tables: dict[str, dict[str, Member]] = {"raw": {}, "settings": {}, "gains": {}}
     sensor = None
     for kind, each in parts:
         if kind == "imu":
+            if sensor is not None:
+                raise InvalidInputError(f"{path}: expected one of {sensor.name} and {each.name}, got both")
             sensor = each
             continue
         table = "raw" if ".raw" in each.name[-8:] else "gains" if _is_gain(each) else "settings"
@@ -258,4 +317,4 @@ def _sorted(path: Path, prefix: str, parts: list[tuple[str, Member]]) -> Recordi
             first = tables[table][kind].name
             raise InvalidInputError(f"{path}: expected one of {first} and {each.name}, got both")
         tables[table][kind] = each
-    return Recording(path, prefix, **tables, sensor=sensor)
+    return Recording(path, prefix, tables["raw"], tables["settings"], tables["gains"], sensor)

@@ -14,7 +14,7 @@ import operator
 import struct
 import threading
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,14 @@ SAMPLES: dict[str, tuple[np.dtype[Any], int, np.dtype[Any]]] = {
     "envelope": (np.dtype("u1"), 1, np.dtype(np.uint8)),
 }
 """By kind: type of the numbers in the file, how many make a sample, and type of the frames."""
+
+
+class Factors(Protocol):
+    """Factors of the samples of each frame, or of one for all; an array, or made when they are asked for."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -157,8 +165,8 @@ class RawFrames:
     ----------
     lines, samples : slice
         Kept.
-    factors : ndarray, shape (1 or frame, sample), optional
-        What the samples kept are multiplied by; complex for I/Q, else real.
+    factors : Factors, optional
+        What the samples kept are multiplied by; complex or real for I/Q, else real.
     """
 
     def __init__(
@@ -168,7 +176,7 @@ class RawFrames:
         kind: str,
         lines: slice,
         samples: slice,
-        factors: npt.NDArray[Any] | None = None,
+        factors: Factors | None = None,
     ) -> None:
         self.raw, self.header, self.kind = raw, header, kind
         self.lines, self.samples, self.factors = lines, samples, factors

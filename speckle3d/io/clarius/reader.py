@@ -15,10 +15,21 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, OrientationSensor, RFSettings, Sweep
 from speckle3d.io.clarius import imu
+from speckle3d.io.clarius.checks import require_depth, require_times
 from speckle3d.io.clarius.demodulation import middle_hz, turns_to
-from speckle3d.io.clarius.lines import Place, element_pitch_mm, place_of, probe_name, require_roi
+from speckle3d.io.clarius.documents import shown
+from speckle3d.io.clarius.gains import GainFactors
+from speckle3d.io.clarius.lines import Place, pitch_of, place_of, probe_name, require_roi
 from speckle3d.io.clarius.package import Recording, find_recording
-from speckle3d.io.clarius.raw import SAMPLES, RawFile, RawFrames, RawHeader, read_header, read_times_ns
+from speckle3d.io.clarius.raw import (
+    SAMPLES,
+    Factors,
+    RawFile,
+    RawFrames,
+    RawHeader,
+    read_header,
+    read_times_ns,
+)
 from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
 from speckle3d.io.clarius.spectrum import measured_band_hz, measured_centres_hz
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
@@ -26,8 +37,6 @@ from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 FORMAT = "Clarius raw package"
 
 _ORDER = ("RF", "IQ", "envelope")
-_SAME_GAIN_DB = 0.005
-"""Gains are written to 0.01 dB."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +72,9 @@ def read_package(path: Path, settings: ImportSettings) -> Sweep:
     spacing_mm = 1e3 * values["speed_of_sound_m_s"] / (2.0 * values["sampling_rate_hz"])
     _, vectors, samples = _frames(chosen, place).shape
     grid = ImageGrid(vectors, samples, values["vector_pitch_mm"], spacing_mm, values["first_sample_depth_mm"])
-    gains = None if said.kind == "envelope" else _gain_factors(recording, chosen, grid)
     turns = _turns(chosen, place, values, settings)
-    frames = _frames(chosen, place, turns if gains is None else gains if turns is None else gains * turns)
+    gains = None if said.kind == "envelope" else _gain_factors(recording, chosen, grid, turns)
+    frames = _frames(chosen, place, turns if gains is None else gains)
     with naming(said.where):
         signal = _signal(said, values)
     return Sweep(
@@ -116,7 +125,9 @@ def choose(recording: Recording) -> Chosen:
     raw = RawFile(recording.raw[name])
     header = read_header(raw)
     _require_same(said, raw, header)
-    return Chosen(name, said, raw, header, read_times_ns(raw, header))
+    times_ns = read_times_ns(raw, header)
+    require_times(raw.member.where, said, times_ns)
+    return Chosen(name, said, raw, header, times_ns)
 
 
 def _require_same(said: Description, raw: RawFile, header: RawHeader) -> None:
@@ -139,7 +150,7 @@ def _require_same(said: Description, raw: RawFile, header: RawHeader) -> None:
         )
     if said.compression.lower() != "none":
         raise InvalidInputError(
-            f"{said.where}: compression: expected none, got {said.compression!r}: frames are not decoded"
+            f"{said.where}: compression: expected none, got {shown(said.compression)}: frames are not decoded"
         )
     require_roi(said)
 
@@ -149,7 +160,7 @@ def is_padded(chosen: Chosen) -> bool:
     roi = chosen.said.roi
     if roi is None:
         return False
-    every = _frames(chosen, Place(slice(None), slice(None), 0.0, 1.0, 0.0))
+    every = _frames(chosen, Place(slice(None), slice(None), 0.0, 0.0, 1.0, 0.0))
     for i in {0, len(every) // 2, len(every) - 1}:
         frame = np.array(every.whole(i))
         frame[roi.start_line : roi.end_line + 1, roi.start_sample : roi.end_sample + 1] = 0
@@ -158,74 +169,88 @@ def is_padded(chosen: Chosen) -> bool:
     return True
 
 
-def _frames(chosen: Chosen, place: Place, factors: npt.NDArray[Any] | None = None) -> RawFrames:
+def _frames(chosen: Chosen, place: Place, factors: Factors | None = None) -> RawFrames:
     return RawFrames(chosen.raw, chosen.header, chosen.said.kind, place.lines, place.samples, factors)
 
 
 def values_of(path: Path, chosen: Chosen, place: Place, settings: ImportSettings) -> dict[str, float]:
     """Numbers of the sweep, the given ones over the package's own; all that lack are asked for at once."""
-    said = chosen.said
-    element_mm, _ = (None, "") if settings.vector_pitch_mm else element_pitch_mm(said, settings.probe)
-    speed = settings.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
-    rate_hz = settings.sampling_rate_hz or said.sampling_rate_hz
-    known = settings.vector_pitch_mm is not None or element_mm is not None
-    found: dict[str, float | None] = {
+    require_depth(chosen.name, chosen.said, settings)
+    pitch = pitch_of(chosen.said, place, settings)
+    # A probe's model is easier told than the distance between its lines.
+    lateral = {"probe": None} if pitch is None else {"vector_pitch_mm": pitch.vector_mm}
+    return settings.over(path, **lateral, **signal_values(chosen, place, settings))
+
+
+def signal_values(chosen: Chosen, place: Place, settings: ImportSettings) -> dict[str, Any]:
+    """Numbers of the sweep but for the distance between lines; None where nothing tells."""
+    found = _said_values(chosen, place, settings)
+    if chosen.said.kind == "envelope":
+        return found | {"dynamic_range_db": settings.dynamic_range_db}
+    band: tuple[float, float] | None = settings.bandwidth_hz
+    if band is None and _is_heard(found):
+        frames = cast(Frames, _frames(chosen, place, _turns(chosen, place, found, settings)))
+        about_hz, shifted_hz = found["centre_frequency_hz"], found.get("demodulation_frequency_hz")
+        band = measured_band_hz(frames, found["sampling_rate_hz"], about_hz, shifted_hz)
+    return found | {"bandwidth_hz": band}
+
+
+def centres_of(chosen: Chosen, place: Place, settings: ImportSettings) -> tuple[float, float] | None:
+    """Centre of the echoes' spectrum near the probe and far from it, Hz; None where nothing tells."""
+    found = _said_values(chosen, place, settings)
+    if not _is_heard(found):
+        return None
+    frames = cast(Frames, _frames(chosen, place, _turns(chosen, place, found, settings)))
+    shifted_hz = found.get("demodulation_frequency_hz")
+    return measured_centres_hz(frames, found["sampling_rate_hz"], found["centre_frequency_hz"], shifted_hz)
+
+
+def _said_values(chosen: Chosen, place: Place, settings: ImportSettings) -> dict[str, Any]:
+    """Numbers that are said or given; None where they are not."""
+    said, given = chosen.said, settings
+    speed = given.speed_of_sound_m_s or said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
+    rate_hz = given.sampling_rate_hz or said.sampling_rate_hz
+    first_mm = given.first_sample_depth_mm
+    found: dict[str, Any] = {
         "sampling_rate_hz": rate_hz,
         "speed_of_sound_m_s": speed,
-        # A probe's model is easier told than the distance between its lines.
-        "vector_pitch_mm" if known else "probe": (element_mm or 0.0) * place.elements_per_line or None,
-        "first_sample_depth_mm": place.first_depth_mm(rate_hz, speed),
+        "first_sample_depth_mm": place.first_depth_mm(rate_hz, speed) if first_mm is None else first_mm,
     }
     if said.kind == "envelope":
-        return settings.over(path, **found, dynamic_range_db=None)
-    centre_hz = settings.centre_frequency_hz or said.transmit_frequency_hz
-    found["centre_frequency_hz"] = centre_hz
-    shifted_hz = settings.demodulation_frequency_hz
+        return found
+    found["centre_frequency_hz"] = given.centre_frequency_hz or said.transmit_frequency_hz
     if said.kind == "IQ":
+        shifted_hz = given.demodulation_frequency_hz
         if shifted_hz is None and said.receive is not None:
-            shifted_hz = middle_hz(said.receive, _depths_mm(chosen, place, rate_hz, speed))
+            shifted_hz = middle_hz(said.receive, _depths_mm(chosen, place, found))
         found["demodulation_frequency_hz"] = shifted_hz
-    band = None
-    if settings.bandwidth_hz is None and centre_hz and (said.kind == "RF" or shifted_hz):
-        known_values = {name: value for name, value in found.items() if value is not None}
-        frames = _frames(chosen, place, _turns(chosen, place, known_values, settings))
-        about_hz = None if said.kind == "RF" else shifted_hz
-        band = measured_band_hz(cast(Frames, frames), rate_hz, centre_hz, about_hz)
-    return settings.over(path, **found, bandwidth_hz=band)
+    return found
 
 
-def centres_of(
-    path: Path, chosen: Chosen, place: Place, settings: ImportSettings
-) -> tuple[float, float] | None:
-    """Centre of the echoes' spectrum near the probe and far from it, Hz; None where it is not clear.
-
-    Raises
-    ------
-    MissingSettingsError
-        If a number of the sweep is neither said nor given.
-    """
-    values = values_of(path, chosen, place, settings)
-    frames = cast(Frames, _frames(chosen, place, _turns(chosen, place, values, settings)))
-    shifted_hz = values.get("demodulation_frequency_hz")
-    return measured_centres_hz(frames, values["sampling_rate_hz"], values["centre_frequency_hz"], shifted_hz)
+def _is_heard(found: Mapping[str, Any]) -> bool:
+    """Whether the frequencies of a spectrum can be told."""
+    return all(found.get(name, True) for name in ("centre_frequency_hz", "demodulation_frequency_hz"))
 
 
-def _depths_mm(chosen: Chosen, place: Place, rate_hz: float, speed_m_s: float) -> FloatArray:
-    """Depth of each kept sample as the scanner counts it."""
+def _depths_mm(chosen: Chosen, place: Place, found: Mapping[str, Any]) -> FloatArray:
+    """Depth of each kept sample as the scanner counts it, or else as it is given."""
+    rate_hz, speed_m_s = found["sampling_rate_hz"], found["speed_of_sound_m_s"]
+    counted_mm, most_mm = place.first_depth_mm(rate_hz, speed_m_s), chosen.said.imaging_depth_mm or np.inf
+    if counted_mm is None or counted_mm > most_mm:
+        counted_mm = found["first_sample_depth_mm"] or 0.0
     samples = np.arange(len(range(chosen.header.samples)[place.samples]))
-    return np.asarray(place.first_depth_mm(rate_hz, speed_m_s) + samples * speed_m_s / (2e-3 * rate_hz))
+    return np.asarray(counted_mm + samples * speed_m_s / (2e-3 * rate_hz))
 
 
 def _turns(
-    chosen: Chosen, place: Place, values: Mapping[str, float], settings: ImportSettings
+    chosen: Chosen, place: Place, values: Mapping[str, Any], settings: ImportSettings
 ) -> ComplexArray | None:
     """Factors that make I/Q as if shifted down by one frequency, shape (1, sample); None where they are."""
     receive = chosen.said.receive
     if chosen.said.kind != "IQ" or receive is None or settings.demodulation_frequency_hz is not None:
         return None
-    rate_hz, speed_m_s = values["sampling_rate_hz"], values["speed_of_sound_m_s"]
-    depths_mm = _depths_mm(chosen, place, rate_hz, speed_m_s)
-    turns = turns_to(values["demodulation_frequency_hz"], receive, depths_mm, rate_hz)
+    depths_mm = _depths_mm(chosen, place, values)
+    turns = turns_to(values["demodulation_frequency_hz"], receive, depths_mm, values["sampling_rate_hz"])
     return None if turns is None else turns[None]
 
 
@@ -273,8 +298,10 @@ def curves_of(recording: Recording, chosen: Chosen) -> tuple[Curve, ...] | None:
     return None
 
 
-def _gain_factors(recording: Recording, chosen: Chosen, grid: ImageGrid) -> FloatArray | None:
-    """The first frame's gain over each one's, shape (frame, sample); None where it is the same."""
+def _gain_factors(
+    recording: Recording, chosen: Chosen, grid: ImageGrid, turns: ComplexArray | None
+) -> GainFactors | None:
+    """The first frame's gain over each one's, times `turns`; None where it is the same."""
     curves = curves_of(recording, chosen)
     if curves is None or len(set(curves)) == 1:
         return None
@@ -283,7 +310,6 @@ def _gain_factors(recording: Recording, chosen: Chosen, grid: ImageGrid) -> Floa
         raise InvalidInputError(
             f"{chosen.said.where}: frame {i}: expected a gain curve as other frames have, got none"
         )
-    depth_mm = grid.first_sample_depth_mm + grid.sample_spacing_mm * np.arange(grid.samples)
-    gain_db = np.array([np.interp(depth_mm, *np.array(curve).T) for curve in curves])
-    apart_db = gain_db - gain_db[0]
-    return None if np.abs(apart_db).max() < _SAME_GAIN_DB else 10.0 ** (-apart_db / 20.0)
+    depth_mm = np.asarray(grid.first_sample_depth_mm + grid.sample_spacing_mm * np.arange(grid.samples))
+    found = GainFactors(depth_mm, curves, turns)
+    return found if found.differ else None

@@ -1,7 +1,7 @@
 """Descriptions of raw files (yml) and their gain by frame (tgc).
 
 The yml is YAML but for its gain curve, ``tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }``, which is read apart.
-Every number is read with its unit. Anchors and aliases are refused: the scanner writes none.
+Every number is read with its unit.
 
 References
 ----------
@@ -20,25 +20,16 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.clarius.documents import documents_of, quantity, shown
 from speckle3d.io.clarius.package import Member
 
 Curve = tuple[tuple[float, float], ...]
 """Depth in mm and gain in dB of each knot of a gain curve."""
 
 _KINDS = {"rf": "RF", "iq": "IQ", "b pre-scan": "envelope", "envelope": "envelope", "b": "envelope"}
-_UNITS = {
-    "": {"": 1.0},
-    "Hz": {"hz": 1.0, "khz": 1e3, "mhz": 1e6},
-    "mm": {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3},
-    "m/s": {"m/s": 1.0},
-    "bytes": {"bytes": 1.0, "byte": 1.0},
-    "deg": {"°": 1.0, "deg": 1.0},
-}
-_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d]*)\s*")
 _KNOT = re.compile(r"\{\s*([-+.\deE]+)\s*mm\s*,\s*([-+.\deE]+)\s*dB\s*\}")
 _GAIN_LINE = re.compile(r"^tgc:.*(?:\n[ \t]+-.*)*$", re.MULTILINE)
-_STAMP = re.compile(r"timestamp:\s*(\d+)")
-_ALIAS = re.compile(r"(?:^|[\s\[{,:?-])[&*]\w", re.MULTILINE)
+_STAMP = re.compile(r"timestamp:\s*(\d{1,19})(?!\d)")
 
 _MOST_YAML_BYTES = 2**24
 """A description of 1,248 lines takes 68 kB."""
@@ -101,7 +92,7 @@ class Description:
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
-    delay_samples : float
+    delay_samples : float, optional
         Samples between transmission and the first sample.
     gain : tuple of pairs
         Depth in mm and gain in dB.
@@ -118,7 +109,7 @@ class Description:
     samples: int
     sample_bytes: int
     sampling_rate_hz: float
-    delay_samples: float
+    delay_samples: float | None
     geometry: Lines
     compression: str = "none"
     frame_rate_hz: float | None = None
@@ -150,28 +141,28 @@ def read_description(member: Member) -> Description:
         raise FileError(f"{where}: expected at most {_MOST_YAML_BYTES} bytes, got {member.size}")
     text = member.text()
     gain_text = "".join(_GAIN_LINE.findall(text))
-    documents = list(documents_of(_GAIN_LINE.sub("", text), where))
+    documents = list(documents_of(_GAIN_LINE.sub(lambda found: "\n" * found[0].count("\n"), text), where))
     if len(documents) != 1:
         raise InvalidInputError(f"{where}: expected one document of fields, got {len(documents)}")
     fields = _Fields(documents[0], where)
     size = fields.below("size")
     lines = size.whole("number of lines")
-    word = str(fields.values.get("type", "")).strip()
-    if word.lower() not in _KINDS:
-        raise InvalidInputError(f"{where}: type: expected RF, IQ or B pre-scan, got {word!r}")
+    word = fields.values.get("type")
+    if not isinstance(word, str) or word.strip().lower() not in _KINDS:
+        raise InvalidInputError(f"{where}: type: expected RF, IQ or B pre-scan, got {shown(word)}")
     probe = fields.values.get("probe")
     probe_fields = _Fields(probe, f"{where}: probe") if isinstance(probe, dict) else None
     return Description(
         where=where,
-        kind=_KINDS[word.lower()],
+        kind=_KINDS[word.strip().lower()],
         frames=fields.whole("frames"),
         lines=lines,
         samples=size.whole("samples per line"),
         sample_bytes=size.whole("sample size", "bytes"),
         sampling_rate_hz=fields.positive("sampling rate", "Hz"),
-        delay_samples=fields.number("delay samples", "", 0.0),
+        delay_samples=fields.optional("delay samples", ""),
         geometry=_read_lines(fields, lines),
-        compression=str(fields.values.get("compression", "none")),
+        compression=_compression(fields),
         frame_rate_hz=fields.optional("frame rate", "Hz"),
         transmit_frequency_hz=fields.optional("transmit frequency", "Hz"),
         imaging_depth_mm=fields.optional("imaging depth", "mm"),
@@ -183,7 +174,7 @@ def read_description(member: Member) -> Description:
         gain=tuple(_knots(gain_text, where)),
         roi=_read_roi(fields),
         receive=_read_receive(fields),
-        unused=tuple(sorted(set(map(str, fields.values)) - _USED)),
+        unused=tuple(sorted(set(fields.values) - _USED)),
     )
 
 
@@ -201,56 +192,14 @@ def read_gains(member: Member) -> dict[int, Curve]:
     stamps = list(_STAMP.finditer(text))
     stops = [*(stamp.start() for stamp in stamps), len(text)][1:]
     curves: dict[int, Curve] = {}
+    alike: dict[Curve, Curve] = {}
     for stamp, after in zip(stamps, stops, strict=bool(stamps)):
         time_ns = int(stamp[1])
         if time_ns in curves:
             raise InvalidInputError(f"{where}: expected one curve at {time_ns} ns, got two")
-        curves[time_ns] = tuple(_knots(text[stamp.end() : after], f"{where}: timestamp {time_ns}"))
+        curve = tuple(_knots(text[stamp.end() : after], f"{where}: timestamp {time_ns}"))
+        curves[time_ns] = alike.setdefault(curve, curve)
     return curves
-
-
-def documents_of(text: str, where: str) -> Iterator[Mapping[str, Any]]:
-    """Parse YAML whose documents are fields; empty ones are left out.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is no YAML, holds other things or aliases, or PyYAML is not installed.
-    """
-    yaml = _library()
-    if (found := _ALIAS.search(text)) is not None:
-        line = text.count("\n", 0, found.end()) + 1
-        raise InvalidInputError(f"{where}: line {line}: expected no anchors and aliases, got one")
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    try:
-        for document in yaml.load_all(text, Loader=loader):
-            if document is None:
-                continue
-            if not isinstance(document, dict):
-                raise InvalidInputError(f"{where}: expected fields, got {type(document).__name__}")
-            yield document
-    except RecursionError:
-        raise InvalidInputError(f"{where}: expected YAML, got brackets within brackets without end") from None
-    except (yaml.YAMLError, ValueError) as error:
-        if isinstance(error, InvalidInputError):
-            raise
-        raise InvalidInputError(f"{where}: expected YAML, got an error: {error}") from error
-
-
-def quantity(value: object, unit: str, where: str) -> float:
-    """Read a number with its unit, as ``"60 MHz"``, in the base unit `unit`.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is no finite number, or has another unit or none.
-    """
-    found = None if isinstance(value, bool) else _NUMBER.fullmatch(str(value))
-    factors = _UNITS[unit]
-    if found is None or found[2].lower() not in factors or not math.isfinite(float(found[1])):
-        expected = f"a number of {unit}" if unit else "a number"
-        raise InvalidInputError(f"{where}: expected {expected}, got {str(value)[:40]!r}")
-    return float(found[1]) * factors[found[2].lower()]
 
 
 @dataclass(frozen=True)
@@ -263,12 +212,10 @@ class _Fields:
     def below(self, name: str) -> _Fields:
         inner = self.values.get(name)
         if not isinstance(inner, dict):
-            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {str(inner)[:40]!r}")
+            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {shown(inner)}")
         return _Fields(inner, f"{self.where}: {name}")
 
-    def number(self, name: str, unit: str = "", default: float | None = None) -> float:
-        if name not in self.values and default is not None:
-            return default
+    def number(self, name: str, unit: str = "") -> float:
         return quantity(self.values.get(name), unit, f"{self.where}: {name}")
 
     def positive(self, name: str, unit: str) -> float:
@@ -287,15 +234,22 @@ class _Fields:
         return int(value)
 
 
+def _compression(fields: _Fields) -> str:
+    held = fields.values.get("compression", "none")
+    if not isinstance(held, str):
+        raise InvalidInputError(f"{fields.where}: compression: expected none, got {shown(held)}")
+    return held
+
+
 def _read_lines(fields: _Fields, count: int) -> Lines:
     where, entries = f"{fields.where}: lines", fields.values.get("lines")
     if not isinstance(entries, list) or not entries:
-        raise InvalidInputError(f"{where}: expected a list of lines, got {str(entries)[:40]!r}")
+        raise InvalidInputError(f"{where}: expected a list of lines, got {shown(entries)}")
     names = (("rx element", ""), ("tx element", ""), ("angle", "deg"))
     rows = np.empty((len(entries), 3))
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise InvalidInputError(f"{where}[{i}]: expected fields, got {str(entry)[:40]!r}")
+            raise InvalidInputError(f"{where}[{i}]: expected fields, got {shown(entry)}")
         line = _Fields(entry, f"{where}[{i}]")
         rows[i] = [line.number(name, unit) for name, unit in names]
     if len(entries) == count:
@@ -340,13 +294,3 @@ def _knots(text: str, where: str) -> Iterator[tuple[float, float]]:
             )
         last_mm = depth_mm
         yield depth_mm, gain_db
-
-
-def _library() -> Any:
-    try:
-        import yaml
-    except ImportError:
-        raise InvalidInputError(
-            'packages of Clarius scanners need PyYAML: pip install "speckle3d[clarius]"'
-        ) from None
-    return yaml

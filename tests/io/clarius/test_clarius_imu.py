@@ -131,7 +131,7 @@ def test_pauses_are_told_and_long_ones_not_bridged(tmp_path):
         (lambda rows: [rows[0].replace("q3", "q4")], "sample 0: orientation: q3: expected a number"),
         (lambda rows: [rows[0], rows[1].replace("magnetometer", "m")], "sample 1: magnetometer: expected o"),
         (lambda _: [], "expected samples of the sensor, got none"),
-        (lambda _: ["[1, 2]"], "expected fields, got list"),
+        (lambda _: ["[1, 2]"], "expected fields, got a list"),
         (lambda rows: [rows[0].replace("scope x: ", "scope x: .nan #")], "gyroscope x: expected a number"),
     ],
 )  # fmt: skip

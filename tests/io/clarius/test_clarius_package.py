@@ -10,6 +10,7 @@ from sweep_examples import rf_sweep
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.clarius.package import find_recording, is_package
+from speckle3d.io.describe import describe
 from speckle3d.io.readers import find_reader, first_bytes
 
 
@@ -115,3 +116,36 @@ def test_a_raw_file_without_yml_is_named(tmp_path):
     folder = examples.write_files(tmp_path / "folder", bare)
     with pytest.raises(InvalidInputError, match=r"_rf\.raw: expected 2024.*_rf\.yml beside it, got none"):
         load_sweep(folder)
+
+
+def test_a_tar_file_without_its_end_is_told(tmp_path):
+    tar = examples.write_files(tmp_path / "p.tar", files())
+    whole = tar.read_bytes()
+    with tarfile.open(tar) as archive:
+        last = archive.getmembers()[-1]
+    end = last.offset_data + -(-last.size // 512) * 512
+    assert not find_recording(tar).cut
+    tar.write_bytes(whole[:end])
+    assert find_recording(tar).cut
+    assert any("without the blocks that close" in row[1] for row in describe(tar))
+    for tail in (b"x" * 100, b"x" * 512):
+        tar.write_bytes(whole[:end] + tail)
+        with pytest.raises(FileError, match=rf"end at byte {end}, got"):
+            find_recording(tar)
+
+
+def test_two_files_of_the_sensor_are_named(tmp_path):
+    both = files() | {f"{examples.NAME}_imu.{end}": b"timestamp: 1" for end in ("yml", "yaml")}
+    folder = examples.write_files(tmp_path / "folder", both)
+    with pytest.raises(InvalidInputError, match=r"expected one of .*_imu\.yaml and .*_imu\.yml, got both"):
+        find_recording(folder)
+
+
+def test_other_files_of_such_names_are_no_package(tmp_path):
+    other = {"my_env.yml": b"name: work\ndependencies:\n  - numpy\n"}
+    folder = examples.write_files(tmp_path / "conda", other)
+    for path in (folder, folder / "my_env.yml", examples.write_files(tmp_path / "conda.tar", other)):
+        assert not claimed(path), path
+    mixed = examples.write_files(tmp_path / "mixed", files() | other)
+    assert claimed(mixed)
+    assert find_recording(mixed).name == examples.NAME

@@ -1,5 +1,6 @@
 """Packages of any sweep, written as the scanner writes them, are read back equal in every field."""
 
+import pickle
 import sys
 from dataclasses import replace
 
@@ -136,6 +137,20 @@ def test_differing_gain_is_undone_relative_to_the_first_frame(tmp_path, kind):
         # The scanner rounds to whole numbers, which is then divided by the gain.
         np.testing.assert_allclose(found.frames[i], sweep.frames[i], atol=0.75)
     assert "undone" in dict(row[:2] for row in describe(package))["gain by frame"]
+    again = pickle.loads(pickle.dumps(found.frames))
+    np.testing.assert_array_equal(again[-1], found.frames[2])
+
+
+def test_equal_gain_curves_are_one_and_no_array_is_held_for_a_frame(tmp_path):
+    sweep = sweep_of("rf", frames=4)
+    curves = [curve(last) for last in (30.0, 36.0, 30.0, 36.0)]
+    frames = load_sweep(examples.write_package(tmp_path / "p", sweep, tgc=curves), GIVEN).frames
+    held = frames.factors
+    assert held.curves[0] is held.curves[2]
+    assert held.curves[1] is held.curves[3]
+    assert held.depth_mm.shape == (40,)
+    np.testing.assert_array_equal(held[2], np.ones(40))
+    assert len(pickle.dumps(frames)) < 2000
 
 
 def test_gain_of_another_kind_serves_all(tmp_path):
