@@ -292,6 +292,8 @@ def _size(size: tuple[int, ...]) -> str:
 
 
 def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
+    if not {*_POSITIONS, *_NUMBERS} & settings.arrays.keys():
+        return []  # and earlier versions need not be read into memory again
     with open_matlab(path) as file:
         return _recording(file, settings).contradictions(settings)
 

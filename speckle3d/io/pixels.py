@@ -264,7 +264,7 @@ def _beside(path: Path, name: str, field: str) -> Path:
 
 
 def _found(header: Path, data: Path, start: int) -> int:
-    """Bytes that the file of the pixels holds from `start` on; the header that names it is named in errors."""
+    """Bytes that the file of the pixels holds from `start` on; errors name the header that names it."""
     try:
         with open_regular(data) as stream:
             return max(stream.seek(0, 2) - start, 0)

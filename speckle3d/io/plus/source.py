@@ -231,6 +231,8 @@ class Source:
     def contradictions(self) -> list[str]:
         """Tell what is given and is another than header or device set say."""
         notes = contradictions(self.path, self.found(), self.settings)
+        if self.settings.frame_rate_hz is not None and self.has_times and self.poses is not None:
+            notes.append("frame times are those of the frame rate from 0; poses keep the file's time stamps")
         if self.header.is_volume:
             notes.append(
                 "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
