@@ -39,7 +39,7 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     Returns
     -------
     Sweep
-        With frames that stay on disk until they are asked for; those of image sequences are in memory.
+        With frames that stay on disk until they are asked for, but for MATLAB files before version 7.3.
 
     Raises
     ------
