@@ -20,7 +20,7 @@ from speckle3d.core.files import open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.dicom_elements import read_header, reading_dicom, text_of, whole_of
-from speckle3d.io.found import Found
+from speckle3d.io.found import Found, differs
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import LazyFrames, OpenFrames
 from speckle3d.io.readers import Reader, Row
@@ -109,7 +109,8 @@ def read_dicom(path: Path, settings: ImportSettings | None = None) -> Sweep:
     MissingSettingsError
         Naming all that the file does not say: always the dynamic range.
     """
-    return _recording(path).sweep(settings or ImportSettings())
+    given = settings or ImportSettings()
+    return _recording(path, given).sweep(given)
 
 
 def _claims(_: Path, start: bytes) -> bool:
@@ -118,7 +119,7 @@ def _claims(_: Path, start: bytes) -> bool:
 
 def _describe(path: Path, settings: ImportSettings) -> list[Row]:
     try:
-        return _recording(path).rows(settings)
+        return _recording(path, settings).rows(settings)
     except InvalidInputError:
         # Why there is no sweep is told beside these rows.
         try:
@@ -128,14 +129,14 @@ def _describe(path: Path, settings: ImportSettings) -> list[Row]:
             return [("elements", "not read", "")]
 
 
-def _recording(path: Path) -> Recording:
+def _recording(path: Path, settings: ImportSettings) -> Recording:
     with open_regular(path) as stream:
         header, syntax = read_header(path, stream)
         _require_decoder(path, syntax)
         size = stream.seek(0, 2)
     count = _require_grey(path, header, syntax, size)
     region, found, notes = _place(path, header)
-    times, rate = _clock(path, header, count)
+    times, rate = _clock(path, header, count, settings.frame_rate_hz is not None)
     lossy = text_of(header, "LossyImageCompression") == "01" or "YBR" in text_of(
         header, "PhotometricInterpretation"
     )
@@ -305,8 +306,10 @@ def _region(path: Path, index: int, item: Any) -> _Region:
     )
 
 
-def _clock(path: Path, header: Any, count: int) -> tuple[npt.NDArray[np.float64] | None, Found]:
-    """Times of the frames where each has its own, else their rate."""
+def _clock(
+    path: Path, header: Any, count: int, rate_is_given: bool
+) -> tuple[npt.NDArray[np.float64] | None, Found]:
+    """Times of the frames where each has its own and no rate is given, else their rate."""
     with reading_dicom(str(path)):
         vector = header.get("FrameTimeVector")
         steps = np.atleast_1d(np.asarray([] if vector is None else vector, dtype=float))
@@ -319,16 +322,19 @@ def _clock(path: Path, header: Any, count: int) -> tuple[npt.NDArray[np.float64]
                 float(header.get("RecommendedDisplayFrameRate") or 0),
             ),
         ]
-    if steps.size:
+    if steps.size and not rate_is_given:
         if steps.size != count or not np.isfinite(steps).all() or not (steps[1:] > 0).all():
             raise InvalidInputError(
-                f"{path}: FrameTimeVector: expected {count} times above 0 after the first, got {steps.size}"
+                f"{path}: FrameTimeVector: expected {count} times above 0 after the first, got {steps.size} "
+                "(--frame-rate-hz replaces them)"
             )
         return np.cumsum(np.concatenate([[0.0], steps[1:]])) / 1e3, Found()
-    for name, rate in rates:
-        if np.isfinite(rate) and rate > 0:
-            return None, Found(rate, name)
-    return None, Found()
+    said = [(name, rate) for name, rate in rates if np.isfinite(rate) and rate > 0]
+    if not said:
+        return None, Found()
+    name, rate = said[0]
+    others = [f"{other} says {each:.4g}" for other, each in said[1:2] if differs(rate, each)]
+    return None, Found(rate, ", ".join([name, *others]))
 
 
 def _grey(image: npt.NDArray[Any], spread: int) -> npt.NDArray[np.uint8]:
@@ -364,7 +370,7 @@ def _notes(header: Any, syntax: Any) -> tuple[Row, ...]:
 
 
 def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
-    return _recording(path).contradictions(settings)
+    return _recording(path, settings).contradictions(settings)
 
 
 READER = Reader(FORMAT, _claims, read_dicom, _describe, notes=_contradictions)

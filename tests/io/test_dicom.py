@@ -73,6 +73,20 @@ def test_times_of_frames(tmp_path, elements, times):
     np.testing.assert_allclose(sweep.frame_time_s, times, atol=1e-12)
 
 
+def test_a_given_rate_stands_in_for_times_that_are_not_of_the_frames(tmp_path):
+    wrong = {"FrameTime": None, "FrameTimeVector": [0.0, 10.0]}
+    path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)], **wrong)
+    with pytest.raises(InvalidInputError, match=r"FrameTimeVector.*--frame-rate-hz"):
+        load_sweep(path, RANGE)
+    sweep = load_sweep(path, RANGE.model_copy(update={"frame_rate_hz": 20.0}))
+    np.testing.assert_allclose(sweep.frame_time_s, 0.05 * np.arange(4))
+
+
+def test_rates_that_disagree_are_told(tmp_path):
+    path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)], FrameTime=50.0, CineRate=10)
+    assert any("FrameTime, CineRate says 10" in value for _, value, _ in describe(path))
+
+
 def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
     path = write_dicom(tmp_path / "a.dcm", images(), FrameTime=None)
     with pytest.raises(MissingSettingsError) as caught:
