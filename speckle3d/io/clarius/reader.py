@@ -67,7 +67,13 @@ def read_package(path: Path, settings: ImportSettings) -> Sweep:
     recording = find_recording(path)
     chosen = choose(recording)
     said = chosen.said
-    place = place_of(said, is_padded(chosen))
+    try:
+        place = place_of(said, is_padded(chosen))
+    except InvalidInputError as error:
+        others = [member.name for name, member in recording.raw.items() if name != chosen.name]
+        if not others:
+            raise
+        raise InvalidInputError(f"{error}; or give another of its raw files: {', '.join(others)}") from error
     values = values_of(path, chosen, place, settings)
     spacing_mm = 1e3 * values["speed_of_sound_m_s"] / (2.0 * values["sampling_rate_hz"])
     _, vectors, samples = _frames(chosen, place).shape

@@ -363,7 +363,10 @@ def test_real_packages(realdata):
         assert rows["quaternion"].startswith("scalar first, world from sensor")
         assert "expected a raw file" in rows["sweep"]
     doppler = realdata / "clarius" / "carotid" / "doppler"
-    with pytest.raises(InvalidInputError, match="got 15 deg, and 1248 of 1248 lines steered"):
+    with pytest.raises(
+        InvalidInputError,
+        match=r"got 15 deg, and 1248 of 1248 lines steered.*or give another.*carotid_env\.raw",
+    ):
         load_sweep(doppler)
     envelope = load_sweep(
         doppler / "carotid_env.raw", ImportSettings(vector_pitch_mm=0.1, dynamic_range_db=60.0)
