@@ -25,6 +25,7 @@ from speckle3d.io.clarius.reader import (
     signal_values,
 )
 from speckle3d.io.clarius.sidecars import Description, read_description
+from speckle3d.io.found import Found, contradictions
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.readers import Row
 
@@ -94,6 +95,7 @@ def package_notes(path: Path, settings: ImportSettings) -> Sequence[str]:
                 "said, Q has the other sign, or it is a harmonic image"
             )
     notes += _pitch_notes(chosen.said, place, settings)
+    notes += contradictions(path, _said_by_yml(chosen.said, place), settings)
     source = _shift_source(chosen.said, settings)
     if chosen.said.kind == "IQ" and "turned" in source:
         notes.append(f"demodulation frequency from {source}")
@@ -110,6 +112,19 @@ def package_notes(path: Path, settings: ImportSettings) -> Sequence[str]:
             f"`speckle3d imu orient {path} --into SWEEP.h5` finds"
         )
     return notes
+
+
+def _said_by_yml(said: Description, place: Place) -> dict[str, Found]:
+    """Numbers of the yml that options replace."""
+    speed = said.speed_of_sound_m_s or SPEED_OF_SOUND_M_S
+    own = {
+        "sampling_rate_hz": said.sampling_rate_hz,
+        "speed_of_sound_m_s": said.speed_of_sound_m_s,
+        "first_sample_depth_mm": place.first_depth_mm(said.sampling_rate_hz, speed),
+    }
+    if said.kind != "envelope":
+        own["centre_frequency_hz"] = said.transmit_frequency_hz
+    return {name: Found(value, said_by="its yml") for name, value in own.items()}
 
 
 def _sensor_rows(recording: Recording) -> list[Row]:

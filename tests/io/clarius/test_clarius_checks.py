@@ -254,3 +254,12 @@ def test_no_real_description_contradicts_itself(realdata):
         # Doppler frames lie in a region of interest.
         told = bool(depth_notes(said, ImportSettings()))
         assert told == (file.name == "carotid_iq.yml" and file.parent.name == "doppler"), file
+
+
+def test_numbers_given_over_the_packages_own_are_told(tmp_path):
+    package = examples.write_package(tmp_path / "a", sweep_of("rf"), sensor=False)
+    given = GIVEN.model_copy(update={"speed_of_sound_m_s": 1482.0, "centre_frequency_hz": 5e6})
+    notes = " ".join(import_notes(package, given))
+    assert "centre frequency 5 MHz, given: its yml says" in notes
+    assert "speed of sound" not in notes  # assumed, and nothing contradicts
+    assert "centre frequency" not in " ".join(import_notes(package, GIVEN))
