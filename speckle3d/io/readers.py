@@ -25,8 +25,8 @@ GROUP = "speckle3d.readers"
 START_BYTES = 4096
 
 _OWN = (
-    "sweeps", "challenge", "uff", "zea", "dicom", "matlab", "metaimage", "plus.documents", "ultrasonix",
-    "clarius",
+    "sweeps", "challenge", "formats.uff", "formats.zea", "formats.dicom", "formats.matlab", "metaimage",
+    "plus.documents", "formats.ultrasonix", "clarius",
 )  # fmt: skip
 """Modules of this package that have a reader, in the order in which they are asked."""
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Tracker
+from speckle3d.io.formats.recordings import rate_of
 from speckle3d.io.found import ASSUMED, Found, contradictions, differs, rows_of
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.headers import SequenceHeader, read_header
@@ -33,7 +34,6 @@ from speckle3d.io.plus.transforms import (
     tracked_poses,
 )
 from speckle3d.io.readers import Row
-from speckle3d.io.recordings import rate_of
 
 _SIZE_TOLERANCE = 0.1
 """How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured

@@ -258,7 +258,7 @@ def test_an_imaginary_part_that_is_not_there_is_refused_before_scipy_meets_it(tm
 
 
 def test_files_of_others_are_sound(realdata):
-    from speckle3d.io.matlab_guard import require_sound
+    from speckle3d.io.formats.matlab_guard import require_sound
 
     paths = sorted((realdata / "broad").glob("*.mat"))[:2]
     assert paths

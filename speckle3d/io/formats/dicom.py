@@ -19,12 +19,12 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import open_regular, plausible_bytes
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
-from speckle3d.io.dicom_elements import read_header, reading_dicom, text_of, whole_of
+from speckle3d.io.formats.dicom_elements import read_header, reading_dicom, text_of, whole_of
+from speckle3d.io.formats.recordings import Recording
 from speckle3d.io.found import Found, differs
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import LazyFrames, OpenFrames
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Recording
 
 FORMAT = "DICOM"
 

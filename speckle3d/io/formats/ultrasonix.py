@@ -21,11 +21,11 @@ import numpy as np
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.core.sweep import Sweep
+from speckle3d.io.formats.recordings import Recording
 from speckle3d.io.found import Found
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import Layout, RawFrames, Real
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Recording
 
 FORMAT = "Ultrasonix"
 

@@ -29,13 +29,13 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_increasing
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames, Sweep
+from speckle3d.io.formats.matlab_file import USER_BLOCK, Listed, MatFile, open_matlab
+from speckle3d.io.formats.recordings import Recording, step_of
 from speckle3d.io.found import Found
 from speckle3d.io.hdf5 import SIGNATURE
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import Layout, Slices
-from speckle3d.io.matlab_file import USER_BLOCK, Listed, MatFile, open_matlab
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Recording, step_of
 
 FORMAT = "MATLAB"
 

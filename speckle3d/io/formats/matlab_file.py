@@ -23,10 +23,10 @@ from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
+from speckle3d.io.formats.matlab_guard import require_sound
 from speckle3d.io.hdf5 import SIGNATURE, find_member, one_line, open_hdf5, reading, require_dataset
 from speckle3d.io.hdf5_guard import plain_attribute, require_readable
 from speckle3d.io.lazy import HDF5Slices, Turn
-from speckle3d.io.matlab_guard import require_sound
 
 USER_BLOCK = 512
 """Bytes of text before the HDF5 part of version 7.3."""

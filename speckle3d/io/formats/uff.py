@@ -26,8 +26,10 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.carrier import demodulation_of
+from speckle3d.io.formats.greys import grey_frames
+from speckle3d.io.formats.hdf5_values import flat, single
+from speckle3d.io.formats.recordings import Recording, step_of
 from speckle3d.io.found import Found
-from speckle3d.io.greys import grey_frames
 from speckle3d.io.hdf5 import (
     find_group,
     find_member,
@@ -40,11 +42,9 @@ from speckle3d.io.hdf5 import (
     require_group,
 )
 from speckle3d.io.hdf5_guard import plain_attribute
-from speckle3d.io.hdf5_values import flat, single
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.lazy import Complex, HDF5Slices, Layout, Real
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Recording, step_of
 
 FORMAT = "USTB .uff"
 

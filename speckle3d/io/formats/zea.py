@@ -24,8 +24,10 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.carrier import demodulation_of
+from speckle3d.io.formats.greys import grey_frames
+from speckle3d.io.formats.hdf5_values import single
+from speckle3d.io.formats.recordings import Recording, step_of
 from speckle3d.io.found import Found
-from speckle3d.io.greys import grey_frames
 from speckle3d.io.hdf5 import (
     find_group,
     find_member,
@@ -39,11 +41,9 @@ from speckle3d.io.hdf5 import (
     require_dataset,
     require_group,
 )
-from speckle3d.io.hdf5_values import single
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.lazy import HDF5Slices, Layout, Pairs, Real
 from speckle3d.io.readers import Reader, Row
-from speckle3d.io.recordings import Recording, step_of
 
 FORMAT = "zea"
 

@@ -1,0 +1,1 @@
+"""Recordings of other systems, a module each, and what they share."""
