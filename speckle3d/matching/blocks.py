@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.threads import cores
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameInspector, QualitySettings
@@ -31,19 +31,6 @@ MATCHING = "in-plane motion and correlation"
 """Name of the stage in `StageTimes`."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
-
-
-_READS_AHEAD: ContextVar[bool] = ContextVar("reads_ahead", default=True)
-
-
-@contextmanager
-def on_one_thread() -> Iterator[None]:
-    """Do not read ahead on a second thread: for a cluster's workers, who are given a core each."""
-    token = _READS_AHEAD.set(False)
-    try:
-        yield
-    finally:
-        _READS_AHEAD.reset(token)
 
 
 @dataclass
@@ -283,7 +270,7 @@ class _BlockMatcher:
                     images(index, echo.intensity)
                 return index, self._matcher.prepare(echo), features
 
-        if not _READS_AHEAD.get():
+        if cores() == 1:
             yield from map(make, numbers)
             return
         with ThreadPoolExecutor(1) as worker:
