@@ -23,7 +23,11 @@ def rows(path: Path, runs: int) -> list[Row]:
     sweep, config = load_sweep(path), Config()
     matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane)
     fixed, moving = (matcher.prepare(matcher.echo(sweep.frames[i])) for i in (0, 1))
-    ways = {"OpenCV matchTemplate": by_opencv, "NumPy, lag by lag": by_numpy, "scipy.signal.correlate": by_scipy}
+    ways = {
+        "OpenCV matchTemplate": by_opencv,
+        "NumPy, lag by lag": by_numpy,
+        "scipy.signal.correlate": by_scipy,
+    }
     cv2.setNumThreads(1)
     made = []
     with on_one_thread():

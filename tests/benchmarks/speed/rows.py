@@ -63,7 +63,9 @@ def print_table(rows: list[Row]) -> None:
     """Print rows as a table in Markdown, so that it can be put on a page."""
     cells = [HEADINGS, *(row.cells() for row in rows)]
     widths = [max(len(line[k]) for line in cells) for k in range(len(HEADINGS))]
-    lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in cells]
+    lines = [
+        "| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in cells
+    ]
     lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
     print("\n".join(lines), flush=True)
 
