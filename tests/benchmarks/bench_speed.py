@@ -1,4 +1,4 @@
-"""Speed and memory of everything that makes a user wait, beside peers or limits in the same process, as one table.
+"""Speed and memory of what makes a user wait, beside peers or limits in the same process, as one table.
 
 Run: ``python tests/benchmarks/bench_speed.py [--runs 7] [--only WHAT ...]`` on a quiet machine. Needs the
 extra ``bench``. Frames are of 127 vectors by 3818 samples; sweeps are simulated once (ten minutes) and kept.

@@ -1,4 +1,4 @@
-"""Tracking a sweep: frames per second beside the transforms alone, the share of each stage, cores kept busy."""
+"""Tracking a sweep: frames per second beside the transforms alone, shares of the stages, cores kept busy."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
