@@ -295,7 +295,7 @@ def _unpacked_fast(packed: bytes, expected: int) -> bytes | None:
     stream = isal_zlib.decompressobj()
     try:
         found = stream.decompress(packed, expected + 1)
-    except Exception:  # Its own, of whatever is damaged.
+    except isal_zlib.error:  # type: ignore[misc]  # An exception, declared as an object.
         return None
     return bytes(found) if len(found) == expected and stream.eof else None
 
