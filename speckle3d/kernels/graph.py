@@ -1,4 +1,4 @@
-"""Robust Gauss-Newton on a graph of relative poses, its normal equations kept row by row within their envelope.
+"""Robust Gauss-Newton on a graph of relative poses, its normal equations kept within their envelope.
 
 References
 ----------
@@ -104,7 +104,7 @@ def marginals(graph: PoseGraph, poses: FloatArray, huber: float, frames: IntArra
 
 @njit(fastmath=_FAST, error_model="numpy")
 def _gather(graph: PoseGraph, poses: FloatArray, huber: float, gradient: FloatArray) -> None:
-    """Fill the rows with the normal equations at some poses, and the gradient, for increments on the right."""
+    """Fill the rows with the normal equations at some poses; the increments of these are on the right."""
     rows, at = graph.rows, graph.at
     rows[:] = 0.0
     gradient[:] = 0.0

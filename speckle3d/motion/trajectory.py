@@ -124,7 +124,7 @@ def _require_connected(second: IntArray, frames: int) -> None:
 
 
 def _chain(pairs: RelativePoses, frames: int, relative: bool) -> FloatArray:
-    """Each frame from the pair whose distance is most certain, absolutely or relative to its size, (n, 4, 4)."""
+    """Each frame from the pair whose distance is most certain, absolutely or relative to its size."""
     doubt = pairs.covariance[:, 2, 2]
     if relative:
         doubt = doubt / np.maximum(pairs.poses.translation[:, 2] ** 2, 1e-6)
@@ -139,7 +139,7 @@ def _chain(pairs: RelativePoses, frames: int, relative: bool) -> FloatArray:
 
 
 # The covariance's order is translation, rotation; exponential coordinates' is rotation, translation.
-_SWAP = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+_SWAPPED = np.array([3, 4, 5, 0, 1, 2])
 
 
 def _graph(pairs: RelativePoses, frames: int) -> PoseGraph:
@@ -155,7 +155,7 @@ def _graph(pairs: RelativePoses, frames: int) -> PoseGraph:
         first,
         second,
         pairs.poses.inv().as_matrix(),
-        np.ascontiguousarray(np.linalg.inv(pairs.covariance)[:, *_SWAP]),
+        np.ascontiguousarray(np.linalg.inv(pairs.covariance)[:, _SWAPPED[:, None], _SWAPPED]),
         begin,
         np.cumsum(length) - length - begin,
         np.empty(int(length.sum())),
@@ -168,6 +168,6 @@ def _marginals(graph: PoseGraph, poses: FloatArray, huber: float) -> FloatArray:
     known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(np.int64))
     blocks = np.zeros((known.size + 1, 6, 6))
     marginals(graph, poses, huber, known, blocks[1:])
-    at, columns = np.concatenate([[0], known]), blocks[:, *_SWAP].reshape(-1, 36).T
+    at, columns = np.concatenate([[0], known]), blocks[:, _SWAPPED[:, None], _SWAPPED].reshape(-1, 36).T
     every = [np.interp(np.arange(frames), at, column) for column in columns]
     return np.stack(every, axis=1).reshape(frames, 6, 6)
