@@ -24,6 +24,7 @@ import numpy.typing as npt
 from speckle3d.core.arrays import ByteArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular, plausible_bytes
+from speckle3d.core.memory import borrowed
 from speckle3d.core.printable import printable
 
 Offset: TypeAlias = tuple[int, ...]
@@ -321,6 +322,7 @@ class Unpacker:
     def __init__(self, node: h5py.Dataset) -> None:
         self._node, self._pipeline, self._shape = node.id, _pipeline(node), node.chunks
         self._stored, self._bytes = node.dtype, _bytes_of(node, node.chunks)
+        self._room = self._bytes + self._bytes // 1000 + 1024
 
     def read(self, offset: Offset) -> npt.NDArray[Any]:
         """Read a chunk by the index of its first sample.
@@ -330,7 +332,10 @@ class Unpacker:
         InvalidInputError
             If it is damaged, or unpacks to fewer bytes or more than a chunk has.
         """
-        skipped, raw = self._node.read_direct_chunk(offset)
+        packed = None
+        if self._node.get_chunk_info_by_coord(offset).size <= self._room:
+            packed = borrowed((self._room,), np.uint8)
+        skipped, raw = self._node.read_direct_chunk(offset, out=packed)
         stages = {filter_id for i, filter_id in enumerate(self._pipeline) if not skipped & (1 << i)}
         data = inflate(raw, self._bytes, offset) if _DEFLATE in stages else raw
         if len(data) != self._bytes:
@@ -347,7 +352,8 @@ def _unshuffled(planes: ByteArray) -> ByteArray:
     if planes.shape[0] not in (2, 4):
         return np.ascontiguousarray(planes.T).reshape(-1)
     # Bytes put together as numbers: many times as fast as a copy of single bytes.
-    whole: npt.NDArray[Any] = planes[-1].astype(f"<u{planes.shape[0]}")
+    whole = borrowed(planes.shape[1:], f"<u{planes.shape[0]}")
+    whole[:] = planes[-1]
     for plane in planes[-2::-1]:
         whole <<= 8
         whole |= plane
