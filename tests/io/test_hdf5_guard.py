@@ -15,7 +15,8 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.calibrations import read_calibration, write_calibration
 from speckle3d.io.challenge import is_challenge_scan
 from speckle3d.io.hdf5 import read_attribute, read_text
-from speckle3d.io.hdf5_guard import follow, inflate, require_texts
+from speckle3d.io.hdf5_guard import follow, require_texts
+from speckle3d.io.inflate import inflate
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.sweeps import read_sweep
 
