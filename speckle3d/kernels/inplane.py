@@ -325,9 +325,9 @@ def _fit(
     motion[1:] = 0.0
     motion[1, 0] = lateral[0, 0]
     motion[2:, 1:] = axial[:2, :2]
-    # The centre's shift is seen in the second image's axes; its displacement is told in the first's. Roll comes
-    # from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves speckle laterally
-    # about the focus rather than about the probe, and lateral shifts understate it by a fifth and more.
+    # The centre's shift is seen in the second image's axes; its displacement is told in the first's. Roll
+    # comes from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves speckle
+    # laterally about the focus rather than about the probe: lateral shifts understate it by a fifth and more.
     roll = -field[1, 1]
     c, s = np.cos(roll), np.sin(roll)
     motion[0, 0] = s * field[1, 0] - c * field[0, 0]

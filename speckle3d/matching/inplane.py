@@ -17,6 +17,7 @@ from scipy import fft
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.inplane import REFERENCES, Geometry, Matches, match_pairs
 from speckle3d.matching.patches import PatchGrid
 
@@ -200,7 +201,7 @@ def match_with_each(
             some = (_filled(frames[begin:end]) for frames in (fixed, theirs))
             match_pairs(*some, moving, ours, geometry, matches, begin, end)
 
-    match(0, count)
+    in_parallel(match, count)
     return [_match(matches, k) for k in range(count)]
 
 
