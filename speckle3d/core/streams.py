@@ -45,13 +45,12 @@ class TimedSamples(Generic[Samples]):
     def covers(self, times_s: npt.ArrayLike) -> BoolArray:
         """Whether each of `times_s` lies on a sample or between two that are close enough."""
         t = np.asarray(times_s, dtype=float)
-        on_sample = np.isin(t, self.time_s)
         if len(self) < 2:
-            return on_sample
+            return np.asarray(t == self.time_s[0])
         right = np.clip(np.searchsorted(self.time_s, t), 1, len(self) - 1)
         before, after = self.time_s[right - 1], self.time_s[right]
-        inside = (t >= before) & (t <= after) & (after - before <= self.max_gap_s)
-        return np.asarray(inside | on_sample)
+        inside = (t > before) & (t < after) & (after - before <= self.max_gap_s)
+        return np.asarray(inside | (t == before) | (t == after))
 
     def at(self, times_s: npt.ArrayLike) -> Samples:
         """Sample at each of `times_s`: slerp of the rotation, linear interpolation of the translation.
