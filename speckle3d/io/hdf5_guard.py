@@ -21,6 +21,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import ByteArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular, plausible_bytes
 from speckle3d.core.printable import printable
@@ -274,6 +275,9 @@ def inflate(packed: bytes, expected: int, offset: Offset) -> bytes:
     zlib.error
         If it is damaged.
     """
+    found = _unpacked_fast(packed, expected)
+    if found is not None:
+        return found
     stream = zlib.decompressobj()
     found = stream.decompress(packed, expected + 1)
     if len(found) != expected or not stream.eof:
@@ -282,13 +286,27 @@ def inflate(packed: bytes, expected: int, offset: Offset) -> bytes:
     return found
 
 
+def _unpacked_fast(packed: bytes, expected: int) -> bytes | None:
+    """Unpack with ISA-L, four times as fast; None without it, and where zlib is to say what is wrong."""
+    try:
+        from isal import isal_zlib
+    except ImportError:
+        return None
+    stream = isal_zlib.decompressobj()
+    try:
+        found = stream.decompress(packed, expected + 1)
+    except isal_zlib.error:  # type: ignore[misc]  # An exception, declared as an object.
+        return None
+    return bytes(found) if len(found) == expected and stream.eof else None
+
+
 def is_filtered(node: h5py.Dataset) -> bool:
     """Whether filters made a data set's chunks, whose length then says nothing."""
     return bool(_pipeline(node))
 
 
 def is_only_deflated(node: h5py.Dataset) -> bool:
-    """Whether `unpacked` can make a data set's chunks: of a plain type, deflated, shuffled before or not."""
+    """Whether `Unpacker` can read a data set's chunks: of a plain type, deflated, shuffled before or not."""
     if h5py.h5t.py_create(node.dtype) != node.id.get_type():
         return False
     if _pipeline(node) != (_SHUFFLE, _DEFLATE):
@@ -297,27 +315,44 @@ def is_only_deflated(node: h5py.Dataset) -> bool:
     return shuffled_by[:1] == (node.dtype.itemsize,)
 
 
-def unpacked(node: h5py.Dataset, offset: Offset) -> npt.NDArray[Any]:
-    """Read a chunk that `is_only_deflated`, as HDF5 would, but whole or not at all.
+class Unpacker:
+    """Reads the chunks of a data set that `is_only_deflated`, as HDF5 would, but whole or not at all."""
 
-    Raises
-    ------
-    InvalidInputError
-        If it is damaged, or unpacks to fewer bytes or more than a chunk has.
-    """
-    skipped, raw = node.id.read_direct_chunk(offset)
-    pipeline = _pipeline(node)
-    stages = {filter_id for i, filter_id in enumerate(pipeline) if not skipped & (1 << i)}
-    expected = _bytes_of(node, node.chunks)
-    data = inflate(raw, expected, offset) if _DEFLATE in stages else raw
-    if len(data) != expected:
-        raise InvalidInputError(f"chunk {offset}: expected {expected} bytes, got {len(data)}")
-    values = np.frombuffer(data, dtype=np.uint8)
-    if _SHUFFLE in stages:
-        values = values.reshape(node.dtype.itemsize, -1).T
-    flat = np.ascontiguousarray(values).reshape(-1).view(node.dtype)
-    chunk: npt.NDArray[Any] = flat.reshape(node.chunks)
-    return chunk.astype(node.dtype.newbyteorder("="), copy=False)
+    def __init__(self, node: h5py.Dataset) -> None:
+        self._node, self._pipeline, self._shape = node.id, _pipeline(node), node.chunks
+        self._stored, self._bytes = node.dtype, _bytes_of(node, node.chunks)
+
+    def read(self, offset: Offset) -> npt.NDArray[Any]:
+        """Read a chunk by the index of its first sample.
+
+        Raises
+        ------
+        InvalidInputError
+            If it is damaged, or unpacks to fewer bytes or more than a chunk has.
+        """
+        skipped, raw = self._node.read_direct_chunk(offset)
+        stages = {filter_id for i, filter_id in enumerate(self._pipeline) if not skipped & (1 << i)}
+        data = inflate(raw, self._bytes, offset) if _DEFLATE in stages else raw
+        if len(data) != self._bytes:
+            raise InvalidInputError(f"chunk {offset}: expected {self._bytes} bytes, got {len(data)}")
+        values = np.frombuffer(data, dtype=np.uint8)
+        if _SHUFFLE in stages:
+            values = _unshuffled(values.reshape(self._stored.itemsize, -1))
+        chunk: npt.NDArray[Any] = values.view(self._stored).reshape(self._shape)
+        return chunk.astype(self._stored.newbyteorder("="), copy=False)
+
+
+def _unshuffled(planes: ByteArray) -> ByteArray:
+    """Bytes of numbers one after the other, of their first bytes, their second bytes and so on."""
+    if planes.shape[0] not in (2, 4):
+        return np.ascontiguousarray(planes.T).reshape(-1)
+    # Bytes put together as numbers: many times as fast as a copy of single bytes.
+    whole: npt.NDArray[Any] = planes[-1].astype(f"<u{planes.shape[0]}")
+    for plane in planes[-2::-1]:
+        whole <<= 8
+        whole |= plane
+    numbers: ByteArray = whole.view(np.uint8)
+    return numbers
 
 
 def _steps(path: bytes) -> list[bytes]:

@@ -116,12 +116,10 @@ class FrameMatcher:
 
     def prepare(self, echo: Echo) -> ReadyFrame:
         """Equalise an echo and transform it for the coarse search."""
-        image = self.extractor.equalise(echo.intensity)
-        parts = None
-        if echo.analytic is not None:
-            floor = np.finfo(np.float32).tiny
-            gain = np.sqrt(image / np.maximum(echo.intensity, floor))
-            parts = np.stack([echo.analytic.real * gain, echo.analytic.imag * gain])
+        if echo.analytic is None:
+            image, parts = self.extractor.equalise(echo.intensity), None
+        else:
+            image, parts = self.extractor.equalise_echo(echo.analytic, echo.intensity)
         return ReadyFrame(image, self._coarse.spectrum(image), parts)
 
     def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:
