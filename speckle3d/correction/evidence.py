@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.geometry import components
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.kernels.steps import Readings, steps_of_readings
@@ -341,23 +342,15 @@ def _steps_at(
     first, second = (
         np.where(covered, each - sensor.time_offset_s, np.nan).ravel() for each in (first_s, second_s)
     )
-    samples, mounting = sensor.readings.world_from_sensor, sensor.sensor_from_image
-    assert mounting is not None
-    turned, moved = _components(samples)
-    mounting_turned, mounting_moved = _components(mounting)
-    steps = np.empty((first_s.size, 6))
-    readings = Readings(sensor.readings.time_s, turned, moved, mounting_turned, mounting_moved)
+    assert sensor.sensor_from_image is not None
+    mounting = components(sensor.sensor_from_image)
+    readings, steps = (
+        Readings(sensor.readings.time_s, *sensor.readings.components, *mounting),
+        np.empty((first_s.size, 6)),
+    )
     steps_of_readings(readings, centre_mm, first, second, steps)
     columns = 6 if isinstance(sensor, Tracker) else 3
     return steps.reshape(*first_s.shape, 6)[..., -columns:]
-
-
-def _components(poses: RigidTransform | Rotation) -> tuple[FloatArray, FloatArray]:
-    """Quaternions, scalar last, and translations; zero for rotations alone."""
-    if isinstance(poses, RigidTransform):
-        return np.ascontiguousarray(poses.rotation.as_quat()), np.ascontiguousarray(poses.translation)
-    xyzw = np.ascontiguousarray(poses.as_quat())
-    return xyzw, np.zeros((*xyzw.shape[:-1], 3))
 
 
 def _elevation(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
