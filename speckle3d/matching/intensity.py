@@ -266,5 +266,8 @@ def _in_turn(values: Complex64Array) -> Float32Array:
 
 def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
     """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
+    if frame.dtype == np.uint8 and frame.size > 256:
+        table = _decompress(np.arange(256, dtype=np.float32), signal)
+        return np.take(table, frame, out=borrowed(frame.shape, np.float32), mode="clip")
     decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
     return np.asarray(10 ** (decibel / 10), dtype=np.float32)
