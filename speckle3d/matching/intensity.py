@@ -21,7 +21,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.memory import borrowed
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
 from speckle3d.kernels.intensity import (
-    divide_by_mean,
     equalise_echo,
     local_mean,
     place_band,
@@ -145,9 +144,7 @@ class IntensityExtractor:
         if self.settings.equalise_mm == 0:
             return intensity
         mean, floor = self._local_mean(intensity)
-        equalised = borrowed(mean.shape, np.float32)
-        divide_by_mean(np.ascontiguousarray(intensity), mean, floor, equalised)
-        return equalised
+        return np.divide(intensity, np.maximum(mean, np.float32(floor), out=mean), out=mean)
 
     def equalise_echo(
         self, analytic: Complex64Array, intensity: Float32Array
