@@ -140,8 +140,8 @@ def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
         for k in range(samples):
             lateral[k] += entering[k] - np.float64(leaving[k])
     most = 0.0
-    for mean in largest:
-        most = max(most, mean)
+    for k in range(samples):
+        most = max(most, float(largest[k]))
     return _LEAST_MEAN * most + _TINY + not_finite
 
 
