@@ -344,4 +344,4 @@ def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool
 
 def _decibel(power: npt.ArrayLike) -> FloatArray:
     """Finite whatever comes in: nothing, and what is not a number, is far below everything."""
-    return np.asarray(10 * np.log10(np.clip(np.nan_to_num(power), 1e-38, 1e38)), dtype=float)
+    return np.asarray(10 * np.log10(np.fmin(np.fmax(power, 1e-38), 1e38)), dtype=float)
