@@ -125,19 +125,25 @@ def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chai
 
 def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bool:
     """Whether two chains are two answers, not one."""
-    step = one.sensor_from_image.inv() * other.sensor_from_image
-    angle = float(step.rotation.magnitude())
+    here, there = (chain.sensor_from_image.as_matrix() for chain in (one, other))
+    step = here[:3, :3].T @ there[:3, :3]
+    angle = _angle(step)
     if phantom.seen_as == "direction":
         # Half a turn about the image's z axis is the same to directions.
-        flipped = step.rotation * Rotation.from_rotvec([0.0, 0.0, np.pi])
-        return bool(min(angle, float(flipped.magnitude())) > _APART_RAD)
+        return min(angle, _angle(step * [-1.0, -1.0, 1.0])) > _APART_RAD
     right_down = points.pixels.max(axis=0)
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * right_down
-    here, there = (
-        c.sensor_from_image.apply(np.column_stack([corners * c.pixel_mm, np.zeros(4)])) for c in (one, other)
+    ours, theirs = (
+        (corners * chain.pixel_mm) @ matrix[:3, :2].T + matrix[:3, 3]
+        for chain, matrix in ((one, here), (other, there))
     )
-    far = float(np.linalg.norm(here - there, axis=1).max())
-    return angle > _APART_RAD or far > _APART * float(np.linalg.norm(right_down * one.pixel_mm))
+    far = float(np.linalg.norm(ours - theirs, axis=1).max())
+    return bool(angle > _APART_RAD or far > _APART * np.linalg.norm(right_down * one.pixel_mm))
+
+
+def _angle(rotation: FloatArray) -> float:
+    """Angle of a rotation matrix, shape (3, 3)."""
+    return float(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0)))
 
 
 def together(residuals: FloatArray, frame: IntArray) -> float:

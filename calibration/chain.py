@@ -20,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from calibration.wander import WanderingFit
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles, skew
+from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles
 from speckle3d.core.leastsquares import Fit
-from speckle3d.core.wander import WanderingFit
+from speckle3d.kernels.chain import chain_derivatives
 
 SeenAs = Literal["line", "direction", "dot"]
 
@@ -353,37 +354,27 @@ def residuals_and_jacobian(
     jacobian : ndarray, shape (n, r, 14)
         Their derivatives with respect to the parameters.
     """
-    probe, probe_turns = _turned(parameters[5:8])
-    target, target_turns = _turned(parameters[11:14])
-    flat = points.pixels * parameters[:2]
-    sensor = flat @ probe[:, :2].T + parameters[2:5]
-    world = np.einsum("nij,nj->ni", points.turns, sensor) + points.shifts_mm
     rows, offsets = phantom.vanishing(points)
-    in_sensor = rows @ target @ points.turns
-    jacobian = np.empty((*offsets.shape, len(CHAIN)))
-    jacobian[..., :2] = (in_sensor @ probe[:, :2]) * points.pixels[:, None]
-    jacobian[..., 2:5] = in_sensor
-    jacobian[..., 8:11] = rows
-    for k in range(3):
-        moved = flat @ probe_turns[k][:, :2].T
-        jacobian[..., 5 + k] = np.einsum("nri,ni->nr", in_sensor, moved)
-        jacobian[..., 11 + k] = np.einsum("nri,ni->nr", rows, world @ target_turns[k].T)
-    where = world @ target.T + parameters[8:11]
-    return np.einsum("nri,ni->nr", rows, where) - offsets, jacobian
+    values, jacobian = np.empty(offsets.shape), np.empty((*offsets.shape, len(CHAIN)))
+    chain_derivatives(
+        np.ascontiguousarray(parameters, dtype=float),
+        np.ascontiguousarray(points.pixels, dtype=float),
+        np.ascontiguousarray(points.turns),
+        np.ascontiguousarray(points.shifts_mm),
+        np.ascontiguousarray(rows),
+        np.ascontiguousarray(offsets),
+        np.arange(len(CHAIN)),
+        np.ones(offsets.shape),
+        values.reshape(-1),
+        jacobian.reshape(-1, len(CHAIN)),
+    )
+    return values, jacobian
 
 
 def free_jacobian(points: ImagePoints, phantom: Phantom, chain: Chain, free: Sequence[str]) -> FloatArray:
     """Derivatives by the free parameters in the sensor's and the world's own frames, shape (n r, p)."""
     _, jacobian = residuals_and_jacobian(chain.parameters(), points, phantom)
     return jacobian.reshape(-1, len(CHAIN))[:, [CHAIN.index(name) for name in free]]
-
-
-def _turned(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation by x-y-z fixed angles (alpha, beta, gamma), and its derivatives, shape (3, 3, 3)."""
-    x, y, z = skew(np.eye(3))
-    rotation = rotation_from_fixed_angles(*angles).as_matrix()
-    about_y = np.cos(angles[0]) * y - np.sin(angles[0]) * x
-    return rotation, np.stack([z @ rotation, about_y @ rotation, rotation @ x])
 
 
 def wrapped(angles_rad: npt.ArrayLike) -> FloatArray:

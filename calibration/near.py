@@ -5,11 +5,10 @@ There no fixed angle is near its singularity, wherever the sensor is mounted, an
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from calibration.chain import CHAIN, Chain, ImagePoints, Phantom, residuals_and_jacobian
+from calibration.chain import CHAIN, Chain, ImagePoints, Phantom
+from calibration.equations import BareChain, Equations, columns_of
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
 
@@ -18,32 +17,16 @@ def near_jacobian(
     points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """Residuals, shape (n r,), and Jacobian, (n r, p), in frames that lie on the image and on the phantom."""
-    near = replace(points, world_from_sensor=chain.target_from_image(points))
-    residuals, jacobian = residuals_and_jacobian(on_image(chain), near, phantom)
-    columns = [CHAIN.index(name) for name in free]
-    return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
+    bare = BareChain.of(chain)
+    return Equations.of(points, phantom).near(bare).derivatives(bare.on_image, columns_of(free))
 
 
 def moved_by(chain: Chain, free: tuple[str, ...], step: FloatArray) -> Chain:
     """Add a step in the free parameters, in frames that lie on the image and on the phantom."""
-    parameters = on_image(chain)
-    parameters[[CHAIN.index(name) for name in free]] += step
-    return moved_to(chain, parameters)
-
-
-def on_image(chain: Chain) -> FloatArray:
-    """Parameters of a chain in frames that lie on the image and on the phantom: zero but for pixel sizes."""
-    return np.concatenate([chain.pixel_mm, np.zeros(len(CHAIN) - 2)])
-
-
-def moved_to(chain: Chain, parameters: FloatArray) -> Chain:
-    """Replace the parameters of `on_image` by others."""
-    step = Chain.from_parameters(parameters)
-    return Chain(
-        step.pixel_mm,
-        chain.sensor_from_image * step.sensor_from_image,
-        step.target_from_world * chain.target_from_world,
-    )
+    bare = BareChain.of(chain)
+    parameters = bare.on_image
+    parameters[columns_of(free)] += step
+    return bare.moved_to(parameters).chain
 
 
 def corners_moved(chain: Chain, points: ImagePoints) -> FloatArray:

@@ -13,12 +13,11 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from calibration.chain import CHAIN, Chain, ImagePoints, Phantom, residuals_and_jacobian
-from calibration.near import corners_moved, on_image
+from calibration.chain import CHAIN, Chain, ImagePoints, Phantom
+from calibration.equations import BareChain, Equations, columns_of
+from calibration.near import corners_moved
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.leastsquares import levenberg_marquardt
 
@@ -81,15 +80,13 @@ class _Rise:
         free: tuple[str, ...],
         step: FloatArray,
     ) -> None:
-        near = replace(points, world_from_sensor=chain.target_from_image(points))
-        columns = np.array([CHAIN.index(name) for name in free])
-        origin = on_image(chain)
+        bare, columns = BareChain.of(chain), columns_of(free)
+        near, origin = Equations.of(points, phantom).near(bare), bare.on_image
 
         def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
             full = origin.copy()
             full[columns] += x
-            residuals, jacobian = residuals_and_jacobian(full, near, phantom)
-            return residuals.ravel(), jacobian.reshape(-1, len(CHAIN))[:, columns]
+            return near.derivatives(full, columns)
 
         self._at, self._step = at, step
         self._here, jacobian = at(np.zeros(len(free)))

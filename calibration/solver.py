@@ -6,13 +6,12 @@ frames that contradict the others are left out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
 from calibration.chain import (
-    CHAIN,
     POSE,
     PROBE,
     SCALES,
@@ -22,9 +21,8 @@ from calibration.chain import (
     Phantom,
     PixelPrior,
     free_jacobian,
-    residuals_and_jacobian,
 )
-from calibration.near import moved_to, on_image
+from calibration.equations import BareChain, Equations, columns_of
 from calibration.profile import widened
 from calibration.wandering import settle
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
@@ -55,6 +53,7 @@ _RESIZED = 0.1
 """And they change pixel sizes by a few percent."""
 _FREE_ROUNDS = 5
 """After so many rounds, frames may be dropped but not taken back, so that the rounds end."""
+_TOLERANCE = 1e-9
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
 
@@ -98,12 +97,12 @@ def solve_chain(
         chain = settled
     if phantom.determined:
         # Where the phantom is, as the readings say on average: what wanders is not in its place.
-        chain, _, _ = refined(points[used], phantom, chain, phantom.determined)
+        chain, _ = refined(points[used], phantom, chain, phantom.determined)
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit, _ = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
+    _, fit = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
     return ChainSolution(
         chain,
         phantom,
@@ -128,20 +127,22 @@ def agreed(
     prior: PixelPrior | None = None,
 ) -> tuple[Chain, BoolArray]:
     """Least squares of the frames that do not contradict the others, and which points those are."""
-    chain = first_guess(points, phantom, start, at_first(free, prior))
-    residuals = residuals_of(points, phantom, chain)
+    equations = Equations.of(points, phantom)
+    chain = _first_guess(equations, BareChain.of(start), at_first(free, prior))
+    residuals = equations.residuals(chain)
     used = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals))
+    in_rows = phantom.seen_as == "line"
     round_ = 0
     while True:
         _require_majority(used, points)
         sigma = sigma_of(residuals[used])
-        chain, _, _ = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
-        residuals = residuals_of(points, phantom, chain)
+        chain, _ = _refined(equations[used], chain, free, None, _TOLERANCE, prior, sigma, in_rows)
+        residuals = equations.residuals(chain)
         agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals[used]))
         if round_ >= _FREE_ROUNDS:
             agreeing &= used
         if (agreeing == used).all():
-            return chain, used
+            return chain.chain, used
         used, round_ = agreeing, round_ + 1
 
 
@@ -180,20 +181,26 @@ def first_guess(
     rounds: int = _REWEIGHTINGS,
 ) -> Chain:
     """Nearly least absolute residuals, by reweighting at most so often, so that wrong frames pull little."""
+    return _first_guess(Equations.of(points, phantom), BareChain.of(start), free, rounds).chain
+
+
+def _first_guess(
+    equations: Equations, start: BareChain, free: tuple[str, ...], rounds: int = _REWEIGHTINGS
+) -> BareChain:
     chain, before = start, np.inf
     for _ in range(rounds):
-        size = np.abs(residuals_of(points, phantom, chain))
+        size = np.abs(equations.residuals(chain))
         if size.mean() > _SETTLED * before:
             break
         before = size.mean()
         weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
-        chain, _, _ = refined(points, phantom, chain, free, weights, tolerance=1e-3)
+        chain, _ = _refined(equations, chain, free, weights, tolerance=1e-3)
     return chain
 
 
 def residuals_of(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatArray:
     """Return what does not vanish in the phantom's frame, shape (n, r)."""
-    return residuals_and_jacobian(chain.parameters(), points, phantom)[0]
+    return Equations.of(points, phantom).residuals(BareChain.of(chain))
 
 
 def refined(
@@ -201,48 +208,75 @@ def refined(
     phantom: Phantom,
     chain: Chain,
     free: tuple[str, ...],
-    weights: FloatArray | None = None,
-    tolerance: float = 1e-9,
     prior: PixelPrior | None = None,
     sigma: float = 1.0,
-) -> tuple[Chain, Fit, FloatArray]:
+) -> tuple[Chain, Fit]:
     """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
 
     There all angles start at zero: far from where fixed angles become singular, and well scaled. The prior's
     deviations are weighed against residuals of standard deviation `sigma`, and follow them in the fit.
     """
-    near = replace(points, world_from_sensor=chain.target_from_image(points))
-    columns = np.array([CHAIN.index(name) for name in free])
-    origin = on_image(chain)
-    scale = 1.0 if weights is None else weights
-    in_rows = phantom.seen_as == "line" and prior is not None
+    equations, in_rows = Equations.of(points, phantom), phantom.seen_as == "line"
+    found, fit = _refined(equations, BareChain.of(chain), free, None, _TOLERANCE, prior, sigma, in_rows)
+    return found.chain, fit
 
-    @lru_cache(maxsize=2)
-    def at(x: bytes) -> tuple[FloatArray, FloatArray]:
+
+def _refined(
+    equations: Equations,
+    chain: BareChain,
+    free: tuple[str, ...],
+    weights: FloatArray | None = None,
+    tolerance: float = _TOLERANCE,
+    prior: PixelPrior | None = None,
+    sigma: float = 1.0,
+    in_rows: bool = False,
+) -> tuple[BareChain, Fit]:
+    """`refined` on bare arrays, each equation times its weight, shape (n, r)."""
+    near, columns, origin = equations.near(chain), columns_of(free), chain.on_image
+    scale = np.ones(equations.offsets.shape) if weights is None else weights
+
+    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         full = origin.copy()
-        full[columns] = np.frombuffer(x)
-        values, jacobian = residuals_and_jacobian(full, near, phantom)
-        kept = jacobian[:, :, columns] * (scale if weights is None else weights[:, :, None])
-        kept, values = kept.reshape(-1, len(columns)), (values * scale).ravel()
+        full[columns] = x
+        values, jacobian = near.derivatives(full, columns, scale)
+        if prior is None:
+            return values, jacobian
         if in_rows:
             # Lines err by rows: in millimetres, an image that shrinks to nothing would leave no residual.
             larger = full[1] / origin[1]
-            kept, values = kept / larger, values / larger
-            kept[:, free.index("s_y")] -= values / full[1]
-        if prior is None:
-            return values, kept
+            jacobian, values = jacobian / larger, values / larger
+            jacobian[:, free.index("s_y")] -= values / full[1]
         extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
-        return np.append(values, sigma * prior.deviation(full[:2])), np.vstack([kept, extra])
+        return np.append(values, sigma * prior.deviation(full[:2])), np.vstack([jacobian, extra])
 
-    def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return at(x.tobytes())
-
-    fit = levenberg_marquardt(
-        lambda x: both(x)[0].copy(), origin[columns], lambda x: both(x)[1].copy(), free, tolerance=tolerance
-    )
+    both = _Remembered(at)
+    fit = levenberg_marquardt(both.values, origin[columns], both.jacobian, free, tolerance=tolerance)
     found = origin.copy()
     found[columns] = fit.parameters
-    return moved_to(chain, found), fit, both(fit.parameters)[1]
+    return chain.moved_to(found), fit
+
+
+class _Remembered:
+    """Residuals and derivatives at the last two places: MINPACK asks for one, then for the other."""
+
+    def __init__(self, at: Callable[[FloatArray], tuple[FloatArray, FloatArray]]) -> None:
+        self._at = at
+        self._places: list[tuple[bytes, tuple[FloatArray, FloatArray]]] = []
+
+    def _look(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        key = x.tobytes()
+        for place, both in self._places:
+            if place == key:
+                return both
+        both = self._at(x)
+        self._places = [(key, both), *self._places[:1]]
+        return both
+
+    def values(self, x: FloatArray) -> FloatArray:
+        return self._look(x)[0].copy()
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        return self._look(x)[1].copy()
 
 
 def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:

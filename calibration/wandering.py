@@ -20,9 +20,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.chain import SCALES, Chain, ImagePoints, Phantom, PixelPrior
 from calibration.near import moved_by, near_jacobian
+from calibration.wander import JITTER, SensorError, WanderingFit, attributed, wandering_fit
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.geometry import skew
-from speckle3d.core.wander import JITTER, SensorError, WanderingFit, attributed, wandering_fit
 
 _STEPS = 3
 """The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
@@ -142,7 +142,11 @@ def _corrected(
         @ (chain.sensor_from_image.rotation.as_matrix()[:, :2])
     )
     # The smallest displacement in the image, mm, that explains what is left to it.
-    moved_mm = np.einsum("nkr,nr->nk", np.linalg.pinv(in_image), image.reshape(-1, several))
+    if several == 1:  # a batch of pseudo-inverses takes as long as all else
+        square = np.maximum(np.sum(in_image**2, axis=2), np.finfo(float).tiny)
+        moved_mm = in_image[:, 0] * (image[:, None] / square)
+    else:
+        moved_mm = np.einsum("nkr,nr->nk", np.linalg.pinv(in_image), image.reshape(-1, several))
     corrected = replace(points, world_from_sensor=poses, pixels=points.pixels - moved_mm / chain.pixel_mm)
     effect = sensor_error(corrected, phantom, chain).effects
     taken = np.einsum("mk,mk->m", effect, sensor) + np.einsum("nrk,nk->nr", in_image, moved_mm).ravel()

@@ -17,7 +17,7 @@ from speckle3d.correction.trust import believed, cleaned_readings, examine_senso
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import speckle_size
+from speckle3d.matching.texture import SpeckleSizes, speckle_size
 from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.curve_doubts import DepthFactors, doubt_curves, doubt_speed
 from speckle3d.motion.estimate import PairReader
@@ -29,6 +29,7 @@ def doubts_of_curves(
     sweep: Sweep,
     curves: DecorrelationCurves,
     matcher: FrameMatcher,
+    sizes: SpeckleSizes,
     reader: PairReader,
     factors: DepthFactors,
     flags: IntArray,
@@ -37,7 +38,7 @@ def doubts_of_curves(
     path: FloatArray,
 ) -> tuple[Doubt, ...]:
     """What a sweep's own speckle says against the curves; raises if it refutes them."""
-    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
+    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0), sizes)
     found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
     return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
 

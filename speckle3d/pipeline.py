@@ -36,7 +36,7 @@ from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import doubt_images
+from speckle3d.matching.texture import SpeckleSizes, doubt_images
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import DepthFactors, doubt_depths, doubt_widths
 from speckle3d.motion.curve_prior import RowsSeen, rows_seen, straightened
@@ -185,8 +185,9 @@ def track(
     )
 
     # RF -> intensity -> in-plane motion -> patch correlation
+    sizes = SpeckleSizes(sweep, matcher, images)
     found = match_sweep(
-        sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
+        sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep, matched
     )
     flags = _flagged(sweep, found, settings)
 
@@ -199,7 +200,9 @@ def track(
         # What stands still would be blamed on the curves.
         doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
         factors = reader.depth_factors(found.table, path, sound, settings.coherence)
-        doubts += doubts_of_curves(sweep, curves, matcher, reader, factors, flags, pairs, coherence, path)
+        doubts += doubts_of_curves(
+            sweep, curves, matcher, sizes, reader, factors, flags, pairs, coherence, path
+        )
 
     # -> curves of the lens that the depths of the images agree on, and everything read with them
     mismatch, given = curves.mismatch(settings.curves.same_probe), curves

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, leastsq
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -19,6 +20,9 @@ from speckle3d.core.errors import InvalidInputError
 Residuals = Callable[[FloatArray], FloatArray]
 
 _MOST_EVALUATIONS = 200
+
+_CONVERGED = (1, 2, 3, 4)
+"""What MINPACK returns if it stopped because of a tolerance."""
 
 _ROUNDING = 1e-9
 """Standard deviation below which the residuals of robust fits are rounding errors."""
@@ -37,20 +41,29 @@ class Fit:
     names : tuple of str, length n
     residuals : ndarray, shape (m,)
         At the solution, as given by the caller (weighted if the caller weighted).
-    covariance : ndarray, shape (n, n)
-        Of the parameters, from the Jacobian at the solution and the residual variance; directions the
-        data do not determine have infinite variance on every parameter they touch.
-    condition_number : float
-        Of the Jacobian (`condition_number`).
+    jacobian : ndarray, shape (m, n)
+        At the solution.
     """
 
     parameters: FloatArray
     names: tuple[str, ...]
     residuals: FloatArray
-    covariance: FloatArray
-    condition_number: float
+    jacobian: FloatArray
     evaluations: int
     converged: bool
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of the parameters, shape (n, n), from the Jacobian at the solution and the residual variance.
+
+        Directions the data do not determine have infinite variance on every parameter they touch.
+        """
+        return _covariance(self.jacobian, self.residuals)
+
+    @cached_property
+    def condition_number(self) -> float:
+        """Of the Jacobian (`condition_number`)."""
+        return condition_number(self.jacobian)
 
     @property
     def rms(self) -> float:
@@ -99,26 +112,40 @@ def levenberg_marquardt(
     if not np.isfinite(r0).all():
         raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
     labels = tuple(names) if names else tuple(f"p{i}" for i in range(x0.size))
-    found = least_squares(
-        residuals,
-        x0,
-        jac=jacobian if jacobian is not None else "2-point",
-        method="lm",
-        x_scale="jac",
-        xtol=tolerance,
-        ftol=tolerance,
-        gtol=tolerance,
-        max_nfev=_MOST_EVALUATIONS,
-    )
-    jac = np.asarray(found.jac)
+    if jacobian is not None:
+        # As `least_squares` with method "lm", which calls the same MINPACK three times as slowly.
+        x, _, info, _, status = leastsq(
+            residuals,
+            x0,
+            Dfun=jacobian,
+            full_output=True,
+            ftol=tolerance,
+            xtol=tolerance,
+            gtol=tolerance,
+            maxfev=_MOST_EVALUATIONS,
+        )
+        values, evaluations, converged = info["fvec"], info["nfev"], status in _CONVERGED
+        slopes = jacobian(x)
+    else:
+        found = least_squares(
+            residuals,
+            x0,
+            method="lm",
+            x_scale="jac",
+            xtol=tolerance,
+            ftol=tolerance,
+            gtol=tolerance,
+            max_nfev=_MOST_EVALUATIONS,
+        )
+        x, values, slopes = found.x, found.fun, np.asarray(found.jac)
+        evaluations, converged = found.nfev, found.success
     return Fit(
-        parameters=found.x,
+        parameters=np.asarray(x),
         names=labels,
-        residuals=found.fun,
-        covariance=_covariance(jac, found.fun),
-        condition_number=condition_number(jac),
-        evaluations=int(found.nfev),
-        converged=bool(found.success),
+        residuals=np.asarray(values),
+        jacobian=np.array(slopes, dtype=float),
+        evaluations=int(evaluations),
+        converged=bool(converged),
     )
 
 

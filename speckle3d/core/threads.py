@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _SLICES_PER_CORE = 4
 """So that a core that has done its own share takes from another's."""
 _LIMITS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
+_SPENT: ContextVar[list[float] | None] = ContextVar("spent", default=None)
 _pool: ThreadPoolExecutor | None = None
 
 
@@ -43,11 +50,38 @@ def cores() -> int:
     return max(1, min([allowed, *limits]))
 
 
-def pool() -> ThreadPoolExecutor:
-    """Return the threads that all of the process shares, one for each processor."""
+@contextmanager
+def counting_seconds() -> Iterator[list[float]]:
+    """Gather the processor time that is spent inside by this thread and those that help it, s."""
+    spent: list[float] = []
+    token, began = _SPENT.set(spent), time.thread_time()
+    try:
+        yield spent
+    finally:
+        spent.append(time.thread_time() - began)
+        _SPENT.reset(token)
+
+
+def _helping(work: Callable[[], Result]) -> Callable[[], Result]:
+    """Make work fit for another thread: in the context of this one, which is told the time it takes."""
+    spent, context = _SPENT.get(), copy_context()
+
+    def run() -> Result:
+        began = time.thread_time()
+        try:
+            return context.run(work)
+        finally:
+            if spent is not None:
+                spent.append(time.thread_time() - began)
+
+    return run
+
+
+def _others() -> ThreadPoolExecutor:
+    """Return the threads that all of the process shares: fewer by one than cores: callers work, too."""
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(max(2, os.cpu_count() or 1), "speckle3d")
+        _pool = ThreadPoolExecutor(max(1, cores() - 1), "speckle3d")
     return _pool
 
 
@@ -80,7 +114,7 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
                 return
             function(first, min(first + size, count))
 
-    others = [pool().submit(copy_context().run, work) for _ in range(threads - 1)]
+    others = [_others().submit(_helping(work)) for _ in range(threads - 1)]
     try:
         work()
     finally:
@@ -88,6 +122,53 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
         wait(begun)
     for other in begun:
         other.result()
+
+
+def ahead(function: Callable[[Item], Result], items: Iterable[Item], most: int = 3) -> Generator[Result]:
+    """Yield what a function makes of items, in order, `most` of them worked out before they are asked for.
+
+    Other threads work ahead; this one helps while it would have to wait. On one core nothing is done ahead.
+    """
+    if cores() == 1:
+        yield from map(function, items)
+        return
+    waiting: deque[_Ahead[Item, Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(_Ahead(function, item))
+            if len(waiting) > most:
+                yield _first_of(waiting)
+        while waiting:
+            yield _first_of(waiting)
+    finally:
+        wait([each.future for each in waiting if not each.future.cancel()])
+
+
+class _Ahead(Generic[Item, Result]):
+    """The result for one item, which whoever comes first makes."""
+
+    def __init__(self, function: Callable[[Item], Result], item: Item) -> None:
+        self._function, self._item = function, item
+        self.future: Future[Result] = _others().submit(copy_context().run, function, item)
+
+    def begin_here(self) -> bool:
+        """Make the result on this thread, unless it is made or being made."""
+        if not self.future.cancel():
+            return False
+        self.future = Future()
+        try:
+            self.future.set_result(self._function(self._item))
+        except BaseException as error:  # noqa: BLE001 (raised when its turn comes)
+            self.future.set_exception(error)
+        return True
+
+
+def _first_of(waiting: deque[_Ahead[Item, Result]]) -> Result:
+    first = waiting.popleft()
+    first.begin_here()
+    while not first.future.done() and any(each.begin_here() for each in waiting):
+        pass
+    return first.future.result()
 
 
 def _forget() -> None:

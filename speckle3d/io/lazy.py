@@ -19,7 +19,8 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
-from speckle3d.io.hdf5_guard import is_filtered, is_only_deflated, require_whole_chunk, unpacked
+from speckle3d.io.hdf5_guard import is_filtered, require_whole_chunk
+from speckle3d.io.inflate import Unpacker, is_only_deflated
 
 Slices: TypeAlias = Sequence[npt.NDArray[Any]]
 Turn: TypeAlias = Callable[[Slices], npt.NDArray[Any]]
@@ -158,7 +159,8 @@ class _Part:
         self._node, self._on_disk = data.id, data.id.get_space()
         self._in_memory = h5py.h5s.create_simple(self._shape or (1,))
         self._kind = h5py.h5t.py_create(self._dtype)
-        self._unpacks = self._axis == 0 and data.chunks == (1, *self._shape) and is_only_deflated(data)
+        unpacks = self._axis == 0 and data.chunks == (1, *self._shape) and is_only_deflated(data)
+        self._unpacker = Unpacker(data) if unpacks else None
         # Chunks that no filter made were looked at when the data set was found.
         self._checks = data.chunks is not None and is_filtered(data)
         self._checked: set[tuple[int, ...]] = set()
@@ -166,8 +168,8 @@ class _Part:
     def read(self, i: int) -> npt.NDArray[Any]:
         if self._axis is not None:
             self._start[self._axis] = i
-        if self._unpacks:
-            whole: npt.NDArray[Any] = unpacked(self._data, tuple(self._start))[0]
+        if self._unpacker:
+            whole: npt.NDArray[Any] = self._unpacker.read(tuple(self._start))[0]
             return whole
         if self._checks:
             self._check_chunks(i, self._data.chunks)

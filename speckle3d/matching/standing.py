@@ -15,6 +15,7 @@ import numpy as np
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.threads import ahead
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 from speckle3d.matching.patches import PatchGrid
 
@@ -34,9 +35,11 @@ def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -
         Of power, or with images of intensity of its variation; of either sign and about zero where nothing
         stays. NaN where there is no echo.
     """
-    echoes = [
-        _normalised(matcher.prepare(matcher.echo(sweep.frames[frame])), matcher.patches) for frame in frames
-    ]
+
+    def look(frame: int) -> Float32Array:
+        return _normalised(matcher.prepare(matcher.echo(sweep.frames[frame])), matcher.patches)
+
+    echoes = list(ahead(look, frames))
     shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(echoes, 2)]
     return np.asarray(np.median(shared, axis=0), dtype=float)
 

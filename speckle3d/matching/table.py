@@ -31,8 +31,7 @@ class MatchedPair:
     @classmethod
     def of(cls, match: PatchMatch) -> MatchedPair:
         """Keep what later stages need."""
-        known = match.correlation[np.isfinite(match.correlation)]
-        return cls(match.correlation, float(np.median(known)) if known.size else 0.0, match.motion)
+        return cls(match.correlation, match.median, match.motion)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core import threads
-from speckle3d.core.threads import cores, in_parallel, on_one_thread
+from speckle3d.core.threads import ahead, cores, counting_seconds, in_parallel, on_one_thread
 
 
 @pytest.fixture(autouse=True)
@@ -61,3 +61,44 @@ def test_workers_of_a_cluster_and_the_environment_limit_the_threads(monkeypatch)
     with on_one_thread():
         assert cores() == 1
     assert cores() >= 1
+
+
+def test_results_made_ahead_come_in_order_and_not_too_many_of_them():
+    begun = []
+
+    def slowest_first(item):
+        begun.append(item)
+        threading.Event().wait(0.002 * (8 - item))
+        return 10 * item
+
+    results = ahead(slowest_first, range(8), most=3)
+    assert next(results) == 0
+    assert max(begun) <= 4
+    assert list(results) == [10 * item for item in range(1, 8)]
+
+
+def test_an_error_made_ahead_is_raised_in_its_turn():
+    results = ahead(lambda item: 1 / (item - 2), range(5))
+    assert [next(results), next(results)] == [-0.5, -1.0]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_work_ahead_stops_where_no_more_is_asked_for():
+    made = []
+    results = ahead(made.append, range(100), most=2)
+    next(results)
+    results.close()
+    assert len(made) <= 4
+
+
+def test_seconds_of_helping_threads_count():
+    def busy(first, stop):
+        for _ in range(first, stop):
+            np.sort(np.random.default_rng(0).random(100_000))
+
+    with counting_seconds() as alone:
+        busy(0, 8)
+    with counting_seconds() as shared:
+        in_parallel(busy, 8)
+    assert sum(shared) > 0.5 * sum(alone)

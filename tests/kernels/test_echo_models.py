@@ -40,12 +40,12 @@ def exact_bins(distance, rho, each=40.0):
 
 def fit(bins, scales=(1.0,), stretches=STRETCHES, lengths=LENGTHS_MM, of_echo=True, gain_precision=0.0):
     scales = np.array(scales)
-    shape = (scales.size, len(bins), stretches.size, lengths.size)
+    shape = (len(bins), scales.size, stretches.size, lengths.size)
     cost, found = np.empty(shape), np.empty((*shape, 2))
     table = np.tile(amplitude(GRID_MM), (len(bins), 1))
     curves = PatchCurves(table, STEP_MM, np.full(len(bins), CELLS), of_echo)
-    fit_echo_models(bins, scales, stretches, lengths, curves, 20.0, gain_precision, cost, found)
-    return cost, found
+    fit_echo_models(bins, scales, stretches, lengths, curves, 20.0, gain_precision, 0, len(bins), cost, found)
+    return cost.swapaxes(0, 1), found.swapaxes(0, 1)
 
 
 DISTANCE_MM = np.linspace(0.05, 2.5, 50)

@@ -23,6 +23,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
+from speckle3d.kernels.wander import COMPONENTS, LANES, attribute, innovations
 
 WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
@@ -42,6 +43,9 @@ recording, which looks like a straight line."""
 
 _NEGLIGIBLE = 1e-4
 """Weight over the largest below which a size and a time have no say."""
+
+_ROUNDED = 1e-18
+"""Weight over the largest below which it adds nothing to a sum."""
 
 _SINGULAR = 1e-15
 """Ratio of eigenvalues below which a direction counts as not determined."""
@@ -165,20 +169,25 @@ def wandering_fit(
     normal, log_determinant = _innovations(columns, error.effects, starts, time_s, grid)
     matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
     free = max(len(residuals) - len(scale), 1)
-    inverse = np.linalg.pinv(matrix, rcond=_SINGULAR, hermitian=True)
-    left = np.maximum(energy - np.einsum("gi,gij,gj->g", pull, inverse, pull), 0.0)
+    sizes, axes = np.linalg.eigh(matrix)
+    along = np.einsum("gij,gi->gj", axes, pull)
+    known_sizes = np.where(sizes > _SINGULAR * sizes[:, -1:], sizes, np.inf)
+    left = np.maximum(energy - (along**2 / known_sizes).sum(axis=1), 0.0)
     variance = np.maximum(left / free, _SMALLEST**2)
-    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=_SINGULAR, hermitian=True)
-    back = np.zeros(len(scale)) if excess is None else known @ (excess * scale)
-    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
-    sizes = np.linalg.eigvalsh(matrix)
     volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
     weight = grid.prior * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
-    step = weight @ steps
+    # Points of the grid whose weight is lost in rounding need no answer.
+    some = weight > _ROUNDED * weight.max()
+    back = np.zeros(len(scale)) if excess is None else known @ (excess * scale)
+    precision = matrix[some] / variance[some, None, None] + known
+    spread = np.linalg.pinv(precision, rcond=_SINGULAR, hermitian=True)
+    steps = -np.einsum("gij,gj->gi", spread, pull[some] / variance[some, None] + back)
+    share = weight[some]
+    step = share @ steps
     apart = steps - step
-    covariance = np.einsum("g,gij->ij", weight, spread) + np.einsum("g,gi,gj->ij", weight, apart, apart)
+    covariance = np.einsum("g,gij->ij", share, spread) + (share * apart.T) @ apart
     wandering = weight * (grid.wander > 0)
     time = float(np.exp(wandering @ np.log(grid.time_s) / wandering.sum())) if wandering.sum() > 0 else np.nan
     return WanderingFit(
@@ -210,15 +219,17 @@ def attributed(
     image : ndarray, shape (m,)
         What is left for the image.
     """
-    sensor, image = np.zeros_like(error.effects), np.zeros_like(residuals)
+    sensor, image = np.empty(error.effects.shape), np.empty(residuals.shape)
     starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
-    least = max(fit.white, _SMALLEST) ** 2
-    for first, last in zip(starts, [*starts[1:], len(group)], strict=True):
-        effect = error.effects[first:last]
-        total = (effect * fit.spread) @ effect.T + least * np.eye(last - first)
-        pull = np.linalg.solve(total, residuals[first:last])
-        sensor[first:last] = fit.spread * (pull @ effect)
-        image[first:last] = least * pull
+    attribute(
+        np.ascontiguousarray(residuals),
+        np.ascontiguousarray(error.effects),
+        np.append(starts, len(group)),
+        np.ascontiguousarray(fit.spread),
+        max(fit.white, _SMALLEST) ** 2,
+        sensor,
+        image,
+    )
     return sensor, image
 
 
@@ -248,31 +259,36 @@ def _innovations(
     columns: FloatArray, effects: FloatArray, starts: IntArray, time_s: FloatArray, grid: _Grid
 ) -> tuple[FloatArray, FloatArray]:
     """Products of the columns' innovations, (g, p + 1, p + 1), and logarithms of their variance, (g,)."""
-    count, k = grid.unit.shape
-    stationary = grid.unit * (grid.wander**2)[:, None]
-    shaken = grid.unit * (grid.jitter**2)[:, None]
-    diagonal = np.arange(k)
-    variance = np.zeros((count, k, k))
-    variance[:, diagonal, diagonal] = stationary
-    expected = np.zeros((count, k, columns.shape[1]))
-    normal = np.zeros((count, columns.shape[1], columns.shape[1]))
-    log_determinant = np.zeros(count)
-    before = time_s[starts[0]]
-    for first, last in zip(starts, [*starts[1:], len(columns)], strict=True):
-        kept = np.exp(-max(time_s[first] - before, 0.0) / grid.time_s)
-        before = time_s[first]
-        variance *= (kept**2)[:, None, None]
-        variance[:, diagonal, diagonal] += (1.0 - kept**2)[:, None] * stationary
-        expected *= kept[:, None, None]
-        effect = effects[first:last]
-        seen = effect @ variance
-        total = seen @ effect.T + (effect * shaken[:, None]) @ effect.T + np.eye(last - first)
-        root = np.linalg.cholesky(total)
-        both = np.linalg.solve(root, np.concatenate([columns[first:last] - effect @ expected, seen], axis=2))
-        whitened, gain = both[:, :, : columns.shape[1]], both[:, :, columns.shape[1] :]
-        across = np.swapaxes(gain, 1, 2)
-        expected += across @ whitened
-        variance -= across @ gain
-        normal += np.swapaxes(whitened, 1, 2) @ whitened
-        log_determinant += 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    return normal, log_determinant
+    count, wide = len(grid.time_s), columns.shape[1]
+    blocks = -(-count // LANES)
+    padded = np.minimum(np.arange(blocks * LANES), count - 1)
+    moving = np.zeros((len(columns), COMPONENTS))
+    moving[:, : effects.shape[1]] = effects
+    unit = np.zeros((blocks * LANES, COMPONENTS))
+    unit[:, : effects.shape[1]] = grid.unit[padded]
+
+    def in_blocks(values: FloatArray) -> FloatArray:
+        return np.ascontiguousarray(np.swapaxes(values.reshape(blocks, LANES, -1), 1, 2))
+
+    pauses_s = np.maximum(np.diff(time_s[starts], prepend=time_s[starts[0]]), 0.0)
+    constants_s, which = np.unique(grid.time_s[padded], return_inverse=True)
+    kept = np.exp(-pauses_s[:, None] / constants_s)[:, which].T
+    stationary = unit * (grid.wander[padded] ** 2)[:, None]
+    shaken = unit * (grid.jitter[padded] ** 2)[:, None]
+    normal = np.empty((blocks, wide, wide, LANES))
+    log_determinant = np.empty((blocks, LANES))
+    given = (
+        np.ascontiguousarray(columns),
+        moving,
+        np.append(starts, len(columns)),
+        in_blocks(kept),
+        in_blocks(stationary),
+        in_blocks(shaken),
+    )
+
+    def some(first: int, stop: int) -> None:
+        innovations(*given, first, stop, normal, log_determinant)
+
+    some(0, blocks)
+    normal = np.moveaxis(normal, 3, 1).reshape(blocks * LANES, wide, wide)[:count]
+    return normal, log_determinant.ravel()[:count]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from speckle3d.core import wander
+from calibration import wander
+from calibration.wander import SensorError, attributed, wandering_fit
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.wander import SensorError, attributed, wandering_fit
 
 
 def drawn(rng, size, frames=60, several=2, spacing_s=0.2, constant_s=4.0):
