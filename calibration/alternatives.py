@@ -138,7 +138,7 @@ def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bo
         for chain, matrix in ((one, here), (other, there))
     )
     far = float(np.linalg.norm(ours - theirs, axis=1).max())
-    return bool(angle > _APART_RAD) or far > _APART * float(np.linalg.norm(right_down * one.pixel_mm))
+    return bool(angle > _APART_RAD or far > _APART * np.linalg.norm(right_down * one.pixel_mm))
 
 
 def _angle(rotation: FloatArray) -> float:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -53,9 +52,11 @@ class Estimate:
 
     def stepped(self, step: FloatArray, pivot_mm: FloatArray) -> Estimate:
         """Turn about a point of the image and displace it, in the image's own frame; then rescale."""
-        turn = Rotation.from_rotvec(step[:3])
-        shift = pivot_mm + step[3:6] - turn.apply(pivot_mm)
-        moved = self.sensor_from_image * RigidTransform.from_components(shift, turn)
+        # As one product of matrices: transforms check themselves, which takes as long as a small comparison.
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
+        matrix[:3, 3] = pivot_mm + step[3:6] - matrix[:3, :3] @ pivot_mm
+        moved = RigidTransform.from_matrix(self.sensor_from_image.as_matrix() @ matrix)
         return Estimate(moved, self.scales * (1.0 + step[6:8]))
 
 
@@ -175,13 +176,15 @@ def spread_patches(
     reach = (side - 1) * stride
     step = max(1.0, reach * (1.0 - overlap))
     starts = [np.unique(np.linspace(0, n - 1 - reach, int((n - 1 - reach) / step) + 1).round()) for n in size]
+    first, second = (start.astype(np.int64) for start in starts)
+    across, down = (start[:, None] + stride * np.arange(side) for start in (first, second))
     kept = []
     for image in images:
         there = np.isfinite(stack.images[image])
-        for a, b in product(starts[0].astype(int), starts[1].astype(int)):
-            if there[a : a + reach + 1 : stride, b : b + reach + 1 : stride].mean() > LEAST_SHARE:
-                kept.append((image, a, b))
-    return PatchGrid(np.array(kept, dtype=np.int64).reshape(-1, 3), (side, side), stride)
+        share = there[across[:, :, None, None], down[None, None]].mean(axis=(1, 3))
+        a, b = np.nonzero(share > LEAST_SHARE)
+        kept.append(np.column_stack([np.full(len(a), image), first[a], second[b]]))
+    return PatchGrid(np.concatenate(kept).astype(np.int64).reshape(-1, 3), (side, side), stride)
 
 
 def whole_images(stack: Stack, images: IntArray, spacing_mm: float) -> PatchGrid:

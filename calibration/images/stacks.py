@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
@@ -163,9 +163,33 @@ class Stack:
         # Frames count by the distance they stand for, so that a pause does not outweigh its neighbours.
         weight *= np.maximum(np.gradient(way), 1e-3 * way[-1] / len(way))
         weight /= weight.sum(axis=1, keepdims=True)
-        turn = Rotation.concatenate([centre.rotation.mean(row) for row in weight])
-        held = RigidTransform.from_components(weight @ centre.translation, turn)
-        return Stack(_weighted(self.images, weight), self.pixels, held * to_centre.inv())
+        held = RigidTransform.from_components(weight @ centre.translation, mean_rotations(centre, weight))
+        return Stack(self._weighted(weight), self.pixels, held * to_centre.inv())
+
+    @cached_property
+    def _shown(self) -> tuple[Float32Array, BoolArray]:
+        """Images with zero where they show nothing, and where they show something, both of shape (n, u v)."""
+        flat = self.images.reshape(len(self), -1)
+        there = np.isfinite(flat)
+        return np.where(there, flat, np.float32(0.0)), there
+
+    @cached_property
+    def _same_everywhere(self) -> bool:
+        """Whether all images show something in the same places."""
+        there = self._shown[1]
+        return bool(there.all(axis=0).sum() + (~there).all(axis=0).sum() == there.shape[1])
+
+    def _weighted(self, weight: FloatArray) -> Float32Array:
+        """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
+        filled, there = self._shown
+        share = weight.astype(np.float32)
+        total = share @ filled
+        if self._same_everywhere:
+            mean = np.where(there[0], total, np.float32(np.nan))
+        else:
+            seen = share @ there.astype(np.float32)
+            mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
+        return np.asarray(mean.reshape(len(weight), *self.images.shape[1:]), dtype=np.float32)
 
 
 def read_stack(
@@ -223,15 +247,8 @@ def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:
     return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)
 
 
-def _weighted(images: Float32Array, weight: FloatArray) -> Float32Array:
-    """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
-    flat = images.reshape(len(images), -1)
-    there = np.isfinite(flat)
-    share = weight.astype(np.float32)
-    total = share @ np.where(there, flat, np.float32(0.0))
-    if there.all(axis=0).sum() + (~there).all(axis=0).sum() == flat.shape[1]:
-        mean = np.where(there[0], total, np.float32(np.nan))
-    else:
-        seen = share @ there.astype(np.float32)
-        mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
-    return np.asarray(mean.reshape(len(weight), *images.shape[1:]), dtype=np.float32)
+def mean_rotations(poses: RigidTransform, weights: FloatArray) -> Rotation:
+    """`Rotation.mean` for many rows of weights, shape (k, n), at once."""
+    quaternions = poses.rotation.as_quat()
+    products = np.einsum("ni,nj->nij", quaternions, quaternions).reshape(-1, 16)
+    return Rotation.from_quat(np.linalg.eigh((weights @ products).reshape(-1, 4, 4))[1][:, :, -1])

@@ -19,7 +19,8 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
-from speckle3d.io.hdf5_guard import Unpacker, is_filtered, is_only_deflated, require_whole_chunk
+from speckle3d.io.hdf5_guard import is_filtered, require_whole_chunk
+from speckle3d.io.inflate import Unpacker, is_only_deflated
 
 Slices: TypeAlias = Sequence[npt.NDArray[Any]]
 Turn: TypeAlias = Callable[[Slices], npt.NDArray[Any]]

@@ -37,7 +37,7 @@ def place_band(spectrum: Float32Array, weights: Float32Array, runs: IntArray, ou
             done += count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def place_band_of_real(
     spectrum: Float32Array, here: Float32Array, mirrored: Float32Array, runs: IntArray, out: Float32Array
 ) -> None:
@@ -54,24 +54,25 @@ def place_band_of_real(
     bins = spectrum.shape[1] // 2
     for row in range(out.shape[0]):
         out[row] = 0.0
-        z, x = spectrum[row], out[row]
         done = 0
         for r in range(runs.shape[0]):
             first, to, count = runs[r, 0], runs[r, 1], runs[r, 2]
+            z = spectrum[row, 2 * first : 2 * (first + count)]
+            mirror = spectrum[row, 2 * (bins - first - count + 1) : 2 * (bins - first + 1)]
+            x = out[row, 2 * to : 2 * (to + count)]
+            a, b = here[2 * done : 2 * (done + count)], mirrored[2 * done : 2 * (done + count)]
             for k in range(count):
-                a_real, a_imaginary = z[2 * (first + k)], z[2 * (first + k) + 1]
-                b_real, b_imaginary = z[2 * (bins - first - k)], -z[2 * (bins - first - k) + 1]
-                c_real, c_imaginary = here[2 * (done + k)], here[2 * (done + k) + 1]
-                d_real, d_imaginary = mirrored[2 * (done + k)], mirrored[2 * (done + k) + 1]
-                x[2 * (to + k)] = (
-                    a_real * c_real
-                    - a_imaginary * c_imaginary
-                    + (b_real * d_real - b_imaginary * d_imaginary)
+                j = count - 1 - k
+                real, imaginary = mirror[2 * j], -mirror[2 * j + 1]
+                x[2 * k] = (
+                    z[2 * k] * a[2 * k]
+                    - z[2 * k + 1] * a[2 * k + 1]
+                    + (real * b[2 * k] - imaginary * b[2 * k + 1])
                 )
-                x[2 * (to + k) + 1] = (
-                    a_real * c_imaginary
-                    + a_imaginary * c_real
-                    + (b_real * d_imaginary + b_imaginary * d_real)
+                x[2 * k + 1] = (
+                    z[2 * k] * a[2 * k + 1]
+                    + z[2 * k + 1] * a[2 * k]
+                    + (real * b[2 * k + 1] + imaginary * b[2 * k])
                 )
             done += count
 
@@ -107,7 +108,9 @@ def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
     wide, high = 2 * half[0] + 1, 2 * half[1] + 1
     lateral = np.zeros(samples)
     largest = np.zeros(samples, np.float32)
+    # Sums from the start of a vector whose ends are repeated, and the same from a window later.
     upto = np.zeros(samples + high)
+    later = upto[high:]
     scale = 1.0 / (wide * high)
     not_finite = 0.0
     for v in range(-half[0], half[0] + 1):
@@ -116,19 +119,20 @@ def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
             lateral[k] += entering[k]
     for row in range(rows):
         total = 0.0
+        before, inside, behind = upto[1:], upto[1 + half[1] :], upto[1 + half[1] + samples :]
         for k in range(half[1]):
             total += lateral[0]
-            upto[k + 1] = total
+            before[k] = total
         for k in range(samples):
             total += lateral[k]
-            upto[half[1] + k + 1] = total
+            inside[k] = total
         for k in range(half[1]):
             total += lateral[samples - 1]
-            upto[half[1] + samples + k + 1] = total
+            behind[k] = total
         not_finite += 0.0 * total
         target = out[row]
         for k in range(samples):
-            mean = np.float32((upto[k + high] - upto[k]) * scale)
+            mean = np.float32((later[k] - upto[k]) * scale)
             target[k] = mean
             largest[k] = mean if mean > largest[k] else largest[k]
         entering = image[min(row + half[0] + 1, rows - 1)]

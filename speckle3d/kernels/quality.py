@@ -53,9 +53,10 @@ def patch_statistics(image: Float32Array, first: IntArray, size: IntArray, out: 
                 stop = half_high if part == 0 else (high - half_high if part == 1 else high)
                 part_sum: Any = np.float32(0.0)
                 part_square: Any = np.float32(0.0)
-                for k in range(start, stop):
-                    part_sum += varying[k]
-                    part_square += varying[k] * varying[k]
+                piece = varying[start:stop]
+                for k in range(piece.size):
+                    part_sum += piece[k]
+                    part_square += piece[k] * piece[k]
                 sums[v, part], squares[v, part] = part_sum, part_square
             product: Any = np.float32(0.0)
             later = varying[high - half_high :]

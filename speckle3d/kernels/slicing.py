@@ -192,6 +192,7 @@ def compare_patches(
     f, g = np.empty(size), np.empty(size)
     rows = np.zeros((PARAMETERS, size if derivatives else 1))
     near = np.empty(source.images.shape[0], np.int64)
+    planes = np.empty((5, source.images.shape[0]))
     for p in range(patches.where.shape[0]):
         out.alike[p] = math.nan
         out.energy[p, 0] = out.energy[p, 1] = out.share[p] = 0.0
@@ -201,7 +202,9 @@ def compare_patches(
         n_near = _images_near(sample, source, patches, p, max_gap_mm, near)
         if n_near < 2:
             continue
-        n, wanted = _cut_patch(sample, source, patches, p, max_gap_mm, near[:n_near], f, g, rows, derivatives)
+        n, wanted = _cut_patch(
+            sample, source, patches, p, max_gap_mm, near[:n_near], planes, f, g, rows, derivatives
+        )
         out.share[p] = n / max(wanted, 1)
         if n < 6 or n < least_share * wanted:
             continue
@@ -259,17 +262,26 @@ def _cut_patch(
     p: int,
     max_gap_mm: float,
     near: IntArray,
+    planes: FloatArray,
     f: FloatArray,
     g: FloatArray,
     rows: FloatArray,
     derivatives: bool,
 ) -> tuple[int, int]:
-    """Fill levels of a patch (`f`), of its cut (`g`) and derivatives; return points found and wanted."""
+    """Fill levels of a patch (`f`), of its cut (`g`) and derivatives; return points found and wanted.
+
+    `planes`, shape (5, n), holds the planes of the images near the patch, and their distances from a point.
+    """
     slope, place = np.empty((2, 3)), np.empty((2, 3))
-    frame, distance, level = np.empty(2, np.int64), np.empty(2), np.empty(2)
+    frame, best, distance, level = np.empty(2, np.int64), np.empty(2, np.int64), np.empty(2), np.empty(2)
     k, u0, v0 = patches.where[p]
     pose, image, pixels, cut_pixels = sample.poses[k], sample.images[k], sample.pixels, source.pixels
     last_u, last_v = source.images.shape[1] - 1.0, source.images.shape[2] - 1.0
+    n_near = near.shape[0]
+    for index in range(n_near):
+        for c in range(4):
+            planes[c, index] = source.poses[near[index], 2, c]
+    away = planes[4]
     n = 0
     wanted = 0
     for a in range(patches.sides[0]):
@@ -284,24 +296,44 @@ def _cut_patch(
             wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 3]
             wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 3]
             wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 3]
+            for index in range(n_near):
+                away[index] = (
+                    planes[0, index] * wx + planes[1, index] * wy + planes[2, index] * wz + planes[3, index]
+                )
             distance[0] = distance[1] = max_gap_mm
+            best[0] = best[1] = -1
+            for index in range(n_near):
+                q = away[index]
+                if q >= 0.0:
+                    if q < distance[0]:
+                        distance[0], best[0] = q, index
+                elif -q < distance[1]:
+                    distance[1], best[1] = -q, index
             frame[0] = frame[1] = -1
-            for index in range(near.shape[0]):
-                j = near[index]
-                t = source.poses[j]
-                q = t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]
-                s = 0 if q >= 0.0 else 1
-                if abs(q) < distance[s]:
+            for s in range(2):
+                # The nearest image on this side that shows something there: mostly the first one tried.
+                while best[s] >= 0:
+                    t = source.poses[near[best[s]]]
                     px = t[0, 0] * wx + t[0, 1] * wy + t[0, 2] * wz + t[0, 3]
                     py = t[1, 0] * wx + t[1, 1] * wy + t[1, 2] * wz + t[1, 3]
                     su = (px - cut_pixels[2]) / cut_pixels[0]
                     sv = (py - cut_pixels[3]) / cut_pixels[1]
                     if 0.0 <= su <= last_u and 0.0 <= sv <= last_v:
-                        found, du, dv = bilinear(source.images[j], su, sv)
+                        found, du, dv = bilinear(source.images[near[best[s]]], su, sv)
                         if not math.isnan(found):
-                            distance[s], frame[s], level[s] = abs(q), j, found
+                            frame[s], level[s] = near[best[s]], found
                             slope[s, 0], slope[s, 1] = du / cut_pixels[0], dv / cut_pixels[1]
-                            place[s, 0], place[s, 1], place[s, 2] = px, py, q
+                            place[s, 0], place[s, 1], place[s, 2] = px, py, away[best[s]]
+                            break
+                    # That image is out of the choice, and the next nearest is tried.
+                    away[best[s]] = max_gap_mm
+                    distance[s], best[s] = max_gap_mm, -1
+                    for index in range(n_near):
+                        q = away[index] if s == 0 else -away[index]
+                        if (q > 0.0 or (q == 0.0 and s == 0)) and q < distance[s]:
+                            distance[s], best[s] = q, index
+                if frame[s] < 0:
+                    break
             if frame[0] < 0 or frame[1] < 0:
                 continue
             gap = distance[0] + distance[1]

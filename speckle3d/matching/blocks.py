@@ -237,7 +237,7 @@ class _BlockMatcher:
         for anchor in references[:SEARCHED]:
             found = self._matcher.search(self._ready[anchor], self._ready[frame])
             self._motion[frame] = compose(self._motion[anchor], found)
-            pairs = {first: self._match(first, frame) for first in references}
+            pairs = self._match(references, frame)
             if max(pair.median for pair in pairs.values()) >= self._settings.least_correlation:
                 break
         else:
@@ -245,13 +245,19 @@ class _BlockMatcher:
                 self._motion[frame] = self._motion[frame - 1]
         return pairs
 
-    def _match(self, first: int, second: int) -> MatchedPair:
-        fixed, moving = self._ready[first], self._ready[second]
-        start = compose(inverse(self._motion[first]), self._motion[second])
-        pair = MatchedPair.of(self._matcher.match(fixed, moving, start))
-        if second - first == 1 and pair.median >= self._settings.least_correlation:
-            self._motion[second] = compose(self._motion[first], pair.motion)
-        return pair
+    def _match(self, references: Sequence[int], frame: int) -> dict[int, MatchedPair]:
+        """Match a frame with its references, those after the frame before it from the motion found with that."""
+        before = frame - 1
+        split = references.index(before) + 1 if before in references else len(references)
+        pairs: dict[int, MatchedPair] = {}
+        for some in filter(None, (references[:split], references[split:])):
+            starts = [compose(inverse(self._motion[first]), self._motion[frame]) for first in some]
+            fixed = [self._ready[first] for first in some]
+            found = self._matcher.match_with_each(fixed, self._ready[frame], starts)
+            pairs.update({first: MatchedPair.of(match) for first, match in zip(some, found, strict=True)})
+            if some[-1] == before and pairs[before].median >= self._settings.least_correlation:
+                self._motion[frame] = compose(self._motion[before], pairs[before].motion)
+        return pairs
 
     def _lead_in(self, first: int) -> None:
         """Find the key frames before a block, going back from it no farther than a block is long.

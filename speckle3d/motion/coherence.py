@@ -94,14 +94,18 @@ class Coherence:
     scale: FloatArray
     scale_sigma: float
 
-    def models(self, frame: FloatArray, distance_mm: FloatArray) -> list[EchoModel]:
+    def models(self, frame: FloatArray, distance_mm: FloatArray) -> EchoModel:
         """Echo models of pairs about given frames and so far apart, both of shape (e,)."""
+        at = np.clip(frame, self.frame[0], self.frame[-1])
+        before = np.searchsorted(self.frame, at, side="right") - 1
+        after, width = (at - self.frame[before])[:, None], np.diff(self.frame)[:, None]
         share, gain, stretch, decay = (
-            np.stack([np.interp(frame, self.frame, column) for column in values.T], axis=1)
-            for values in (self.share, self.gain, self.stretch, self.decay_per_mm)
+            np.concatenate([np.diff(v, axis=0) / width, np.zeros((1, v.shape[1]))])[before] * after
+            + v[before]
+            for v in (self.share, self.gain, self.stretch, self.decay_per_mm)
         )
         staying = share * np.exp(-np.abs(distance_mm)[:, None] * decay)
-        return [EchoModel(*one) for one in zip(staying, 1 - share, gain, stretch, strict=True)]
+        return EchoModel(staying, 1 - share, gain, stretch)
 
 
 def scale_sigma(coherence: Coherence | None) -> float:

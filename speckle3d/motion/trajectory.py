@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +12,8 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.relative import RelativePoses
 from speckle3d.kernels.graph import PoseGraph, marginals, relax
-from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import TrajectorySettings
-from speckle3d.motion.planes import PairPlane
+from speckle3d.motion.planes import PairPlanes
 
 SETTLED = 1e-7
 ROUNDS = 6
@@ -26,26 +24,35 @@ KNOWN_FRAMES = 80
 
 
 def relative_poses_of(
-    first: Sequence[int],
-    second: Sequence[int],
-    motions: Sequence[InPlaneMotion],
-    planes: Sequence[PairPlane],
-    signs: Sequence[float],
+    first: IntArray,
+    second: IntArray,
+    inplane: FloatArray,
+    inplane_covariance: FloatArray,
+    planes: PairPlanes,
+    sign: FloatArray,
 ) -> RelativePoses:
-    """Relative poses from in-plane motion and signed planes."""
-    a, b, c = (np.array([p.coefficients for p in planes]) * np.asarray(signs)[:, None]).T
+    """Relative poses from in-plane motion and signed planes.
+
+    Parameters
+    ----------
+    first, second : ndarray of int, shape (e,)
+    inplane, inplane_covariance : ndarray, shape (e, 3) and (e, 3, 3)
+        As of `CorrelationTable`.
+    planes : PairPlanes
+    sign : ndarray, shape (e,)
+    """
+    a, b, c = (planes.coefficients * sign[:, None]).T
     yaw = -np.arcsin(np.clip(b, -1, 1))
     tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
-    x, y, roll = np.array([(m.x_mm, m.y_mm, m.roll_rad) for m in motions]).T
+    x, y, roll = inplane.T
     rotation = rotation_from_fixed_angles(roll, yaw, tilt)
     poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
     covariance = np.zeros((len(planes), 6, 6))
-    inplane = [m.covariance if m.covariance is not None else np.eye(3) for m in motions]
-    covariance[:, [[0], [1], [5]], [0, 1, 5]] = np.array(inplane) + np.diag(INPLANE_FLOOR)
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = inplane_covariance + np.diag(INPLANE_FLOOR)
     # (a, b, c) is (z, -yaw, tilt) for small angles.
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
-    covariance[:, 2:5, 2:5] = order @ np.array([p.covariance for p in planes]) @ order.T
-    return RelativePoses(np.asarray(first), np.asarray(second), poses, covariance)
+    covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T
+    return RelativePoses(first, second, poses, covariance)
 
 
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
