@@ -218,6 +218,60 @@ def bin_by_distance(rho, offset_mm, slope, lateral_mm, edges_mm):
     return out
 
 
+def echo_model(bins, scale, stretch, length_mm, curves, redundancy, gain_precision):
+    """Twin of `speckle3d.kernels.coherence.fit_echo_models` for one patch and model: cost, share and gain."""
+    amplitude, step_mm, cells, of_echo = curves
+    n, d, rho, square = bins[bins[:, 0] > 0].T
+    d, mean, spread = d / n, rho / n, square / n - (rho / n) ** 2
+    at = np.minimum(d * scale / stretch / step_mm, amplitude.size - 1 - 1e-6)
+    g = np.interp(at, np.arange(amplitude.size), amplitude)
+    h = np.exp(-d * scale / length_mm) if length_mm > 0 else np.zeros_like(d)
+    share, gain = 0.1 if length_mm > 0 else 0.0, 1.0
+    for _ in range(8):
+        echo = share * h + (1 - share) * g
+        model = gain * echo**2
+        seen = np.minimum(model, 1.0)
+        variance = (1 - seen) ** 2 / cells * (2 * seen + 1 / cells if of_echo else (1 + seen) ** 2) + 1e-3
+        weight = n / (variance * redundancy)
+        cost = (weight * ((mean - model) ** 2 + spread)).sum() + (n * np.log(variance)).sum() / redundancy
+        if length_mm < 0:
+            break
+        cost += gain_precision * (gain - 1) ** 2
+        jacobian = np.stack([2 * gain * echo * (h - g), echo**2])
+        normal = (jacobian * weight) @ jacobian.T + np.diag([0.1, gain_precision])
+        pull = (jacobian * weight) @ (mean - model) - [0.0, gain_precision * (gain - 1)]
+        if length_mm == 0:
+            normal[0], normal[:, 0], pull[0] = [1.0, 0.0], [1.0, 0.0], 0.0
+        step = 0.8 * np.linalg.solve(normal, pull)
+        moved = np.clip([share + step[0], gain + step[1]], [0.0, 0.1], [0.97, 1.03])
+        if np.abs(moved - [share, gain]).sum() < 2e-3:
+            break
+        share, gain = moved
+    return cost, share, gain
+
+
+def pose_graph_step(poses, first, second, measured, information, huber):
+    """Twin of one round of `speckle3d.kernels.graph.relax`, dense: the normal equations and the gradient.
+
+    Parameters are exponential coordinates, rotation first, on the right of all poses but the first.
+    """
+    normal, gradient = 1e-9 * np.eye(6 * len(poses)), np.zeros(6 * len(poses))
+    for i, j, z, omega in zip(first, second, measured, information, strict=True):
+        relative = poses[i].inv() * poses[j]
+        error = (z.inv() * relative).as_exp_coords()
+        x, y, w = relative.inv().translation
+        turn = relative.inv().rotation.as_matrix()
+        carried = np.zeros((6, 6))
+        carried[:3, :3] = carried[3:, 3:] = turn
+        carried[3:, :3] = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]]) @ turn
+        weight = min(1.0, huber / max(np.sqrt(error @ omega @ error / 6), 1e-9))
+        jacobian = np.zeros((6, 6 * len(poses)))
+        jacobian[:, 6 * i : 6 * i + 6], jacobian[:, 6 * j : 6 * j + 6] = -carried, np.eye(6)
+        normal += weight * jacobian.T @ omega @ jacobian
+        gradient += weight * jacobian.T @ omega @ error
+    return normal[6:, 6:], gradient[6:]
+
+
 def edges_of_columns(samples, inside, sigma, threshold):
     """Twin of `calibration.detection.edges` by slope: each run of rows convolved alone, maxima by search.
 

@@ -112,20 +112,36 @@ class MotionEvidence:
         steps = steps_between(self.image[first], self.image[first + lag], self.centre_mm)
         return _Lag(first, first + lag, steps, (n - lag) / lag, lag * pause_s)
 
-    def agreements(
-        self, sensors: Sequence[OrientationSensor | Tracker], noise: FloatArray, still: bool = False
-    ) -> list[list[Agreement]]:
-        """How each sensor's steps fit, over each lag that it covers, at the sign that fits better.
+    def agreements(self, sensor: OrientationSensor | Tracker, noise: FloatArray) -> list[Agreement]:
+        """How a sensor's steps fit, over each lag that it covers, at the sign that fits better.
 
         Parameters
         ----------
-        sensors : sequence of OrientationSensor or Tracker
-            Calibrated to the image, read at the same times.
+        sensor : OrientationSensor or Tracker
+            Calibrated to the image.
         noise : ndarray, shape (6,)
             `noise_of` the sensor as it was recorded: a fault put right must not look better for being small.
+        """
+        signs = self._agreements([sensor], noise, False)
+        return [each[0] for each in signs[int(np.argmin([total_misfit(some)[0] for some in signs]))]]
+
+    def misfits(
+        self, sensors: Sequence[OrientationSensor | Tracker], noise: FloatArray, still: bool = False
+    ) -> FloatArray:
+        """Mean misfit of each of several sensors, that are read at the same times, as of its `agreements`.
+
+        Parameters
+        ----------
         still : bool
             Instead, how a sensor that does not move would fit.
         """
+        ahead, back = self._agreements(sensors, noise, still)
+        return np.minimum(total_misfit(ahead), total_misfit(back))
+
+    def _agreements(
+        self, sensors: Sequence[OrientationSensor | Tracker], noise: FloatArray, still: bool
+    ) -> tuple[list[Agreement], list[Agreement]]:
+        """Of all sensors, stacked, over each lag that they cover, if the probe moved forward, and back."""
         every = [self._sensed(sensor) for sensor in sensors]
         signs: tuple[list[Agreement], list[Agreement]] = [], []
         for number, lag in enumerate(self.lags):
@@ -134,10 +150,7 @@ class MotionEvidence:
                 both = self._both_signs(0.0 * sensed if still else sensed, noise, lag)
                 for agreements, agreement in zip(signs, both, strict=True):
                     agreements.append(agreement)
-        return [
-            min(([one[k] for one in agreements] for agreements in signs), key=total_misfit)
-            for k in range(len(every))
-        ]
+        return signs
 
     def delayed_misfits(
         self, sensor: OrientationSensor | Tracker, noise: FloatArray, delays_s: FloatArray
@@ -234,9 +247,9 @@ class MotionEvidence:
         return ahead, fit(forward * _MIRRORED[-columns:]) if self.by_images else ahead
 
 
-def total_misfit(agreements: list[Agreement]) -> float:
-    """Mean misfit over the lags, which share their information."""
-    return float(np.mean([each.misfit for each in agreements])) if agreements else 0.0
+def total_misfit(agreements: list[Agreement]) -> FloatArray:
+    """Mean misfit over the lags, which share their information; zero without any."""
+    return np.asarray(np.mean([each.misfit for each in agreements], axis=0) if agreements else np.zeros(1))
 
 
 def noise_of(sensor: OrientationSensor | Tracker, time_s: FloatArray, centre_mm: FloatArray) -> FloatArray:

@@ -225,7 +225,8 @@ class _Examination(Generic[Sensor]):
         self.about, self.seen = name_of(sensor), seen
         self.sensor: Sensor = sensor
         self.noise = noise_of(sensor, seen.time_s, seen.centre_mm)
-        (self.agreements,) = seen.agreements([sensor], self.noise)
+        self.agreements = seen.agreements(sensor, self.noise)
+        self.misfit = float(total_misfit(self.agreements).item())
         self.gyroscope = gyroscope_evidence(sensor) if isinstance(sensor, OrientationSensor) else None
 
     def doubts(self) -> Iterator[Doubt]:
@@ -279,11 +280,10 @@ class _Examination(Generic[Sensor]):
 
     def _gains(self, accused: Sequence[Suspect[Sensor]]) -> list[_Gain]:
         """What each fault, put right, would explain."""
-        given = total_misfit(self.agreements)
-        mended = self.seen.agreements([suspect.mended for suspect in accused], self.noise)
+        explained = self.misfit - self.seen.misfits([suspect.mended for suspect in accused], self.noise)
         return [
-            _Gain(suspect.name, given - total_misfit(agreements), self._turning(suspect.mended))
-            for suspect, agreements in zip(accused, mended, strict=True)
+            _Gain(suspect.name, float(gain), self._turning(suspect.mended))
+            for suspect, gain in zip(accused, np.broadcast_to(explained, len(accused)), strict=True)
         ]
 
     def _turning(self, mended: Sensor) -> float:
@@ -294,8 +294,7 @@ class _Examination(Generic[Sensor]):
         return 0.0 if evidence is None else self.gyroscope.misfit - evidence.misfit
 
     def _gain_of_still(self) -> float:
-        (still,) = self.seen.agreements([self.sensor], self.noise, still=True)
-        return total_misfit(self.agreements) - total_misfit(still)
+        return self.misfit - float(self.seen.misfits([self.sensor], self.noise, still=True)[0])
 
     def _mounting(self) -> tuple[_Gain, float]:
         """The rotation of the image on the sensor that fits best, and its angle, degrees."""

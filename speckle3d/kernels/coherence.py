@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import numpy as np
-from numba import njit
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import float64, int64, njit
+from numba.extending import intrinsic
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.statistics import PatchCurves, correlation_variance
@@ -22,6 +27,20 @@ _LANES = 8
 _LN2, _LN2_HIGH, _LN2_LOW = 0.6931471805599453, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _ROOT_HALF_BITS, _EXPONENT = 0x3FE6A09E667F3BCD, 52
 """Square root of a half as an integer, and where the exponent of a float64 begins."""
+
+
+def _as_integer(typing: Any, number: Any) -> Any:
+    return int64(float64), lambda context, builder, signature, args: builder.bitcast(args[0], ir.IntType(64))
+
+
+def _as_number(typing: Any, bits: Any) -> Any:
+    return float64(int64), lambda context, builder, signature, args: builder.bitcast(args[0], ir.DoubleType())
+
+
+_bits: Callable[[float], int] = cast(Any, intrinsic(_as_integer))
+"""A float64 as the integer of the same bits."""
+_number: Callable[[int], float] = cast(Any, intrinsic(_as_number))
+"""The float64 of an integer's bits."""
 
 
 @njit(cache=True, nogil=True)
@@ -104,57 +123,46 @@ def fit_echo_models(
     amplitude, step_mm, cells, of_echo = curves
     last = amplitude.shape[1] - 1
     room = (bins.shape[1] + _LANES - 1) // _LANES * _LANES
-    table, g, v, h = np.empty((4, room)), np.empty(room), np.empty(room), np.empty((lengths_mm.size, room))
+    weight, distance, mean, spread = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
+    g, h = np.empty(room), np.empty((lengths_mm.size, room))
     for e in range(first, stop):
         p = e % cells.size
-        size = _fill(bins[e], redundancy, table)
+        size = 0
+        for b in range(bins.shape[1]):
+            n = bins[e, b, 0]
+            if n > 0:
+                weight[size] = n / redundancy
+                distance[size] = bins[e, b, 1] / n
+                mean[size] = bins[e, b, 2] / n
+                spread[size] = bins[e, b, 3] / n - mean[size] ** 2
+                size += 1
+        while size % _LANES:
+            weight[size] = distance[size] = mean[size] = spread[size] = 0.0
+            size += 1
         for s in range(scales.size):
             for j in range(lengths_mm.size):
-                if lengths_mm[j] > 0.0:
-                    _decay(table[1], scales[s] / lengths_mm[j], size, h[j])
-                else:
-                    h[j] = 0.0
+                for b in range(size):
+                    h[j, b] = 0.0
+                    if lengths_mm[j] > 0.0:
+                        h[j, b] = _exponential(max(-distance[b] * (scales[s] / lengths_mm[j]), -700.0))
             for k in range(stretches.size):
                 ratio = scales[s] / stretches[k] / step_mm
                 for b in range(size):
-                    at = min(table[1, b] * ratio, last - 1e-6)
+                    at = min(distance[b] * ratio, last - 1e-6)
                     q = int(at)
                     g[b] = amplitude[p, q] + (at - q) * (amplitude[p, q + 1] - amplitude[p, q])
                 for j in range(lengths_mm.size):
-                    share, gain, new_share, new_gain, prior = 0.0, 1.0, 0.0, 1.0, 0.0
+                    share, gain, new_share, new_gain = 0.0, 1.0, 0.0, 1.0
                     if lengths_mm[j] > 0.0:
                         share, gain, new_share, new_gain = _fit_both(
-                            table[0], table[2], g, h[j], cells[p], of_echo, gain_precision, size
+                            weight, mean, g, h, j, cells[p], of_echo, gain_precision, size
                         )
                     elif lengths_mm[j] != NO_GAIN:
-                        gain, new_gain = _fit_gain(
-                            table[0], table[2], g, cells[p], of_echo, gain_precision, size
-                        )
-                    prior = gain_precision * (gain - 1.0) ** 2
-                    cost[e, s, k, j] = prior + _misfit(
-                        table, g, h[j], share, gain, cells[p], of_echo, size, v
+                        gain, new_gain = _fit_gain(weight, mean, g, cells[p], of_echo, gain_precision, size)
+                    cost[e, s, k, j] = gain_precision * (gain - 1.0) ** 2 + _misfit(
+                        weight, mean, spread, g, h, j, share, gain, cells[p], of_echo, size
                     )
                     found[e, s, k, j, 0], found[e, s, k, j, 1] = new_share, new_gain
-
-
-@njit(fastmath=_FAST, error_model="numpy")
-def _fill(bins: FloatArray, redundancy: float, table: FloatArray) -> int:
-    """Weight, distance, mean correlation and its variance of the bins that hold pairs; returns how many.
-
-    Their number is rounded up to whole lanes by bins without any weight.
-    """
-    size = 0
-    for b in range(bins.shape[0]):
-        n = bins[b, 0]
-        if n > 0:
-            table[0, size] = n / redundancy
-            table[1, size] = bins[b, 1] / n
-            table[2, size] = bins[b, 2] / n
-            table[3, size] = bins[b, 3] / n - table[2, size] ** 2
-            size += 1
-    whole = (size + _LANES - 1) // _LANES * _LANES
-    table[:, size:whole] = 0.0
-    return whole
 
 
 @njit(fastmath=_FAST, error_model="numpy")
@@ -163,6 +171,7 @@ def _fit_both(
     mean: FloatArray,
     g: FloatArray,
     h: FloatArray,
+    j: int,
     cells: float,
     of_echo: bool,
     gain_precision: float,
@@ -173,12 +182,13 @@ def _fit_both(
     for turn in range(_ROUNDS):
         cc, cg, gg, rc, rg = 0.1, 0.0, gain_precision, 0.0, -gain_precision * (gain - 1.0)
         for b in range(size):
-            echo = share * h[b] + (1.0 - share) * g[b]
-            model = gain * echo * echo
+            apart = h[j, b] - g[b]
+            echo = g[b] + share * apart
+            jg = echo * echo
+            model = gain * jg
             w = weight[b] / (_variance(min(model, 1.0), cells, of_echo) + _VARIANCE_FLOOR)
             left = mean[b] - model
-            jc = 2.0 * gain * echo * (h[b] - g[b])
-            jg = echo * echo
+            jc = 2.0 * gain * echo * apart
             cc += w * jc * jc
             cg += w * jc * jg
             gg += w * jg * jg
@@ -226,47 +236,51 @@ def _fit_gain(
 
 @njit(fastmath=_FAST, error_model="numpy")
 def _misfit(
-    table: FloatArray,
+    weight: FloatArray,
+    mean: FloatArray,
+    spread: FloatArray,
     g: FloatArray,
     h: FloatArray,
+    j: int,
     share: float,
     gain: float,
     cells: float,
     of_echo: bool,
     size: int,
-    v: FloatArray,
 ) -> float:
-    """Twice the negative log-likelihood; `v` is room to work in."""
+    """Twice the negative log-likelihood."""
     total = 0.0
     for b in range(size):
-        echo = share * h[b] + (1.0 - share) * g[b]
+        echo = g[b] + share * (h[j, b] - g[b])
         model = gain * echo * echo
-        left = table[2, b] - model
-        v[b] = _variance(min(model, 1.0), cells, of_echo) + _VARIANCE_FLOOR
-        total += table[0, b] / v[b] * (left * left + table[3, b])
-    # A logarithm without a call can be taken of many bins at once: 2 artanh((m - 1) / (m + 1)).
-    bits = v.view(np.int64)
-    for b in range(size):
-        power = (bits[b] - _ROOT_HALF_BITS) >> _EXPONENT
-        bits[b] -= power << _EXPONENT
-        t = (v[b] - 1.0) / (v[b] + 1.0)
-        q = t * t
-        series = 1 / 11 + q * (1 / 13 + q * (1 / 15 + q * (1 / 17 + q / 19)))
-        series = 1.0 + q * (1 / 3 + q * (1 / 5 + q * (1 / 7 + q * (1 / 9 + q * series))))
-        total += table[0, b] * (power * _LN2 + 2.0 * t * series)
+        left = mean[b] - model
+        v = _variance(min(model, 1.0), cells, of_echo) + _VARIANCE_FLOOR
+        total += weight[b] * ((left * left + spread[b]) / v + _logarithm(v))
     return total
 
 
+# Logarithm and exponential without a call: the processor can take them of many bins at once.
+
+
 @njit(fastmath=_FAST, error_model="numpy")
-def _decay(distance: FloatArray, rate: float, size: int, out: FloatArray) -> None:
-    """Fill `out` with exp(-rate distance) for what is not below zero, without a call, as `_misfit`."""
-    bits = out.view(np.int64)
-    for b in range(size):
-        x = -min(distance[b] * rate, 700.0)
-        power = np.floor(x / _LN2 + 0.5)
-        r = x - power * _LN2_HIGH - power * _LN2_LOW
-        series = 1.0
-        for term in (12.0, 11.0, 10.0, 9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0):
-            series = 1.0 + series * r / term
-        out[b] = series
-        bits[b] += np.int64(power) << _EXPONENT
+def _logarithm(x: float) -> float:
+    """Of a number above zero, by 2 artanh((m - 1) / (m + 1)) of its mantissa."""
+    bits = _bits(x)
+    power = (bits - _ROOT_HALF_BITS) >> _EXPONENT
+    m = _number(bits - (power << _EXPONENT))
+    t = (m - 1.0) / (m + 1.0)
+    q = t * t
+    series = 1 / 11 + q * (1 / 13 + q * (1 / 15 + q * (1 / 17 + q / 19)))
+    series = 1.0 + q * (1 / 3 + q * (1 / 5 + q * (1 / 7 + q * (1 / 9 + q * series))))
+    return float(power * _LN2 + 2.0 * t * series)
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _exponential(x: float) -> float:
+    """Of a number from -700 to 0, by the series for what powers of two leave."""
+    power = np.floor(x / _LN2 + 0.5)
+    r = x - power * _LN2_HIGH - power * _LN2_LOW
+    series = 1.0
+    for term in (12.0, 11.0, 10.0, 9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0):
+        series = 1.0 + series * r / term
+    return float(_number(_bits(series) + (int(power) << _EXPONENT)))

@@ -10,6 +10,8 @@ from numba import njit
 from speckle3d.core.arrays import FloatArray
 
 _STILL_RAD = 1e-12
+_Three = tuple[float, float, float]
+_Four = tuple[float, float, float, float]
 
 
 class Readings(NamedTuple):
@@ -50,73 +52,82 @@ def steps_of_readings(
     out : float64, shape (m, 6)
         x, y, z of the point, mm, and the rotation vector, degrees; NaN where a time is.
     """
-    q, p, u, v = np.empty((2, 4)), np.empty((2, 3)), np.empty(4), np.empty(3)
+    c = (centre_mm[0], centre_mm[1], centre_mm[2])
     for m in range(first_s.size):
         if np.isnan(first_s[m]) or np.isnan(second_s[m]):
             out[m] = np.nan
             continue
-        _pose_at(readings, first_s[m], q[0], p[0])
-        _pose_at(readings, second_s[m], q[1], p[1])
-        q[0, :3] = -q[0, :3]
-        # x = R1' (p2 + R2 c - p1) - c
-        _turn(q[1], centre_mm, v)
+        (x, y, z, w), before = _pose_at(readings, first_s[m])
+        second, after = _pose_at(readings, second_s[m])
+        back = (-x, -y, -z, w)
+        # R1' (p2 + R2 c - p1) - c
+        at = _turned(second, c)
+        at = _turned(
+            back,
+            (at[0] + after[0] - before[0], at[1] + after[1] - before[1], at[2] + after[2] - before[2]),
+        )
+        turn = _product(back, second)
+        norm = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+        angle = 2.0 * np.arctan2(norm, abs(turn[3]))
+        size = np.rad2deg(angle / norm if norm > _STILL_RAD else 2.0) * (-1.0 if turn[3] < 0.0 else 1.0)
         for k in range(3):
-            v[k] += p[1, k] - p[0, k]
-        _turn(q[0], v, out[m, :3])
-        for k in range(3):
-            out[m, k] -= centre_mm[k]
-        _multiply(q[0], q[1], u)
-        norm = np.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
-        angle = 2.0 * np.arctan2(norm, abs(u[3]))
-        size = np.rad2deg(angle / norm if norm > _STILL_RAD else 2.0) * (-1.0 if u[3] < 0.0 else 1.0)
-        for k in range(3):
-            out[m, 3 + k] = size * u[k]
+            out[m, k] = at[k] - c[k]
+            out[m, 3 + k] = size * turn[k]
 
 
 @njit(error_model="numpy")
-def _pose_at(readings: Readings, time_s: float, q: FloatArray, p: FloatArray) -> None:
+def _pose_at(readings: Readings, time_s: float) -> tuple[_Four, _Three]:
     """Rotation and place of the image at a time."""
     time, turned, moved = readings.time_s, readings.turned, readings.moved
     k = max(min(int(np.searchsorted(time, time_s)), time.size - 1), 1) - 1
-    after = min(k + 1, time.size - 1)
-    part = (time_s - time[k]) / (time[after] - time[k]) if after > k else 0.0
-    apart, across, along = 0.0, 0.0, 0.0
+    n = min(k + 1, time.size - 1)
+    part = (time_s - time[k]) / (time[n] - time[k]) if n > k else 0.0
+    alike, across, along = 0.0, 0.0, 0.0
     for j in range(4):
-        apart += turned[k, j] * turned[after, j]
-    side = -1.0 if apart < 0.0 else 1.0
+        alike += turned[k, j] * turned[n, j]
+    side = -1.0 if alike < 0.0 else 1.0
     for j in range(4):
-        across += (side * turned[after, j] - turned[k, j]) ** 2
-        along += (side * turned[after, j] + turned[k, j]) ** 2
+        across += (side * turned[n, j] - turned[k, j]) ** 2
+        along += (side * turned[n, j] + turned[k, j]) ** 2
     angle = 2.0 * np.arctan2(np.sqrt(across), np.sqrt(along))
-    before = 1.0 - part
+    a, b = 1.0 - part, side * part
     if angle > _STILL_RAD:
-        before, part_of_turn = np.sin(before * angle) / np.sin(angle), np.sin(part * angle) / np.sin(angle)
-    else:
-        part_of_turn = part
-    sensor = np.empty(4)
-    for j in range(4):
-        sensor[j] = before * turned[k, j] + side * part_of_turn * turned[after, j]
-    _multiply(sensor, readings.mounting_turned, q)
-    _turn(sensor, readings.mounting_moved, p)
-    for j in range(3):
-        p[j] += moved[k, j] + part * (moved[after, j] - moved[k, j])
+        a, b = np.sin(a * angle) / np.sin(angle), side * np.sin(part * angle) / np.sin(angle)
+    sensor = (
+        a * turned[k, 0] + b * turned[n, 0],
+        a * turned[k, 1] + b * turned[n, 1],
+        a * turned[k, 2] + b * turned[n, 2],
+        a * turned[k, 3] + b * turned[n, 3],
+    )
+    q, t = readings.mounting_turned, readings.mounting_moved
+    x, y, z = _turned(sensor, (t[0], t[1], t[2]))
+    place = (
+        x + moved[k, 0] + part * (moved[n, 0] - moved[k, 0]),
+        y + moved[k, 1] + part * (moved[n, 1] - moved[k, 1]),
+        z + moved[k, 2] + part * (moved[n, 2] - moved[k, 2]),
+    )
+    return _product(sensor, (q[0], q[1], q[2], q[3])), place
 
 
 @njit(error_model="numpy")
-def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
-    out[1] = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
-    out[2] = a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3]
-    out[3] = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]
+def _product(a: _Four, b: _Four) -> _Four:
+    """Of two quaternions."""
+    return (
+        a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
+        a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0],
+        a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3],
+        a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2],
+    )
 
 
 @njit(error_model="numpy")
-def _turn(q: FloatArray, v: FloatArray, out: FloatArray) -> None:
-    """Turn a vector by a unit quaternion."""
+def _turned(q: _Four, v: _Three) -> _Three:
+    """A vector turned by a unit quaternion."""
     x = 2.0 * (q[1] * v[2] - q[2] * v[1])
     y = 2.0 * (q[2] * v[0] - q[0] * v[2])
     z = 2.0 * (q[0] * v[1] - q[1] * v[0])
-    a = v[0] + q[3] * x + q[1] * z - q[2] * y
-    b = v[1] + q[3] * y + q[2] * x - q[0] * z
-    out[2] = v[2] + q[3] * z + q[0] * y - q[1] * x
-    out[0], out[1] = a, b
+    return (
+        v[0] + q[3] * x + q[1] * z - q[2] * y,
+        v[1] + q[3] * y + q[2] * x - q[0] * z,
+        v[2] + q[3] * z + q[0] * y - q[1] * x,
+    )

@@ -117,11 +117,14 @@ class FrameMatcher:
 
     def prepare(self, echo: Echo) -> ReadyFrame:
         """Equalise an echo and transform it for the coarse search."""
-        if echo.analytic is None:
-            image, parts = self.extractor.equalise(echo.intensity), None
-        else:
-            image, parts = self.extractor.equalise_echo(echo.analytic, echo.intensity)
+        image, parts = self.equalised(echo)
         return ReadyFrame(image, self._coarse.spectrum(image), parts)
+
+    def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array | None]:
+        """Intensity and, where there is phase, echo over their local mean; see `ReadyFrame`."""
+        if echo.analytic is None:
+            return self.extractor.equalise(echo.intensity), None
+        return self.extractor.equalise_echo(echo.analytic, echo.intensity)
 
     def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:
         """In-plane motion to the nearest sample, looked for over the whole search range."""

@@ -284,12 +284,13 @@ def _bins(signal: RFSettings, count: int) -> tuple[FloatArray, IntArray]:
 
 def _spectrum(sweep: Sweep, signal: RFSettings) -> tuple[FloatArray, FloatArray]:
     """Power by frequency, over all vectors of some frames."""
-    samples = sweep.grid.samples
+    # A few samples less make a transform of small factors several times as fast.
+    samples = fft.prev_fast_len(sweep.grid.samples, not signal.are_complex)
     frequency_hz, bins = _bins(signal, samples)
     window = np.hanning(samples).astype(np.float32)
     total = np.zeros(bins.size)
     for k in _spread(np.arange(len(sweep)), SPECTRA):
-        frame = sweep.frames[k] * window
+        frame = sweep.frames[k][:, :samples] * window
         spectrum = (fft.fft(frame, axis=1) if signal.are_complex else fft.rfft(frame, axis=1))[:, bins]
         total = total + (spectrum.real**2 + spectrum.imag**2).mean(axis=0)
     return frequency_hz, total
