@@ -52,6 +52,9 @@ class Tiles(Generic[Made]):
         self._kept: OrderedDict[tuple[int, int], _Tile[Made]] = OrderedDict()
         self._lock = Lock()
 
+    def __len__(self) -> int:
+        return len(self._kept)
+
     def __call__(self, indices: Iterable[tuple[int, int]]) -> list[Made]:
         """Return tiles; threads that need the same ones share the work of making them."""
         tiles = [self._tile(int(i), int(j)) for i, j in indices]
