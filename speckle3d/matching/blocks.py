@@ -11,12 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.sweep import Sweep
@@ -175,19 +171,12 @@ def match_block(
 
 @dataclass(frozen=True)
 class _MadeReady:
-    """A frame as read, its intensity, and what is kept of it."""
+    """What is made of a frame on the way to matching it."""
 
     number: int
-    frame: npt.NDArray[Any]
     intensity: Float32Array
     ready: ReadyFrame
     features: FrameFeatures
-
-    def repeats(self, before: npt.NDArray[Any] | None) -> bool:
-        """Whether the frame is bit for bit the one before; most differ in their first vector."""
-        if before is None:
-            return False
-        return np.array_equal(self.frame[0], before[0]) and np.array_equal(self.frame, before)
 
 
 class _BlockMatcher:
@@ -205,7 +194,6 @@ class _BlockMatcher:
         self._settings = trajectory
         self._inspector = FrameInspector(sweep.signal, matcher.patches, quality)
         self._schedule = PairSchedule(trajectory)
-        self._before: npt.NDArray[Any] | None = None
         self._ready: dict[int, ReadyFrame] = {}
         self._motion: dict[int, InPlaneMotion] = {}
 
@@ -215,9 +203,7 @@ class _BlockMatcher:
         else:
             self._motion[0] = InPlaneMotion()
         for made in self._made_ready(range(block.first, block.stop), images):
-            features = replace(made.features, identical=made.repeats(self._before))
-            self._before = made.frame
-            yield MatchedFrame(made.number, features, self._advance(made.number, made.ready))
+            yield MatchedFrame(made.number, made.features, self._advance(made.number, made.ready))
 
     def _advance(self, frame: int, ready: ReadyFrame) -> dict[int, MatchedPair]:
         """Match a frame with its references, and drop frames that are no longer needed."""
@@ -273,8 +259,6 @@ class _BlockMatcher:
         with closing(self._made_ready(back)) as earlier:
             for made in earlier:
                 frame = made.number
-                if self._before is None:
-                    self._before = made.frame
                 with self._times.of(MATCHING):
                     self._ready[frame] = made.ready
                     if frame < first - 1:
@@ -306,7 +290,7 @@ class _BlockMatcher:
             with self._times.of("intensity"):
                 echo = self._matcher.echo(frame)
                 features = self._inspector.inspect(frame, echo.intensity)
-                return _MadeReady(index, frame, echo.intensity, self._matcher.prepare(echo), features)
+                return _MadeReady(index, echo.intensity, self._matcher.prepare(echo), features)
 
         for made in ahead(make, numbers, AHEAD):
             if images:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -120,8 +121,8 @@ class QualitySettings(BaseModel):
 class FrameFeatures:
     """What is kept of a frame; r rows of patches."""
 
-    identical: bool
-    """Whether it is bit for bit the frame before."""
+    digest: int
+    """Of the samples as read: a frame that repeats the one before has the same."""
     clipped: float
     """Share of samples piled up at the frame's own extremes, over the share at which it is saturated."""
     samples_db: float
@@ -142,7 +143,7 @@ class FrameFeatures:
 
 
 class FrameInspector:
-    """Looks at the frames of one sweep, in order; remembers no more than a digest of the last one.
+    """Looks at the frames of one sweep, each by itself and in any order.
 
     Parameters
     ----------
@@ -159,10 +160,9 @@ class FrameInspector:
         self._columns = int(np.unique(patches.first[:, 0]).size)
         self._first, self._size = patches.first, patches.size
         self._pitch_mm = float(patches.spacing_mm[0])
-        self._last_digest: int | None = None
 
     def inspect(self, frame: npt.NDArray[Any], intensity: Float32Array) -> FrameFeatures:
-        """Describe one frame, and compare it with the one that was inspected before.
+        """Describe one frame.
 
         Parameters
         ----------
@@ -176,14 +176,6 @@ class FrameInspector:
         InvalidInputError
             If the intensity image does not hold the patches.
         """
-        digest = digest_of(frame)
-        self._last_digest, before = digest, self._last_digest
-        return self.features(frame, intensity, identical=digest == before)
-
-    def features(
-        self, frame: npt.NDArray[Any], intensity: Float32Array, identical: bool = False
-    ) -> FrameFeatures:
-        """Describe one frame as `inspect` does, whatever was inspected before."""
         samples = np.ascontiguousarray(frame)
         if np.iscomplexobj(samples):
             samples = samples.view(samples.real.dtype)
@@ -202,7 +194,7 @@ class FrameInspector:
             top = (self._first[0, 1] + self._size[1]) * samples.shape[1] // intensity.shape[1]
             below = some[:, top:].astype(np.float32)
             return FrameFeatures(
-                identical=identical,
+                digest=_digest(samples),
                 clipped=clipped,
                 samples_db=float(_decibel(np.mean(below * below))),
                 near_db=float(_decibel(near.mean())) if near.size else np.nan,
@@ -250,9 +242,9 @@ class FrameInspector:
         return echo & together & fine, echo & ~together, live
 
 
-def digest_of(frame: npt.NDArray[Any]) -> int:
-    """Digest of a frame bit for bit; of another frame the same once in four thousand million."""
-    return int(crc32(np.ascontiguousarray(frame).data))
+def _digest(samples: npt.NDArray[Any]) -> int:
+    """Digest bit for bit; of another frame the same once in four thousand million."""
+    return int(crc32(samples.data))
 
 
 def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | None = None) -> IntArray:
@@ -276,7 +268,8 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     noisy = np.array([f.noise_share > _NOISY for f in features])
     lifted = (few & noisy) | _darkened(features, few, ~saturated & ~few, s.drop_db)
     flags = np.zeros(len(features), dtype=np.int64)
-    flags[[f.identical for f in features]] |= FrameFlag.FROZEN
+    repeated = [frame.digest == before.digest for before, frame in pairwise(features)]
+    flags[1:][repeated] |= FrameFlag.FROZEN
     flags[saturated] |= FrameFlag.SATURATED
     flags[lifted] |= FrameFlag.LIFTED
     flags[few & ~lifted] |= FrameFlag.NO_SPECKLE
