@@ -78,6 +78,16 @@ def _refine(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _least(values: FloatArray, size: int) -> int:
+    """Where the least of the first values is, the first of equal ones."""
+    at = 0
+    for n in range(1, size):
+        if values[n] < values[at]:
+            at = n
+    return at
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def follow_paths(
     start: IntArray,
     first: IntArray,
@@ -124,7 +134,8 @@ def follow_paths(
         if pairs == 0:
             if rules.hold:
                 for h in range(kept):
-                    paths[h, f] = paths[h, f - 1]
+                    for k in range(2):
+                        paths[h, f, k] = paths[h, f - 1, k]
             continue
         here, moves = first[low : low + pairs], moved[low : low + pairs]
         latest = 0
@@ -163,7 +174,7 @@ def follow_paths(
                 total[n] = cost[h] + doubt
         size, found = 2 * pairs * kept, 0
         for _ in range(min(4 * count, size)):
-            n = np.argmin(total[:size])
+            n = _least(total, size)
             if not np.isfinite(total[n]) or found == count:
                 break
             parent = n // (2 * pairs)
@@ -177,7 +188,7 @@ def follow_paths(
                     turned = max(turned, abs(paths[parents[h], here[e], 1] - paths[parent, here[e], 1]))
                 same = same or (off < rules.same_mm and turned < rules.same_slope)
             if not same:
-                others[found, f] = place
+                others[found, f, 0], others[found, f, 1] = place[0], place[1]
                 parents[found], new_cost[found] = parent, total[n]
                 # Averaged over travel and not over time, so that a pause, whose steps have random signs,
                 # keeps it.
@@ -190,22 +201,26 @@ def follow_paths(
         if found == 0:
             continue
         # Of frames long past the best path so far stands.
-        leader = np.argmin(cost[:kept])
+        leader = _least(cost, kept)
         opened = max(settled, f - rules.open_frames)
         for g in range(settled, opened):
             for h in range(count):
                 if h != leader:
-                    paths[h, g] = paths[leader, g]
+                    for k in range(2):
+                        paths[h, g, k] = paths[leader, g, k]
         settled = opened
-        lowest = np.min(new_cost[:found])
+        lowest = new_cost[_least(new_cost, found)]
         for h in range(found):
             for g in range(settled, f):
-                others[h, g] = paths[parents[h], g]
+                for k in range(2):
+                    others[h, g, k] = paths[parents[h], g, k]
             cost[h], trend[h], left[h] = new_cost[h] - lowest, new_trend[h], new_left[h]
         for h in range(found):
             for g in range(settled, f + 1):
-                paths[h, g] = others[h, g]
+                for k in range(2):
+                    paths[h, g, k] = others[h, g, k]
         kept = found
-    leader = np.argmin(cost[:kept])
+    leader = _least(cost, kept)
     for f in range(frames):
-        best[f] = paths[leader, f]
+        for k in range(2):
+            best[f, k] = paths[leader, f, k]
