@@ -25,7 +25,7 @@ Buffers = tuple[Float32Array, Float32Array, Float32Array]
 @njit(cache=True, nogil=True)
 def _stride(size: IntArray, axial_radius: int) -> int:
     """Length of padded rows."""
-    return (size[1] + 2 * axial_radius + _LANES - 1) // _LANES * _LANES
+    return int((size[1] + 2 * axial_radius + _LANES - 1) // _LANES * _LANES)
 
 
 @njit(cache=True, nogil=True)
@@ -114,18 +114,24 @@ def _echo_sums(
     start: int,
     inside: Float32Array,
     end: int,
+    chunk: int,
 ) -> tuple[float, float, float]:
     """Real and imaginary part of the sum of conj(a) b, and of the power of b where `inside` is one."""
-    in_phase: Any = np.float32(0.0)
-    quadrature: Any = np.float32(0.0)
-    power: Any = np.float32(0.0)
+    in_phase, quadrature, power = 0.0, 0.0, 0.0
     behind = np.uint64(start)
-    for k in range(np.uint64(end)):
-        real, imaginary = b[behind + k], bi[behind + k]
-        in_phase += a[k] * real + ai[k] * imaginary
-        quadrature += a[k] * imaginary - ai[k] * real
-        power += inside[k] * (real * real + imaginary * imaginary)
-    return float(in_phase), float(quadrature), float(power)
+    for first in range(0, end, chunk):
+        some_in_phase: Any = np.float32(0.0)
+        some_quadrature: Any = np.float32(0.0)
+        some_power: Any = np.float32(0.0)
+        for k in range(np.uint64(first), np.uint64(min(first + chunk, end))):
+            real, imaginary = b[behind + k], bi[behind + k]
+            some_in_phase += a[k] * real + ai[k] * imaginary
+            some_quadrature += a[k] * imaginary - ai[k] * real
+            some_power += inside[k] * (real * real + imaginary * imaginary)
+        in_phase += some_in_phase
+        quadrature += some_quadrature
+        power += some_power
+    return in_phase, quadrature, power
 
 
 @njit(cache=True, nogil=True)
@@ -175,14 +181,15 @@ def turns(size: IntArray, axial_radius: int, ramp_rad: FloatArray) -> Float32Arr
     """Cosine and sine of a ramp's phase at the samples of a patch in `buffers`, shape (2, rows * stride)."""
     stride = _stride(size, axial_radius)
     out = np.empty((2, size[0] * stride), np.float32)
-    across, along = np.exp(1j * ramp_rad[0]), np.exp(1j * ramp_rad[1])
-    start = complex(1.0)
     for v in range(size[0]):
-        phase = start
+        # From the row's first sample on by the addition theorem: two operations for each, not two functions.
+        cosine, sine = np.cos(ramp_rad[0] * v), np.sin(ramp_rad[0] * v)
+        step_cosine, step_sine = np.cos(ramp_rad[1]), np.sin(ramp_rad[1])
         for k in range(v * stride, (v + 1) * stride):
-            out[0, k], out[1, k] = phase.real, phase.imag
-            phase *= along
-        start *= across
+            out[0, k], out[1, k] = cosine, sine
+            turned = cosine * step_cosine - sine * step_sine
+            sine = sine * step_cosine + cosine * step_sine
+            cosine = turned
     return out
 
 
@@ -221,7 +228,7 @@ def cohere_patch(
             out[i, j] = np.nan
     if rows <= 0 or width <= 0 or rows * width < least_overlap * size[0] * size[1]:
         return
-    end, inside = rows * stride, room[2]
+    end, chunk, inside = rows * stride, _TOGETHER * stride, room[2]
     a, ai, b, bi = room[0][0], room[0][1], room[1][0], room[1][1]
     corner = v0 + shift[0] - lateral, s0 + shift[1] - axial
     _copy(fixed[0], (v0, s0), rows, width, stride, a)
@@ -234,7 +241,7 @@ def cohere_patch(
         for j in range(out.shape[1]):
             if not corners and i != lateral and j != axial:
                 continue
-            in_phase, quadrature, other = _echo_sums(a, ai, b, bi, i * stride + j, inside, end)
+            in_phase, quadrature, other = _echo_sums(a, ai, b, bi, i * stride + j, inside, end, chunk)
             if power * other > 0.0:
                 out[i, j] = (in_phase**2 + quadrature**2) / (power * other)
 

@@ -16,6 +16,7 @@ LEAST_CORRELATION = 0.05
 REFERENCES = 8
 """Frames that `match_pairs` is given; the last may be repeated."""
 _HUBER, _ROUNDS = 1.5, 5
+_NOWHERE = np.iinfo(np.int64).max
 _LEAST_PATCHES = 6
 _COLLINEAR = 1e-10
 """Ratio of the least to the largest variance of places below which they lie on a line; on a grid of a hundred
@@ -58,7 +59,7 @@ class Matches(NamedTuple):
     correlation : float64, shape (m, p)
     shift_mm : float64, shape (m, p, 2)
     motion : float64, shape (m, 4, 3)
-        Displacement of the centre, mm, and roll, rad; in the rows after, their covariance if they were fitted.
+        Displacement of the centre, mm, and roll, rad; in the rows after their covariance, if fitted.
     median : float64, shape (m,)
         Of the correlations that are finite; zero if none is.
     fitted, settled : bool, shape (m,)
@@ -108,19 +109,19 @@ def finite_median(values: FloatArray, spare: FloatArray) -> float:
             count += 1
     if count == 0:
         return 0.0
-    upper = select(spare, count, count // 2)
+    upper = float(select(spare, count, count // 2))
     if count % 2:
         return upper
-    lower = spare[0]
+    lower = float(spare[0])
     for k in range(1, count // 2):
-        lower = max(lower, spare[k])
+        lower = max(lower, float(spare[k]))
     return 0.5 * (lower + upper)
 
 
 @njit(cache=True, nogil=True)
 def _sound(rho: FloatArray) -> bool:
     """Whether a patch's logarithms carry: the corners, which weigh little, may be lower."""
-    for k in range(3):
+    for k in range(3):  # noqa: SIM110 (compiled; NaN does not count)
         if rho[1, k] <= LEAST_CORRELATION or rho[k, 1] <= LEAST_CORRELATION:
             return False
     return True
@@ -129,7 +130,7 @@ def _sound(rho: FloatArray) -> bool:
 @njit(cache=True, nogil=True)
 def _at_least(value: float) -> float:
     """Value limited from below for its logarithm; NaN stays."""
-    return LEAST_CORRELATION if value < LEAST_CORRELATION else value
+    return float(LEAST_CORRELATION if value < LEAST_CORRELATION else value)
 
 
 @njit(cache=True, nogil=True)
@@ -269,11 +270,11 @@ def _determined(at: FloatArray, count: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _displaced(motion: FloatArray, at_mm: FloatArray, out: FloatArray) -> None:
+def _displaced(x_mm: float, y_mm: float, roll_rad: float, at_mm: FloatArray, out: FloatArray) -> None:
     """Where each place of the first frame is found in the second, less itself."""
-    c, s = np.cos(motion[2]), np.sin(motion[2])
+    c, s = np.cos(roll_rad), np.sin(roll_rad)
     for p in range(at_mm.shape[0]):
-        x, y = at_mm[p, 0] - motion[0], at_mm[p, 1] - motion[1]
+        x, y = at_mm[p, 0] - x_mm, at_mm[p, 1] - y_mm
         out[p, 0] = c * x + s * y - at_mm[p, 0]
         out[p, 1] = c * y - s * x - at_mm[p, 1]
 
@@ -322,9 +323,9 @@ def _fit(
     lateral, axial = np.empty((3, 3)), np.empty((3, 3))
     _robust_fit(at, data[0], total, count, room[5:], field[0], lateral)
     _robust_fit(at, data[1], total, count, room[5:], field[1], axial)
-    motion[1:] = 0.0
-    motion[1, 0] = lateral[0, 0]
-    motion[2:, 1:] = axial[:2, :2]
+    motion[1, 0], motion[1, 1], motion[1, 2] = lateral[0, 0], 0.0, 0.0
+    for i in range(2):
+        motion[2 + i, 0], motion[2 + i, 1], motion[2 + i, 2] = 0.0, axial[i, 0], axial[i, 1]
     # The centre's shift is seen in the second image's axes; its displacement is told in the first's. Roll
     # comes from axial shifts alone. Off focus the wavefront is curved, so a turn in the plane moves speckle
     # laterally about the focus rather than about the probe: lateral shifts understate it by a fifth and more.
@@ -365,11 +366,13 @@ def match_pairs(
     predicted, weight, room = np.empty((patches, 2)), np.empty(patches), np.empty((8, max(patches, 9)))
     lag, changed = np.empty((patches, 2), np.int64), np.empty(patches, np.bool_)
     rho, field, patch_room = np.empty((patches, 3, 3)), np.empty((2, 3)), buffers(size, 1, 1)
+    ramp_rad = np.empty(2)
     for m in range(begin, stop):
         fixed, shift, motion = images[m - begin], matches.shift_mm[m], matches.motion[m]
-        start = motion[0].copy()
-        _displaced(start, at_mm, predicted)
-        lag[:] = np.iinfo(np.int64).max
+        x_mm, y_mm, roll_rad = motion[0, 0], motion[0, 1], motion[0, 2]
+        _displaced(x_mm, y_mm, roll_rad, at_mm, predicted)
+        for p in range(patches):
+            lag[p, 0], lag[p, 1] = _NOWHERE, _NOWHERE
         _round(predicted, spacing, lag, changed)
         moved, fitted = True, False
         for turn in range(geometry.passes):
@@ -393,11 +396,12 @@ def match_pairs(
             if not moved:
                 break
         if not fitted:
-            motion[0] = start
-            field[:] = 0.0
+            motion[0, 0], motion[0, 1], motion[0, 2] = x_mm, y_mm, roll_rad
+            field[1, 1], field[1, 2] = 0.0, 0.0
         matches.fitted[m], matches.settled[m] = fitted, not moved
         if of_echo:
-            ramp_rad = geometry.wavenumber_per_mm * field[1, 1:] * spacing
+            for k in range(2):
+                ramp_rad[k] = geometry.wavenumber_per_mm * field[1, 1 + k] * spacing[k]
             phase = turns(size, 1, ramp_rad)
             for p in range(patches):
                 cohere_patch(

@@ -232,7 +232,7 @@ class _BlockMatcher:
         return pairs
 
     def _match(self, references: Sequence[int], frame: int) -> dict[int, MatchedPair]:
-        """Match a frame with its references, those after the frame before it from the motion found with that."""
+        """Match a frame with its references, those after its predecessor from the motion found with that."""
         before = frame - 1
         split = references.index(before) + 1 if before in references else len(references)
         pairs: dict[int, MatchedPair] = {}

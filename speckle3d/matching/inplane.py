@@ -105,15 +105,19 @@ class CoarseMatcher:
     def spectrum(self, image: Float32Array) -> Complex64Array:
         """Transform one frame; keep the result for every pair the frame is in."""
         usable = image.shape[1] // self._pool * self._pool
-        pooled = image[:, :usable].reshape(image.shape[0], -1, self._pool).mean(axis=2)
+        # Not `numpy.mean`, which takes fourteen times as long along so short an axis.
+        pooled = sum(
+            (image[:, k : usable : self._pool] for k in range(1, self._pool)), image[:, : usable : self._pool]
+        )
+        pooled = pooled / np.float32(self._pool)
         pooled -= pooled.mean()
         return np.asarray(fft.rfft2(pooled, self._shape))
 
     def shift(self, fixed: Complex64Array, moving: Complex64Array) -> npt.NDArray[np.int64]:
         """Vectors and samples by which `moving` is displaced, shape (2,)."""
-        product = fft.irfft2(np.conj(fixed) * moving, self._shape)
         rows, columns = self._reach
-        near = product[np.arange(-rows, rows + 1)[:, None], np.arange(-columns, columns + 1)]
+        product = fft.ifft(np.conj(fixed) * moving, axis=0, overwrite_x=True)[np.arange(-rows, rows + 1)]
+        near = fft.irfft(product, self._shape[1], axis=1)[:, np.arange(-columns, columns + 1)]
         peak = np.unravel_index(np.argmax(near), near.shape)
         return np.array([peak[0] - rows, (peak[1] - columns) * self._pool], dtype=np.int64)
 
@@ -198,8 +202,8 @@ def match_with_each(
     def match(first: int, stop: int) -> None:
         for begin in range(first, stop, REFERENCES):
             end = min(begin + REFERENCES, stop)
-            some = (_filled(frames[begin:end]) for frames in (fixed, theirs))
-            match_pairs(*some, moving, ours, geometry, matches, begin, end)
+            images, parts = _filled(fixed[begin:end]), _filled(theirs[begin:end])
+            match_pairs(images, parts, moving, ours, geometry, matches, begin, end)
 
     in_parallel(match, count)
     return [_match(matches, k) for k in range(count)]

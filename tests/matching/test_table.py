@@ -7,8 +7,9 @@ from speckle3d.matching.table import CorrelationTable, MatchedPair
 
 
 def pair(*correlation, x_mm=0.0, y_mm=0.0):
-    rho = np.array(correlation)
-    return MatchedPair.of(PatchMatch(rho, np.zeros((rho.size, 2)), InPlaneMotion(x_mm, y_mm)))
+    rho, known = np.array(correlation), [value for value in correlation if np.isfinite(value)]
+    median = float(np.median(known)) if known else 0.0
+    return MatchedPair.of(PatchMatch(rho, np.zeros((rho.size, 2)), InPlaneMotion(x_mm, y_mm), median, True))
 
 
 def table(*rows):
