@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeAlias
 
 import h5py
@@ -91,19 +93,19 @@ class Unpacker:
         self._stored, self._bytes = node.dtype, bytes_of(node, node.chunks)
         self._room = self._bytes + self._bytes // 1000 + _MOST_OVER
 
-    def read(self, offset: Offset) -> npt.NDArray[Any]:
-        """Read a chunk by the index of its first sample.
+    def read(self, offset: Offset) -> Callable[[], npt.NDArray[Any]]:
+        """Read a chunk by the index of its first sample; the function returned unpacks it.
 
-        Raises
-        ------
-        InvalidInputError
-            If it is damaged, or unpacks to fewer bytes or more than a chunk has.
+        It raises `InvalidInputError` if the chunk unpacks to fewer bytes or more than it is to hold.
         """
         packed = None
         if self._node.get_chunk_info_by_coord(offset).size <= self._room:
             packed = borrowed((self._room,), np.uint8)
         skipped, raw = self._node.read_direct_chunk(offset, out=packed)
         stages = {filter_id for i, filter_id in enumerate(self._filters) if not skipped & (1 << i)}
+        return partial(self._unpacked, raw, stages, offset)
+
+    def _unpacked(self, raw: bytes, stages: set[int], offset: Offset) -> npt.NDArray[Any]:
         data = inflate(raw, self._bytes, offset) if DEFLATE in stages else raw
         if len(data) != self._bytes:
             raise InvalidInputError(f"chunk {offset}: expected {self._bytes} bytes, got {len(data)}")

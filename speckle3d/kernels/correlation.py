@@ -16,7 +16,7 @@ from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
 _LANES = 16
 """Rows are padded to a multiple of this many samples: a vector register's."""
-_TOGETHER = 8
+_TOGETHER = 4
 """Rows whose sums are taken in float32; more would leave too much of a flat patch's variance."""
 
 Buffers = tuple[Float32Array, Float32Array, Float32Array]
@@ -56,17 +56,21 @@ def _common(first: int, size: int, length: int, radius: int, shift: int) -> tupl
 
 
 @njit(cache=True, nogil=True)
-def _copy(image: Float32Array, v: int, s: int, rows: int, width: int, stride: int, out: Float32Array) -> None:
-    """Copy a window to rows `stride` apart; zeros behind each, and in one row more."""
-    for k in range(rows):
-        source, row = image[v + k, s : s + width], out[k * stride : (k + 1) * stride]
-        for n in range(width):
-            row[n] = source[n]
-        for n in range(width, stride):
-            row[n] = np.float32(0.0)
-    behind = out[rows * stride : (rows + 1) * stride]
-    for n in range(behind.size):
-        behind[n] = np.float32(0.0)
+def _copy(
+    image: Float32Array, corner: tuple[int, int], rows: int, width: int, stride: int, out: Float32Array
+) -> None:
+    """Copy a window to rows `stride` apart; zeros behind each, and in one row more if there is room."""
+    # Unsigned indices are not tested for being negative, and slices would count their references.
+    v, s, at = np.uint64(corner[0]), np.uint64(corner[1]), np.uint64(0)
+    for _ in range(rows):
+        for n in range(np.uint64(width)):
+            out[at + n] = image[v, s + n]
+        for n in range(np.uint64(width), np.uint64(stride)):
+            out[at + n] = np.float32(0.0)
+        at += np.uint64(stride)
+        v += np.uint64(1)
+    for n in range(at, np.uint64(min(out.size, (rows + 1) * stride))):
+        out[n] = np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
@@ -79,20 +83,22 @@ def _cover(width: int, stride: int, inside: Float32Array) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
-def _sums(a: Float32Array, b: Float32Array, inside: Float32Array, chunk: int) -> tuple[float, float, float]:
-    """Sum of a b, of b and of its square where `inside` is one."""
+def _sums(
+    a: Float32Array, b: Float32Array, start: int, inside: Float32Array, end: int, chunk: int
+) -> tuple[float, float, float]:
+    """Sum of a b, of b and of its square where `inside` is one, b beginning with its sample `start`."""
     product, total, square = 0.0, 0.0, 0.0
-    for start in range(0, a.size, chunk):
-        end = min(start + chunk, a.size)
-        part, other, weight = a[start:end], b[start:end], inside[start:end]
+    behind = np.uint64(start)
+    for first in range(0, end, chunk):
         some_product: Any = np.float32(0.0)
         some: Any = np.float32(0.0)
         some_square: Any = np.float32(0.0)
-        for k in range(part.size):
-            value = weight[k] * other[k]
-            some_product += part[k] * other[k]
+        for k in range(np.uint64(first), np.uint64(min(first + chunk, end))):
+            other = b[behind + k]
+            value = inside[k] * other
+            some_product += a[k] * other
             some += value
-            some_square += value * other[k]
+            some_square += value * other
         product += some_product
         total += some
         square += some_square
@@ -101,16 +107,24 @@ def _sums(a: Float32Array, b: Float32Array, inside: Float32Array, chunk: int) ->
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
 def _echo_sums(
-    a: Float32Array, ai: Float32Array, b: Float32Array, bi: Float32Array, inside: Float32Array
+    a: Float32Array,
+    ai: Float32Array,
+    b: Float32Array,
+    bi: Float32Array,
+    start: int,
+    inside: Float32Array,
+    end: int,
 ) -> tuple[float, float, float]:
     """Real and imaginary part of the sum of conj(a) b, and of the power of b where `inside` is one."""
     in_phase: Any = np.float32(0.0)
     quadrature: Any = np.float32(0.0)
     power: Any = np.float32(0.0)
-    for k in range(a.size):
-        in_phase += a[k] * b[k] + ai[k] * bi[k]
-        quadrature += a[k] * bi[k] - ai[k] * b[k]
-        power += inside[k] * (b[k] * b[k] + bi[k] * bi[k])
+    behind = np.uint64(start)
+    for k in range(np.uint64(end)):
+        real, imaginary = b[behind + k], bi[behind + k]
+        in_phase += a[k] * real + ai[k] * imaginary
+        quadrature += a[k] * imaginary - ai[k] * real
+        power += inside[k] * (real * real + imaginary * imaginary)
     return float(in_phase), float(quadrature), float(power)
 
 
@@ -138,19 +152,18 @@ def correlate_patch(
     if rows <= 0 or width <= 0 or n < least_overlap * size[0] * size[1]:
         return
     end, chunk = rows * stride, _TOGETHER * stride
-    a, b, inside = room[0][0, :end], room[1][0], room[2][:end]
-    _copy(fixed, v0, s0, rows, width, stride, a)
-    v, s = v0 + shift[0] - lateral, s0 + shift[1] - axial
-    _copy(moving, v, s, rows + 2 * lateral, width + 2 * axial, stride, b)
-    _cover(width, stride, room[2])
-    aa_sum, a_sum, _ = _sums(a, a, inside, chunk)
+    a, b, inside = room[0][0], room[1][0], room[2]
+    _copy(fixed, (v0, s0), rows, width, stride, a)
+    corner = v0 + shift[0] - lateral, s0 + shift[1] - axial
+    _copy(moving, corner, rows + 2 * lateral, width + 2 * axial, stride, b)
+    _cover(width, stride, inside)
+    aa_sum, a_sum, _ = _sums(a, a, 0, inside, end, chunk)
     a_var = aa_sum - a_sum * a_sum / n
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             if not corners and i != lateral and j != axial:
                 continue
-            start = i * stride + j
-            ab_sum, b_sum, bb_sum = _sums(a, b[start : start + end], inside, chunk)
+            ab_sum, b_sum, bb_sum = _sums(a, b, i * stride + j, inside, end, chunk)
             b_var = bb_sum - b_sum * b_sum / n
             # Float32 sums leave about 1e-6 of the energy: less variance than that is a flat patch.
             if a_var > 1e-6 * aa_sum and b_var > 1e-6 * bb_sum:
@@ -174,10 +187,10 @@ def turns(size: IntArray, axial_radius: int, ramp_rad: FloatArray) -> Float32Arr
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
-def _turn(a: Float32Array, ai: Float32Array, cosine: Float32Array, sine: Float32Array) -> float:
+def _turn(a: Float32Array, ai: Float32Array, cosine: Float32Array, sine: Float32Array, end: int) -> float:
     """Turn a patch's echo back by the ramp's phase, in place; return its power."""
     power: Any = np.float32(0.0)
-    for k in range(a.size):
+    for k in range(np.uint64(end)):
         real, imaginary = a[k], ai[k]
         power += real * real + imaginary * imaginary
         a[k] = real * cosine[k] + imaginary * sine[k]
@@ -208,23 +221,20 @@ def cohere_patch(
             out[i, j] = np.nan
     if rows <= 0 or width <= 0 or rows * width < least_overlap * size[0] * size[1]:
         return
-    end = rows * stride
-    a, ai, inside = room[0][0, :end], room[0][1, :end], room[2][:end]
-    b, bi = room[1][0], room[1][1]
-    v, s = v0 + shift[0] - lateral, s0 + shift[1] - axial
-    for k in range(2):
-        _copy(fixed[k], v0, s0, rows, width, stride, room[0][k, :end])
-        _copy(moving[k], v, s, rows + 2 * lateral, width + 2 * axial, stride, room[1][k])
-    _cover(width, stride, room[2])
-    power = _turn(a, ai, turn[0], turn[1])
+    end, inside = rows * stride, room[2]
+    a, ai, b, bi = room[0][0], room[0][1], room[1][0], room[1][1]
+    corner = v0 + shift[0] - lateral, s0 + shift[1] - axial
+    _copy(fixed[0], (v0, s0), rows, width, stride, a)
+    _copy(fixed[1], (v0, s0), rows, width, stride, ai)
+    _copy(moving[0], corner, rows + 2 * lateral, width + 2 * axial, stride, b)
+    _copy(moving[1], corner, rows + 2 * lateral, width + 2 * axial, stride, bi)
+    _cover(width, stride, inside)
+    power = _turn(a, ai, turn[0], turn[1], end)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             if not corners and i != lateral and j != axial:
                 continue
-            start = i * stride + j
-            in_phase, quadrature, other = _echo_sums(
-                a, ai, b[start : start + end], bi[start : start + end], inside
-            )
+            in_phase, quadrature, other = _echo_sums(a, ai, b, bi, i * stride + j, inside, end)
             if power * other > 0.0:
                 out[i, j] = (in_phase**2 + quadrature**2) / (power * other)
 

@@ -9,6 +9,7 @@ from speckle3d.core.arrays import Float32Array, IntArray
 
 _LEAST_MEAN = 1e-9
 """Of the largest mean, under which none is divided by."""
+_TINY = float(np.finfo(np.float32).tiny)
 
 
 @njit(cache=True, nogil=True)
@@ -106,8 +107,7 @@ def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
     """
     rows, samples = image.shape
     wide, high = 2 * half[0] + 1, 2 * half[1] + 1
-    lateral = np.zeros(samples)
-    largest = np.zeros(samples, np.float32)
+    lateral, largest = np.zeros(samples), np.zeros(samples, np.float32)
     # Sums from the start of a vector whose ends are repeated, and the same from a window later.
     upto = np.zeros(samples + high)
     later = upto[high:]
@@ -139,17 +139,10 @@ def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
         leaving = image[max(row - half[0], 0)]
         for k in range(samples):
             lateral[k] += entering[k] - np.float64(leaving[k])
-    return float(_LEAST_MEAN * largest.max() + np.finfo(np.float32).tiny + not_finite)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def divide_by_mean(image: Float32Array, mean: Float32Array, floor: float, out: Float32Array) -> None:
-    """Fill `out` with intensity over its local mean, or over `floor` where that is more."""
-    least = np.float32(floor)
-    for row in range(out.shape[0]):
-        source, under, target = image[row], mean[row], out[row]
-        for k in range(target.size):
-            target[k] = source[k] / (under[k] if under[k] > least else least)
+    most = 0.0
+    for k in range(samples):
+        most = max(most, float(largest[k]))
+    return _LEAST_MEAN * most + _TINY + not_finite
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

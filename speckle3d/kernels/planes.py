@@ -10,10 +10,11 @@ from numba import njit
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.kernels.statistics import INTERPOLATION, PatchCurves, correlation_variance
 
-_variance = njit(error_model="numpy")(correlation_variance)
+_variance = njit(error_model="numpy", fastmath=False)(correlation_variance)
 _FAST = {"reassoc"}
-"""For sums over patches. Predictions are exact: starts of fits lie on knots of the curves, where a distance that
-is rounded otherwise has another slope."""
+"""For sums over patches. Predictions are exact: starts of fits lie on knots of the curves, where a distance
+that is rounded otherwise has another slope. They say so, because a kernel that does not inherits its caller's
+flags."""
 
 _LEAST_MM = 0.05
 """Distance below which correlation is flat: sensitivities are not taken to be less than here."""
@@ -103,7 +104,34 @@ class FittedPlanes(NamedTuple):
     sigma_mm: FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+class _Patches(NamedTuple):
+    """A pair's patches that take part, and the curves they are read with.
+
+    Attributes
+    ----------
+    table : float64, shape (11, p)
+    start : int64, shape (p,)
+        Of each patch's curve in `amplitude`.
+    patch : int64, shape (p,)
+        Which of the image's patches each is.
+    amplitude : float64
+        The curves one after the other.
+    last : float
+        Position in a curve up to which it is read.
+    step_mm : float
+    of_echo : bool
+    """
+
+    table: FloatArray
+    start: IntArray
+    patch: IntArray
+    amplitude: FloatArray
+    last: float
+    step_mm: float
+    of_echo: bool
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def predict_correlation(
     distance_mm: float,
     amplitude: FloatArray,
@@ -148,71 +176,47 @@ def predict_correlation(
     return model, derivative, variance + share_error * share_error + stretch_error * stretch_error
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _signed_distance(plane: FloatArray, i: int, table: FloatArray) -> float:
-    """Distance of a patch without what turning alone decorrelates."""
-    z: float = plane[0] + table[_LATERAL, i] * plane[1] + table[_LEVER, i] * plane[2]
-    return z
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _distance(plane: FloatArray, i: int, patches: _Patches) -> tuple[float, float, float]:
+    """Distance of a patch without and with what turning alone decorrelates, and the latter's part."""
+    t = patches.table
+    z = plane[0] + t[_LATERAL, i] * plane[1] + t[_LEVER, i] * plane[2]
+    turned = t[_SPREAD, i] * plane[2]
+    return z, turned, np.sqrt(z * z + turned * turned)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _norm(z: float, turned: float) -> float:
-    return float(np.sqrt(z * z + turned * turned))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _predict(
-    d: float,
-    i: int,
-    table: FloatArray,
-    base: IntArray,
-    amplitude: FloatArray,
-    last: float,
-    step_mm: float,
-    of_echo: bool,
-) -> tuple[float, float, float]:
-    """As `predict_correlation`, of a patch in the table, but one over the standard deviation."""
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _predict(d: float, i: int, patches: _Patches) -> tuple[float, float, float]:
+    """As `predict_correlation`, but one over the standard deviation."""
+    t = patches.table
     model, derivative, variance = predict_correlation(
         d,
-        amplitude,
-        base[i],
-        last,
-        step_mm,
-        table[_STRETCH, i],
-        table[_STAYING, i],
-        table[_MOVING, i],
-        table[_GAIN, i],
-        table[_STAYING_SD, i],
-        table[_STRETCH_SD, i],
-        table[_CELLS, i],
-        of_echo,
+        patches.amplitude,
+        patches.start[i],
+        patches.last,
+        patches.step_mm,
+        t[_STRETCH, i],
+        t[_STAYING, i],
+        t[_MOVING, i],
+        t[_GAIN, i],
+        t[_STAYING_SD, i],
+        t[_STRETCH_SD, i],
+        t[_CELLS, i],
+        patches.of_echo,
     )
     return model, derivative, 1.0 / np.sqrt(variance)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _evaluate(
-    plane: FloatArray,
-    size: int,
-    table: FloatArray,
-    base: IntArray,
-    amplitude: FloatArray,
-    last: float,
-    step_mm: float,
-    of_echo: bool,
-    rules: FitRules,
-    sums: FloatArray,
-) -> None:
+def _evaluate(plane: FloatArray, size: int, patches: _Patches, rules: FitRules, sums: FloatArray) -> None:
     """Fill `sums`: robust cost, capped cost, half the falling gradient, half the Hessian's upper triangle."""
-    huber, outlying = rules.huber, rules.outlying
+    huber, outlying, table = rules.huber, rules.outlying, patches.table
     cost, capped = 0.0, 0.0
     g0, g1, g2 = 0.0, 0.0, 0.0
     h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(size):
-        x, y, spread = table[_LATERAL, i], table[_LEVER, i], table[_SPREAD, i]
-        z, turned = _signed_distance(plane, i, table), spread * plane[2]
-        d = _norm(z, turned)
-        model, slope, certainty = _predict(d, i, table, base, amplitude, last, step_mm, of_echo)
+        z, turned, d = _distance(plane, i, patches)
+        model, slope, certainty = _predict(d, i, patches)
         left = (table[_RHO, i] - model) * certainty
         misfit = abs(left)
         square = left * left
@@ -222,8 +226,8 @@ def _evaluate(
         capped += square if square < outlying else outlying
         factor = slope * certainty / (d if d > 1e-9 else 1e-9)
         j0 = factor * z
-        j1 = j0 * x
-        j2 = j0 * y + factor * spread * turned
+        j1 = j0 * table[_LATERAL, i]
+        j2 = j0 * table[_LEVER, i] + factor * table[_SPREAD, i] * turned
         w0, w1, w2 = weight * j0, weight * j1, weight * j2
         g0 += w0 * left
         g1 += w1 * left
@@ -271,12 +275,7 @@ def _solve(sums: FloatArray, damping: float, step: FloatArray) -> None:
 def _descend(
     plane: FloatArray,
     size: int,
-    table: FloatArray,
-    base: IntArray,
-    amplitude: FloatArray,
-    last: float,
-    step_mm: float,
-    of_echo: bool,
+    patches: _Patches,
     expected: FloatArray,
     precision: FloatArray,
     rules: FitRules,
@@ -285,7 +284,7 @@ def _descend(
     damping, least, capped = 1e-3, np.inf, np.inf
     trial, step, sums, best = plane.copy(), np.zeros(3), np.zeros(11), np.zeros(11)
     for _ in range(rules.rounds + 1):
-        _evaluate(trial, size, table, base, amplitude, last, step_mm, of_echo, rules, sums)
+        _evaluate(trial, size, patches, rules, sums)
         _with_prior(trial, expected, precision, sums)
         total = sums[0]
         if total <= least:
@@ -310,40 +309,35 @@ def _descend(
 def _conclude(
     plane: FloatArray,
     size: int,
-    table: FloatArray,
-    base: IntArray,
-    amplitude: FloatArray,
-    last: float,
-    step_mm: float,
-    of_echo: bool,
-    excess: FloatArray,
-    sigma: FloatArray,
-    information: FloatArray,
+    patches: _Patches,
     rules: FitRules,
+    excess_mm: FloatArray,
+    sigma_mm: FloatArray,
+    information: FloatArray,
 ) -> None:
-    """Fill excess distances, their deviations and the information of a fitted plane."""
+    """Fill excess distances and their deviations, and add the patches' information on the plane."""
+    table = patches.table
     for i in range(size):
-        x, y, spread = table[_LATERAL, i], table[_LEVER, i], table[_SPREAD, i]
-        z, turned = _signed_distance(plane, i, table), spread * plane[2]
-        d = _norm(z, turned)
-        model, _, certainty = _predict(d, i, table, base, amplitude, last, step_mm, of_echo)
+        z, _, d = _distance(plane, i, patches)
+        model, _, certainty = _predict(d, i, patches)
         # Near no distance the correlation is flat; its curvature still tells one that is not small.
         off = d if d > _LEAST_MM else _LEAST_MM
-        _, steep, _ = _predict(off, i, table, base, amplitude, last, step_mm, of_echo)
+        _, steep, _ = _predict(off, i, patches)
         sensitivity = -steep * certainty
-        sigma[i] = 1.0 / max(sensitivity, _LEAST_SENSITIVITY)
         left = (table[_RHO, i] - model) * certainty
-        excess[i] = -left * sigma[i]
+        sigma = 1.0 / max(sensitivity, _LEAST_SENSITIVITY)
+        excess_mm[patches.patch[i]], sigma_mm[patches.patch[i]] = -left * sigma, sigma
         misfit = abs(left)
         weight = 1.0 if misfit <= rules.huber else rules.huber / misfit
-        o0 = sensitivity * max(abs(z), _LEAST_MM) / off
-        squared = weight * o0 * o0
-        information[0, 0] += squared
-        information[0, 1] += squared * x
-        information[0, 2] += squared * y
-        information[1, 1] += squared * x * x
-        information[1, 2] += squared * x * y
-        information[2, 2] += squared * y * y
+        told = sensitivity * max(abs(z), _LEAST_MM) / off
+        told *= weight * told
+        x, y = table[_LATERAL, i], table[_LEVER, i]
+        information[0, 0] += told
+        information[0, 1] += told * x
+        information[0, 2] += told * y
+        information[1, 1] += told * x * x
+        information[1, 2] += told * x * y
+        information[2, 2] += told * y * y
     information[1, 0] = information[0, 1]
     information[2, 0] = information[0, 2]
     information[2, 1] = information[1, 2]
@@ -358,19 +352,18 @@ def _gather(
     models: EchoModels,
     levers: Levers,
     curves: PatchCurves,
-    table: FloatArray,
-    base: IntArray,
-    patch: IntArray,
+    patches: _Patches,
 ) -> int:
-    """Fill the table of the patches of pair `e` that take part; returns how many they are."""
+    """Fill in the patches of pair `e` that take part; returns how many they are."""
+    table = patches.table
     row = e if models.staying.shape[0] > 1 else 0
     size = 0
     for p in range(used.shape[1]):
         if not used[e, p]:
             continue
         stretch = models.stretch[row, p]
-        patch[size] = p
-        base[size] = p * curves.amplitude.shape[1]
+        patches.patch[size] = p
+        patches.start[size] = p * curves.amplitude.shape[1]
         table[_RHO, size] = rho[e, p]
         table[_LATERAL, size] = levers.lateral_mm[p] - moved_mm[e, 0]
         table[_LEVER, size] = levers.lever_mm[p] - moved_mm[e, 1]
@@ -386,7 +379,7 @@ def _gather(
     return size
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _sum_by_eights(values: FloatArray, first: int, size: int) -> float:
     total, start = 0.0, 0
     if size >= 8:
@@ -402,7 +395,7 @@ def _sum_by_eights(values: FloatArray, first: int, size: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def sum_by_halves(values: FloatArray, size: int) -> float:
     """Sum of the first `size` values, rounded as `numpy.sum` does: by halves down to 128, those by eights."""
     first, length = np.zeros(64, np.int64), np.zeros(64, np.int64)
@@ -428,7 +421,7 @@ def sum_by_halves(values: FloatArray, size: int) -> float:
     return float(sums[0])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _list_starts(
     middle_mm: float,
     slopes: FloatArray,
@@ -496,40 +489,32 @@ def fit_planes(
     fitted : FittedPlanes
         Receives the results.
     """
-    patches = rho.shape[1]
-    amplitude = curves.amplitude.reshape(curves.amplitude.size)
-    last = curves.amplitude.shape[1] - 1.001
-    table = np.empty((11, patches))
-    base, patch = np.empty(patches, np.int64), np.empty(patches, np.int64)
-    excess, sigma = np.empty(patches), np.empty(patches)
-    starts, plane, expected, precision = np.zeros((_STARTS, 3)), np.empty(3), np.zeros(3), np.empty(3)
+    most = rho.shape[1]
+    patches = _Patches(
+        np.empty((11, most)),
+        np.empty(most, np.int64),
+        np.empty(most, np.int64),
+        curves.amplitude.reshape(curves.amplitude.size),
+        curves.amplitude.shape[1] - 1.001,
+        curves.step_mm,
+        curves.of_echo,
+    )
+    off, starts = np.empty(most), np.zeros((_STARTS, 3))
+    plane, expected, precision = np.empty(3), np.zeros(3), np.empty(3)
     precision[0] = 1e-6
     precision[1] = precision[2] = 1.0 / (rules.slope_sd * rules.slope_sd)
     for e in range(rho.shape[0]):
-        size = _gather(e, rho, used, moved_mm, models, levers, curves, table, base, patch)
+        size = _gather(e, rho, used, moved_mm, models, levers, curves, patches)
         if size == 0:
             continue
         expected[1], expected[2] = slopes[e, 0], slopes[e, 1]
-        count = _list_starts(
-            middle_mm[e], slopes[e], either_side[e], size, table[_LATERAL], rules, excess, starts
-        )
+        lateral = patches.table[_LATERAL]
+        count = _list_starts(middle_mm[e], slopes[e], either_side[e], size, lateral, rules, off, starts)
         least = np.inf
         for n in range(count):
             for k in range(3):
                 plane[k] = starts[n, k]
-            cost, misfit = _descend(
-                plane,
-                size,
-                table,
-                base,
-                amplitude,
-                last,
-                curves.step_mm,
-                curves.of_echo,
-                expected,
-                precision,
-                rules,
-            )
+            cost, misfit = _descend(plane, size, patches, expected, precision, rules)
             misfit += rules.crossing_evidence if n > 0 else 0.0
             if misfit < least:
                 least = misfit
@@ -542,23 +527,8 @@ def fit_planes(
         for k in range(3):
             for j in range(3):
                 information[k, j] = precision[k] if j == k else 0.0
-        _conclude(
-            fitted.coefficients[e],
-            size,
-            table,
-            base,
-            amplitude,
-            last,
-            curves.step_mm,
-            curves.of_echo,
-            excess,
-            sigma,
-            information,
-            rules,
-        )
-        for i in range(size):
-            fitted.excess_mm[e, patch[i]] = excess[i]
-            fitted.sigma_mm[e, patch[i]] = sigma[i]
+        best = fitted.coefficients[e]
+        _conclude(best, size, patches, rules, fitted.excess_mm[e], fitted.sigma_mm[e], information)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)

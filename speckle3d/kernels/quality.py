@@ -28,9 +28,8 @@ def patch_statistics(image: Float32Array, first: IntArray, size: IntArray, out: 
     """
     wide, high = size[0], size[1]
     half_wide, half_high = wide // 2, high // 2
+    last_wide, last_high = wide - half_wide, high - half_high
     patch = np.empty((wide, high), np.float32)
-    # Of the first samples, the one between and the last: sums and squares, by vector.
-    sums, squares = np.empty((wide, 3)), np.empty((wide, 3))
     for p in range(first.shape[0]):
         total = 0.0
         for v in range(wide):
@@ -41,67 +40,69 @@ def patch_statistics(image: Float32Array, first: IntArray, size: IntArray, out: 
             total += row_sum
         mean = np.float32(total / (wide * high))
         scale = np.float32(1.0) / mean
-        together = np.zeros(3)
+        # Sums a of values and aa of squares: of all, of the first and last vector, of halves either way.
+        a = a_first = a_last = a_left = a_right = a_top = a_bottom = 0.0
+        aa = aa_first = aa_last = aa_left = aa_right = aa_top = aa_bottom = 0.0
+        alike = across = along = 0.0
         for v in range(wide):
             row = image[first[p, 0] + v, first[p, 1] : first[p, 1] + high]
             # Over the patch's own mean: neither precision nor range is then lost on any.
             varying = patch[v]
             for k in range(high):
                 varying[k] = row[k] * scale - np.float32(1.0)
-            for part in range(3):
-                start = 0 if part == 0 else (half_high if part == 1 else high - half_high)
-                stop = half_high if part == 0 else (high - half_high if part == 1 else high)
-                part_sum: Any = np.float32(0.0)
-                part_square: Any = np.float32(0.0)
-                piece = varying[start:stop]
-                for k in range(piece.size):
-                    part_sum += piece[k]
-                    part_square += piece[k] * piece[k]
-                sums[v, part], squares[v, part] = part_sum, part_square
-            product: Any = np.float32(0.0)
-            later = varying[high - half_high :]
-            for k in range(half_high):
-                product += varying[k] * later[k]
-            together[2] += product
-            if v >= 1:
-                before = patch[v - 1]
-                product = np.float32(0.0)
-                for k in range(high):
-                    product += varying[k] * before[k]
-                together[0] += product
-            if v >= wide - half_wide:
-                before = patch[v - (wide - half_wide)]
-                product = np.float32(0.0)
-                for k in range(high):
-                    product += varying[k] * before[k]
-                together[1] += product
-        out[p, 0], out[p, 1] = mean, np.sqrt(squares.sum() / (wide * high))
-        rows = sums.sum(axis=1)
-        rows_squared = squares.sum(axis=1)
-        out[p, 2] = _pearson(
-            together[0],
-            rows[:-1].sum(),
-            rows[1:].sum(),
-            rows_squared[:-1].sum(),
-            rows_squared[1:].sum(),
-            (wide - 1) * high,
-        )
-        out[p, 3] = _pearson(
-            together[1],
-            rows[:half_wide].sum(),
-            rows[wide - half_wide :].sum(),
-            rows_squared[:half_wide].sum(),
-            rows_squared[wide - half_wide :].sum(),
-            half_wide * high,
-        )
-        out[p, 4] = _pearson(
-            together[2],
-            sums[:, 0].sum(),
-            sums[:, 2].sum(),
-            squares[:, 0].sum(),
-            squares[:, 2].sum(),
-            wide * half_high,
-        )
+            above, below, middle = varying[:half_high], varying[last_high:], varying[half_high:last_high]
+            x, xx, y, yy, xy = _products(above, below)
+            z, zz, _, _, _ = _products(middle, middle)
+            along += xy
+            a_top += x
+            aa_top += xx
+            a_bottom += y
+            aa_bottom += yy
+            x, xx = x + y + z, xx + yy + zz
+            a += x
+            aa += xx
+            if v == 0:
+                a_first, aa_first = x, xx
+            else:
+                alike += _product(varying, patch[v - 1])
+            if v == wide - 1:
+                a_last, aa_last = x, xx
+            if v < half_wide:
+                a_left += x
+                aa_left += xx
+            if v >= last_wide:
+                a_right += x
+                aa_right += xx
+                across += _product(varying, patch[v - last_wide])
+        out[p, 0], out[p, 1] = mean, np.sqrt(aa / (wide * high))
+        out[p, 2] = _pearson(alike, a - a_last, a - a_first, aa - aa_last, aa - aa_first, (wide - 1) * high)
+        out[p, 3] = _pearson(across, a_left, a_right, aa_left, aa_right, half_wide * high)
+        out[p, 4] = _pearson(along, a_top, a_bottom, aa_top, aa_bottom, wide * half_high)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+def _products(a: Float32Array, b: Float32Array) -> tuple[float, float, float, float, float]:
+    """Sums of either's values and squares, and of their products."""
+    x: Any = np.float32(0.0)
+    y: Any = np.float32(0.0)
+    xx: Any = np.float32(0.0)
+    yy: Any = np.float32(0.0)
+    xy: Any = np.float32(0.0)
+    for k in range(a.size):
+        x += a[k]
+        xx += a[k] * a[k]
+        y += b[k]
+        yy += b[k] * b[k]
+        xy += a[k] * b[k]
+    return x, xx, y, yy, xy
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+def _product(a: Float32Array, b: Float32Array) -> float:
+    total: Any = np.float32(0.0)
+    for k in range(a.size):
+        total += a[k] * b[k]
+    return float(total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

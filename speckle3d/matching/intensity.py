@@ -21,7 +21,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.memory import borrowed
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
 from speckle3d.kernels.intensity import (
-    divide_by_mean,
     equalise_echo,
     local_mean,
     place_band,
@@ -145,9 +144,7 @@ class IntensityExtractor:
         if self.settings.equalise_mm == 0:
             return intensity
         mean, floor = self._local_mean(intensity)
-        equalised = borrowed(mean.shape, np.float32)
-        divide_by_mean(np.ascontiguousarray(intensity), mean, floor, equalised)
-        return equalised
+        return np.divide(intensity, np.maximum(mean, np.float32(floor), out=mean), out=mean)
 
     def equalise_echo(
         self, analytic: Complex64Array, intensity: Float32Array
@@ -266,5 +263,8 @@ def _in_turn(values: Complex64Array) -> Float32Array:
 
 def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
     """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
+    if frame.dtype == np.uint8 and frame.size > 256:
+        table = _decompress(np.arange(256, dtype=np.float32), signal)
+        return np.take(table, frame, out=borrowed(frame.shape, np.float32), mode="clip")
     decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
     return np.asarray(10 ** (decibel / 10), dtype=np.float32)

@@ -213,12 +213,14 @@ class FrameInspector:
 
     def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
         """Intensity below which there is no echo, and clipping over its limit."""
-        low, high = float(samples.min()), float(samples.max())
-        clipped = _at_rail(samples, high, -1, counted)
+        lowest, highest = samples.min(axis=1), samples.max(axis=1)
+        low, high = float(lowest.min()), float(highest.max())
+        # Only vectors that come within a count of an extreme can hold what is counted there.
+        clipped = _at_rail(samples[highest >= high - 1], high, -1, counted, samples.size)
         if self._bmode:
             # Black is no echo: it is neither clipped nor counted.
             return 0.0, clipped / max(int(np.count_nonzero(samples)), 1) / self.settings.clipped_bmode
-        clipped += _at_rail(samples, low, 1, counted)
+        clipped += _at_rail(samples[lowest <= low + 1], low, 1, counted, samples.size)
         least = _LEAST_COUNTS if counted else 0.0
         floor = max(least, _LEAST_RATIO * max(abs(low), abs(high)) ** 2)
         return floor, clipped / samples.size / self.settings.clipped_rf
@@ -325,14 +327,14 @@ def _darkened(
     return np.asarray((darker > drop_db) & (beyond_near > drop_db) & (~few | (fainter > drop_db)))
 
 
-def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool) -> int:
-    """Samples at an extreme of the frame, less those one count inside it.
+def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool, of: int) -> int:
+    """Samples at an extreme of the frame, which has `of` samples, less those one count inside it.
 
     Clipping piles samples up at the rail; without it there are fewer at the extreme than next to it, however
     few the counts. A constant frame has no rail.
     """
     at = np.count_nonzero(samples == samples.dtype.type(rail)) if np.isfinite(rail) else 0
-    if at in (1, samples.size):
+    if at in (1, of):
         return 0
     beside: int = 0
     if counted:
@@ -342,4 +344,4 @@ def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool
 
 def _decibel(power: npt.ArrayLike) -> FloatArray:
     """Finite whatever comes in: nothing, and what is not a number, is far below everything."""
-    return np.asarray(10 * np.log10(np.clip(np.nan_to_num(power), 1e-38, 1e38)), dtype=float)
+    return np.asarray(10 * np.log10(np.fmin(np.fmax(power, 1e-38), 1e38)), dtype=float)

@@ -99,10 +99,10 @@ class Coherence:
         at = np.clip(frame, self.frame[0], self.frame[-1])
         before = np.searchsorted(self.frame, at, side="right") - 1
         after, width = (at - self.frame[before])[:, None], np.diff(self.frame)[:, None]
+        flat = np.zeros((1, self.share.shape[1]))
         share, gain, stretch, decay = (
-            np.concatenate([np.diff(v, axis=0) / width, np.zeros((1, v.shape[1]))])[before] * after
-            + v[before]
-            for v in (self.share, self.gain, self.stretch, self.decay_per_mm)
+            np.concatenate([np.diff(values, axis=0) / width, flat])[before] * after + values[before]
+            for values in (self.share, self.gain, self.stretch, self.decay_per_mm)
         )
         staying = share * np.exp(-np.abs(distance_mm)[:, None] * decay)
         return EchoModel(staying, 1 - share, gain, stretch)

@@ -152,20 +152,20 @@ class DistanceEstimator:
         From the correlation's variance over N independent cells and the curve's slope. Near zero the slope
         vanishes; there it is the squared distance whose deviation stays finite.
         """
-        m = model or EchoModel.fully_developed(self.cells.size)
-        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3) / m.stretch
+        staying, moving, gain, stretch = (0.0, 1.0, 1.0, 1.0) if model is None else vars(model).values()
+        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3) / stretch
         position = np.minimum(d / self.step_mm, self._grid.size - 2.001)
         cell = position.astype(int)
         at, part = cell + self._grid.size * np.arange(cell.shape[-1]), position - cell
         rho, slope = ((1 - part) * t.take(at) + part * t.take(at + 1) for t in (self._rho, self._slope))
         g = np.sqrt(rho)
-        echo = m.staying + m.moving * g
-        seen = np.minimum(m.gain * echo**2, 0.999)
+        echo = staying + moving * g
+        seen = np.minimum(gain * echo**2, 0.999)
         noise = correlation_variance(seen, self.cells, self.of_echo) + INTERPOLATION**2
-        misfit = SHARE_ERROR * m.staying * (1 - g) * 2 * echo * m.gain
-        sigma_rho = np.sqrt(noise + misfit**2) * g / np.maximum(m.gain * echo * m.moving, 1e-6)
+        misfit = SHARE_ERROR * staying * (1 - g) * 2 * echo * gain
+        sigma_rho = np.sqrt(noise + misfit**2) * g / np.maximum(gain * echo * moving, 1e-6)
         d = np.minimum(d, self._grid[-1])
         direct = sigma_rho / np.maximum(slope, 1e-9)
         sigma = np.minimum(direct, np.sqrt(2 * d * direct))
-        stretch_sd = np.where(m.stretch > 1.0 + 1e-9, STRETCH_ERROR, 0.0)
-        return np.asarray(np.sqrt(sigma**2 + (stretch_sd * d) ** 2) * m.stretch)
+        stretch_sd = np.where(stretch > 1.0 + 1e-9, STRETCH_ERROR, 0.0)
+        return np.asarray(np.sqrt(sigma**2 + (stretch_sd * d) ** 2) * stretch)

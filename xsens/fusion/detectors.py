@@ -18,41 +18,44 @@ from speckle3d.core.arrays import FloatArray
 from xsens.fusion.increments import Increment
 from xsens.fusion.settings import FusionSettings
 
-_SMOOTHING_S = 0.1
+SMOOTHING_S = 0.1
 """Time over which the field is smoothed: longer than its noise, shorter than a hand's pass by iron."""
 
-_UNDISTURBED_AFTER_S = 0.5
+UNDISTURBED_AFTER_S = 0.5
 """A field is trusted again when it has fitted for this time (VQF's default)."""
 
-_TURNING_RAD_S = math.radians(20.0)
+TURNING_RAD_S = math.radians(20.0)
 """A new reference is learnt only while the sensor turns faster (VQF's default)..."""
 
-_LEARNT_AFTER_S = 10.0
+LEARNT_AFTER_S = 10.0
 """...and only after turning for this time."""
 
-_STARTING_S = 1.0
+STARTING_S = 1.0
 """The first reference is the mean field over this time."""
 
-_IRON_MEMORY_S = 60.0
+IRON_MEMORY_S = 60.0
 """Time over which the estimate of iron, once learnt, is refined."""
 
-_PROVED_AFTER_S = 20.0
+PROVED_AFTER_S = 20.0
 """A first reference that has fitted for this time of turning is confirmed as the room's."""
 
-_IRON_PRIOR = 0.01
+IRON_PRIOR = 0.01
 """Variance of the field's unevenness over that of unknown iron: 3 microtesla against 30."""
 
-_UNEVEN = 0.15
+UNEVEN = 0.15
 """Largest residual of a reference, as a fraction of the field's norm: that of a room with iron in it."""
 
-_FIRST_AFTER_S, _FIRST_UNEVEN = 5.0, 0.5
+FIRST_AFTER_S, FIRST_UNEVEN = 5.0, 0.5
 """The same while the first reference is not confirmed, which may have been learnt beside iron (5 s: VQF's
 default): even a poor reference is then better."""
 
-_STEEPEST = 0.05
+STEEPEST = 0.05
 """A field with a smaller horizontal fraction shows no heading: iron in the room turns it to any side."""
 
-_BETTER = 2.0
+REST_MEMORY_S = 0.5
+"""Time over which a resting sensor's readings are averaged."""
+
+BETTER = 2.0
 """Factor by which a new reference must reduce the variance left by the one it replaces."""
 
 
@@ -129,7 +132,7 @@ class _Candidate:
     def solve(self) -> tuple[FloatArray, FloatArray, float]:
         """The room's field in the world's axes, iron in the sensor's, and the mean square residual."""
         turn, body, world = (a / self.weight_s for a in (self._turn, self._body, self._world))
-        iron = np.linalg.solve((1.0 + _IRON_PRIOR) * np.eye(3) - turn.T @ turn, body - turn.T @ world)
+        iron = np.linalg.solve((1.0 + IRON_PRIOR) * np.eye(3) - turn.T @ turn, body - turn.T @ world)
         room = world - turn @ iron
         left = self._square / self.weight_s - room @ room - iron @ iron - 2.0 * room @ turn @ iron
         return room, np.asarray(iron, dtype=np.float64), max(float(left), 0.0)
@@ -146,16 +149,16 @@ class _Candidate:
 
         The iron is kept if another room alone explains the readings nearly as well.
         """
-        after_s, uneven = (_LEARNT_AFTER_S, _UNEVEN) if proved else (_FIRST_AFTER_S, _FIRST_UNEVEN)
+        after_s, uneven = (LEARNT_AFTER_S, UNEVEN) if proved else (FIRST_AFTER_S, FIRST_UNEVEN)
         if self.weight_s < after_s:
             return None
         room, iron, left = self.solve()
         if left > (uneven * np.linalg.norm(room)) ** 2:
             return None
-        if 1.5 * self._misfit / self.weight_s < _BETTER * left:  # the misfit is of two components of three
+        if 1.5 * self._misfit / self.weight_s < BETTER * left:  # the misfit is of two components of three
             return None
         other, same_iron = self.room_with(reference.iron_au)
-        return (other, reference.iron_au) if same_iron < _BETTER * left else (room, iron)
+        return (other, reference.iron_au) if same_iron < BETTER * left else (room, iron)
 
 
 @dataclass(frozen=True)
@@ -190,7 +193,7 @@ class FieldMonitor:
         self._known: _Candidate | None = None
         self.reference: Reference | None = None
         self.confirmed = False
-        self._fitting_s = _UNDISTURBED_AFTER_S
+        self._fitting_s = UNDISTURBED_AFTER_S
         self._age_s = self._turned_s = 0.0
         self._horizontal = self._vertical = 0.0
 
@@ -218,7 +221,7 @@ class FieldMonitor:
         off = across**2 + along**2
         self.reference = self._followed(reference, duration_s)
         restart = None
-        if rate_rad_s > _TURNING_RAD_S:
+        if rate_rad_s > TURNING_RAD_S:
             self._turned_s += duration_s if fits else 0.0
             self._candidate.add(world_from_sensor, field_au, off, duration_s)
             if fits and self._known is not None:
@@ -227,24 +230,24 @@ class FieldMonitor:
                 self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)
             learnt = self._learn()
             restart = None if self.confirmed else learnt
-            self.confirmed = self.confirmed or self._turned_s > _PROVED_AFTER_S
-        steep = reference.horizontal_au <= _STEEPEST * reference.norm_au
-        disturbed = steep or self._fitting_s < _UNDISTURBED_AFTER_S
+            self.confirmed = self.confirmed or self._turned_s > PROVED_AFTER_S
+        steep = reference.horizontal_au <= STEEPEST * reference.norm_au
+        disturbed = steep or self._fitting_s < UNDISTURBED_AFTER_S
         variance = math.inf if steep else off / (2.0 * reference.horizontal_au**2)
         return FieldReading(clean, disturbed, variance, restart)
 
     def _smooth(self, clean: FloatArray, duration_s: float) -> None:
         horizontal, vertical = math.hypot(clean[0], clean[1]), float(clean[2])
-        share = 1.0 - math.exp(-duration_s / _SMOOTHING_S) if self._age_s else 1.0
+        share = 1.0 - math.exp(-duration_s / SMOOTHING_S) if self._age_s else 1.0
         self._horizontal += share * (horizontal - self._horizontal)
         self._vertical += share * (vertical - self._vertical)
         self._age_s += duration_s
 
     def _followed(self, reference: Reference, duration_s: float) -> Reference:
         """The reference moved a little towards the present field, if that fits."""
-        if self._age_s <= _STARTING_S:
+        if self._age_s <= STARTING_S:
             return reference.towards(self._horizontal, self._vertical, duration_s / self._age_s)
-        if self._fitting_s < _UNDISTURBED_AFTER_S:
+        if self._fitting_s < UNDISTURBED_AFTER_S:
             return reference
         share = duration_s / self._settings.field_memory_s
         return reference.towards(self._horizontal, self._vertical, share)
@@ -258,7 +261,7 @@ class FieldMonitor:
         room, iron = better
         if iron is not self.reference.iron_au:
             self._known = copy(self._candidate)
-            self._known.memory_s = _IRON_MEMORY_S
+            self._known.memory_s = IRON_MEMORY_S
         self.reference = Reference(math.hypot(room[0], room[1]), float(room[2]), iron)
         self._candidate.clear()
         self._fitting_s = self._turned_s = 0.0
@@ -267,8 +270,6 @@ class FieldMonitor:
 
 class RestDetector:
     """Detect rest: gyroscope and accelerometer stay near their means of the last half second for a while."""
-
-    _MEMORY_S = 0.5
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
@@ -282,7 +283,7 @@ class RestDetector:
         if self._rate is None:
             self._rate, self._force = increment.rate_rad_s.copy(), force
         rate_off, force_off = increment.rate_rad_s - self._rate, force - self._force
-        share = increment.duration_s / (self._MEMORY_S + increment.duration_s)
+        share = increment.duration_s / (REST_MEMORY_S + increment.duration_s)
         self._rate += share * rate_off
         self._force = self._force + share * force_off
         limit = self._settings.rest_bias_rad_s + 3.0 * bias_sd_rad_s

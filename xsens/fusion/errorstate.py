@@ -6,6 +6,9 @@ field's heading and north. Two copies of one bias keep magnetism out of inclinat
 heading and the second copy alone (a Schmidt filter, which accounts for the states it leaves uncorrected),
 every other observation corrects both. Without a magnetometer the second copy is unused.
 
+This is the filter of samples as they arrive, and the statement of what the filter is. Recordings run through
+`speckle3d.kernels.orientation`, the same arithmetic without objects; tests hold the two together.
+
 The accelerometer is integrated to velocity, which stays near zero in a hand: over many swings that shows the
 direction of gravity in spite of movement, where the accelerometer itself shows it only at rest. The attitude
 error is the invariant one (velocity turns with it), so that errors of heading and velocity stay separate.
@@ -35,17 +38,17 @@ SIZE = 13
 ANGLE, BIAS, SPEED, HEADING_BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 HEADING, STRAY = 2, 12
 
-_START_S = 1.0
+START_S = 1.0
 """Inclination and heading at the start are those of the mean force and field over this time."""
 
-_REST_SPEED_M_S = 0.02
-_REST_TIME_S = 0.5
+REST_SPEED_M_S = 0.02
+REST_TIME_S = 0.5
 """Standard deviation of a resting sensor's velocity, and how long the accelerometer's error persists."""
 
-_REST_BIAS_RAD = math.radians(0.03)
+REST_BIAS_RAD = math.radians(0.03)
 """Error of the bias after one second of rest: an MT9-B's Allan deviation at 1 s is 0.05 deg/s."""
 
-_REST_NOISE = 0.1
+REST_NOISE = 0.1
 """Random walk of a resting sensor's attitude, as a fraction of the gyroscope's. The gyroscope is not
 integrated at rest; this allows for turning too slow to notice."""
 
@@ -67,7 +70,7 @@ class ErrorStateFilter:
         self._monitor = FieldMonitor(settings)
         self._stray = 0.0
         self.kalman = KalmanFilter(dim_x=SIZE, dim_z=3)
-        self.kalman.P = _start_covariance(settings)
+        self.kalman.P = start_covariance(settings)
         self.transition = np.eye(SIZE)
 
     @property
@@ -77,7 +80,7 @@ class ErrorStateFilter:
 
     def resume(self, increment: Increment, pause_s: float) -> None:
         """Find up and north again after a pause before `increment`; keep bias and reference field."""
-        fresh = _start_covariance(self.settings)
+        fresh = start_covariance(self.settings)
         walk = self.settings.bias_walk_rad_s_sqrt_s**2 * pause_s
         for row in (BIAS, HEADING_BIAS):
             for column in (BIAS, HEADING_BIAS):
@@ -134,7 +137,7 @@ class ErrorStateFilter:
         start.add(increment)
         self._level = start.level()
         self.velocity = np.zeros(3)
-        over = start.duration_s >= _START_S
+        over = start.duration_s >= START_S
         self._start = None if over else start
         if start.field_s > 0.0 and self._magnetic:
             field = self._level @ start.field()
@@ -174,7 +177,7 @@ class ErrorStateFilter:
         rate = math.hypot(*(increment.rate_rad_s - self.bias))
         turning = s.gyro_noise_rad_sqrt_s**2 + (s.gyro_scale_noise_sqrt_s * rate) ** 2
         if self.resting:
-            turning = (_REST_NOISE * s.gyro_noise_rad_sqrt_s) ** 2
+            turning = (REST_NOISE * s.gyro_noise_rad_sqrt_s) ** 2
         noise = np.zeros((SIZE, SIZE))
         walk = s.bias_walk_rad_s_sqrt_s**2 * duration
         i = np.arange(3)
@@ -194,13 +197,13 @@ class ErrorStateFilter:
         s = self.settings
         variance = 2.0 * s.speed_m_s**2 * s.speed_time_s
         if self.resting:
-            variance = 2.0 * _REST_SPEED_M_S**2 * _REST_TIME_S
+            variance = 2.0 * REST_SPEED_M_S**2 * REST_TIME_S
         self.kalman.update(-self.velocity[:, None], R=variance / duration, H=_OBSERVES_SPEED)
         self._inject()
 
     def _correct_bias(self, increment: Increment) -> None:
         """Correct both copies of the bias, one by one, by the gyroscope's reading at rest."""
-        variance = _REST_BIAS_RAD**2 / increment.duration_s * np.eye(3)
+        variance = REST_BIAS_RAD**2 / increment.duration_s * np.eye(3)
         tilt = increment.rate_rad_s - self.bias
         if not self._magnetic:
             self._masked_update(_OBSERVES_BIAS, tilt, variance, np.ones(SIZE))
@@ -316,12 +319,12 @@ _HEADING_ONLY[[HEADING, 9, 10, 11, STRAY]] = 1.0
 _INCLINATION = 1.0 - _HEADING_ONLY
 
 
-def _start_covariance(settings: FusionSettings) -> FloatArray:
+def start_covariance(settings: FusionSettings) -> FloatArray:
     """Covariance at the start: the heading is unknown, both copies of the bias are one."""
     covariance = np.zeros((SIZE, SIZE))
     heading = math.pi if settings.use_magnetometer else 1e-6  # without, it starts at zero by definition
     i = np.arange(3)
-    tilt = (2.0 * settings.speed_m_s / (settings.gravity_m_s2 * _START_S)) ** 2
+    tilt = (2.0 * settings.speed_m_s / (settings.gravity_m_s2 * START_S)) ** 2
     covariance[i, i] = tilt, tilt, heading**2
     bias = settings.bias_sd_rad_s**2
     covariance[i + 3, i + 3] = bias

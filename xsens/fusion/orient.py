@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
-from xsens.fusion.errorstate import ErrorStateFilter
 from xsens.fusion.increments import Samples
 from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
-from xsens.fusion.smoothing import Smoothed, Step, forward, smooth
 from xsens.logs.samples import ImuLog
+
+if TYPE_CHECKING:
+    from xsens.fusion.smoothing import FilterSteps, Smoothed
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -137,8 +138,10 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
 def _stretches(
     samples: Samples, breaks: IntArray, settings: FusionSettings, smoothing: bool
 ) -> list[_Result]:
+    from xsens.fusion.smoothing import forward, fresh_filter, smooth, within_steps  # which loads numba
+
     results: list[_Result] = []
-    kalman: ErrorStateFilter | None = None
+    kept = fresh_filter(settings)
     step_s = float(np.median(samples.step_s))
     edges = [0, *breaks.tolist(), len(samples)]
     for first, last in pairwise(edges):
@@ -149,50 +152,33 @@ def _stretches(
         if first:
             stretch = replace(stretch, step_s=np.concatenate([[step_s], stretch.step_s[1:]]))
         if smoothing and stretch.step_s.sum() > _SHORTEST_S:
-            results.append(_from_smoother(*smooth(stretch, settings)))
-            continue
-        steps, kalman = forward(stretch, settings, kalman, pause_s)
-        results.append(_from_filter(steps))
+            steps, found = smooth(stretch, settings)
+            nodes, biases = found.matrices, found.bias_rad_s
+            within = within_steps(steps, nodes[:-1], biases[:-1], nodes[1:])
+            results.append(_from_smoother(steps, found, within))
+        else:
+            steps = forward(stretch, settings, kept, pause_s)
+            results.append(_from_filter(steps, within_steps(steps, steps.start, steps.start_bias)))
     return results
 
 
-def _from_filter(steps: list[Step]) -> _Result:
-    starts = Rotation.from_matrix([step.start for step in steps])
-    resting = np.array([step.resting for step in steps])
-    within = _within_steps(steps, starts, np.array([step.start_bias_rad_s for step in steps]), resting)
-    each = _step_of_sample(steps)
-    sd = np.sqrt([np.diag(step.covariance)[:3] for step in steps])
-    disturbed = np.array([step.disturbed for step in steps])
-    after = np.array([step.bias_rad_s for step in steps])
-    return _Result(within.as_quat(), sd[each], after[each], disturbed[each], resting[each])
+def _from_filter(steps: FilterSteps, xyzw: FloatArray) -> _Result:
+    disturbed, resting = steps.disturbed > 0.0, steps.resting > 0.0
+    return _each_sample(steps, xyzw, steps.sd_rad, steps.bias, disturbed, resting)
 
 
-def _from_smoother(steps: list[Step], found: Smoothed) -> _Result:
-    """Result by the gyroscope within each step; its error at the step's end is spread over the step."""
-    nodes = Rotation.from_matrix(found.matrices)
-    within = _within_steps(steps, nodes[:-1], found.bias_rad_s[:-1], found.resting)
-    each = _step_of_sample(steps)
-    last = np.flatnonzero(np.diff(each, append=len(steps)))
-    missed = (nodes[1:] * within[last].inv()).as_rotvec()
-    share = np.concatenate([step.increment.time_s / step.increment.time_s[-1] for step in steps])
-    spread = Rotation.from_rotvec(share[:, None] * missed[each]) * within
-    sd, bias = found.sd_rad[1:], found.bias_rad_s[1:]
-    return _Result(spread.as_quat(), sd[each], bias[each], found.disturbed[each], found.resting[each])
+def _from_smoother(steps: FilterSteps, found: Smoothed, xyzw: FloatArray) -> _Result:
+    return _each_sample(steps, xyzw, found.sd_rad[1:], found.bias_rad_s[1:], found.disturbed, found.resting)
 
 
-def _step_of_sample(steps: list[Step]) -> IntArray:
-    return np.repeat(np.arange(len(steps)), [step.increment.time_s.size for step in steps])
-
-
-def _within_steps(
-    steps: list[Step], starts: Rotation, biases_rad_s: FloatArray, resting: BoolArray
-) -> Rotation:
-    """World from sensor at every sample, by the gyroscope from the steps' starts; held in `resting` steps."""
-    increments = [step.increment for step in steps]
-    each = _step_of_sample(steps)
-    off = np.array([increment.bias_rad_s for increment in increments]) - biases_rad_s
-    time_s = np.concatenate([increment.time_s for increment in increments])
-    turns = Rotation.from_quat(np.concatenate([increment.turns_xyzw for increment in increments]))
-    turns *= Rotation.from_rotvec(off[each] * time_s[:, None])
-    held = np.where(resting[each, None], [0.0, 0.0, 0.0, 1.0], turns.as_quat())
-    return starts[each] * Rotation.from_quat(held)
+def _each_sample(
+    steps: FilterSteps,
+    xyzw: FloatArray,
+    sd_rad: FloatArray,
+    bias_rad_s: FloatArray,
+    disturbed: BoolArray,
+    resting: BoolArray,
+) -> _Result:
+    """Give every sample what was found for its step."""
+    each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
+    return _Result(xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
