@@ -136,7 +136,7 @@ class MotionEvidence:
             Instead, how a sensor that does not move would fit.
         """
         ahead, back = self._agreements(sensors, noise, still)
-        return np.minimum(total_misfit(ahead), total_misfit(back))
+        return np.broadcast_to(np.minimum(total_misfit(ahead), total_misfit(back)), len(sensors))
 
     def _agreements(
         self, sensors: Sequence[OrientationSensor | Tracker], noise: FloatArray, still: bool
@@ -293,28 +293,56 @@ class GyroscopeEvidence:
         return bool(tells.any() and np.sum(self.left[tells] ** 2) < 0.3 * np.sum(self.measured[tells] ** 2))
 
 
-def gyroscope_evidence(sensor: OrientationSensor) -> GyroscopeEvidence | None:
-    """Compare readings with the gyroscope; None without one, or with too few readings."""
-    rate, time_s, turned = sensor.gyroscope_rad_s, sensor.readings.time_s, sensor.readings.world_from_sensor
-    if rate is None or len(turned) < 20:
-        return None
-    pause = np.diff(time_s)
-    lag = max(1, round(_SHORT_S / float(np.median(pause))))
-    if len(turned) <= 2 * lag:
-        return None
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)])
-    first = np.unique(np.linspace(0, len(turned) - 1 - lag, _MOST_STEPS).round().astype(int))
-    first = first[time_s[first + lag] - time_s[first] < 2.0 * _SHORT_S]
-    if first.size < _FEWEST_STEPS:
-        return None
-    integrated = np.rad2deg(angle[first + lag] - angle[first])
-    read = (turned[first].inv() * turned[first + lag]).as_rotvec(degrees=True)
-    left = integrated - read
-    measured = _spread(integrated - np.median(integrated, axis=0))
-    noise = 0.1 + _SCALE_ERROR * float(measured.max())
-    drift = np.median(left, axis=0)
-    bias = float(np.linalg.norm(drift) / np.median(time_s[first + lag] - time_s[first]))
-    return GyroscopeEvidence(_spread(left - drift), measured, bias, noise, len(turned) / lag)
+@dataclass(frozen=True)
+class GyroscopeTurns:
+    """How a sensor's gyroscope has it turn over 0.3 s, from some readings to others.
+
+    Attributes
+    ----------
+    first, second : ndarray of int, shape (m,)
+        Readings.
+    degrees : ndarray, shape (m, 3)
+    seconds : float
+        Between them, median.
+    steps : float
+        As in `Agreement`.
+    """
+
+    first: IntArray
+    second: IntArray
+    degrees: FloatArray
+    seconds: float
+    steps: float
+
+    @classmethod
+    def of(cls, sensor: OrientationSensor) -> GyroscopeTurns | None:
+        """None without a gyroscope, or with too few readings."""
+        rate, time_s = sensor.gyroscope_rad_s, sensor.readings.time_s
+        if rate is None or len(time_s) < 20:
+            return None
+        pause = np.diff(time_s)
+        lag = max(1, round(_SHORT_S / float(np.median(pause))))
+        if len(time_s) <= 2 * lag:
+            return None
+        turned = np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)
+        angle = np.concatenate([np.zeros((1, 3)), turned])
+        first = np.unique(np.linspace(0, len(time_s) - 1 - lag, _MOST_STEPS).round().astype(int))
+        first = first[time_s[first + lag] - time_s[first] < 2.0 * _SHORT_S]
+        if first.size < _FEWEST_STEPS:
+            return None
+        second = first + lag
+        seconds = float(np.median(time_s[second] - time_s[first]))
+        return cls(first, second, np.rad2deg(angle[second] - angle[first]), seconds, len(time_s) / lag)
+
+    def compared(self, turned: Rotation) -> GyroscopeEvidence:
+        """Compare with readings, which may have been put right."""
+        read = (turned[self.first].inv() * turned[self.second]).as_rotvec(degrees=True)
+        left = self.degrees - read
+        measured = _spread(self.degrees - np.median(self.degrees, axis=0))
+        noise = 0.1 + _SCALE_ERROR * float(measured.max())
+        drift = np.median(left, axis=0)
+        bias = float(np.linalg.norm(drift)) / self.seconds
+        return GyroscopeEvidence(_spread(left - drift), measured, bias, noise, self.steps)
 
 
 def gravity_from_vertical(sensor: OrientationSensor) -> float | None:

@@ -19,9 +19,9 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.correction.evidence import (
+    GyroscopeTurns,
     MotionEvidence,
     gravity_from_vertical,
-    gyroscope_evidence,
     noise_of,
     total_misfit,
 )
@@ -151,16 +151,19 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) ->
     doubts: list[Doubt] = []
     misled: set[str] = set()
     if sweep.tracker is not None and _usable(sweep.tracker, seen):
-        found = [*_frozen_doubts(sweep.tracker, seen)] or [*_Examination(sweep.tracker, seen).doubts()]
+        found = [*_frozen_doubts(sweep.tracker, seen)] or [
+            *_Examination(_Accused(sweep.tracker), seen).doubts()
+        ]
         misled |= {doubt.about for doubt in found}
         doubts += [*found, *_unequal_lengths(sweep.tracker, seen, length_sigma), *_slip_doubts(sweep.tracker)]
     confirmed = False
     if sweep.orientation is not None and _usable(sweep.orientation, seen):
-        examination = _Examination(sweep.orientation, seen)
+        accused = _Accused(sweep.orientation)
+        examination = _Examination(accused, seen)
         found = [*_frozen_doubts(sweep.orientation, seen)] or [*examination.doubts()]
         misled |= {doubt.about for doubt in found}
         if not found and sweep.tracker is not None and not doubts and _usable(sweep.tracker, seen):
-            by_tracker = _Examination(sweep.orientation, _tracked(sweep, sweep.tracker)).doubts()
+            by_tracker = _Examination(accused, _tracked(sweep, sweep.tracker)).doubts()
             # One of the two is wrong, and which is not known.
             found = [
                 replace(each, suspect=f"{each.suspect}, or the tracker", refuted=False) for each in by_tracker
@@ -218,16 +221,34 @@ class _Gain:
         return self.images + self.gyroscope
 
 
+class _Accused(Generic[Sensor]):
+    """A sensor, conventions that may be mistaken, and how much better its gyroscope fits each put right."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor: Sensor = sensor
+        self.conventions: tuple[Suspect[Sensor], ...] = tuple(suspects(sensor))
+        turns = GyroscopeTurns.of(sensor) if isinstance(sensor, OrientationSensor) else None
+        self.gyroscope = turns and turns.compared(sensor.readings.world_from_sensor)
+        self.turning = [self._turning(turns, suspect.mended) for suspect in self.conventions]
+
+    def _turning(self, turns: GyroscopeTurns | None, mended: Sensor) -> float:
+        # No mounting changes how readings turn.
+        if turns is None or self.gyroscope is None or mended.readings is self.sensor.readings:
+            return 0.0
+        return self.gyroscope.misfit - turns.compared(mended.readings.world_from_sensor).misfit
+
+
 class _Examination(Generic[Sensor]):
     """One sensor against the images, and against its gyroscope if it has one."""
 
-    def __init__(self, sensor: Sensor, seen: MotionEvidence) -> None:
-        self.about, self.seen = name_of(sensor), seen
-        self.sensor: Sensor = sensor
-        self.noise = noise_of(sensor, seen.time_s, seen.centre_mm)
-        self.agreements = seen.agreements(sensor, self.noise)
+    def __init__(self, accused: _Accused[Sensor], seen: MotionEvidence) -> None:
+        self.accused: _Accused[Sensor] = accused
+        self.sensor: Sensor = accused.sensor
+        self.seen = seen
+        self.about, self.gyroscope = name_of(accused.sensor), accused.gyroscope
+        self.noise = noise_of(self.sensor, seen.time_s, seen.centre_mm)
+        self.agreements = seen.agreements(self.sensor, self.noise)
         self.misfit = float(total_misfit(self.agreements).item())
-        self.gyroscope = gyroscope_evidence(sensor) if isinstance(sensor, OrientationSensor) else None
 
     def doubts(self) -> Iterator[Doubt]:
         """At most one: the likeliest fault, if one is far likelier than none."""
@@ -238,7 +259,12 @@ class _Examination(Generic[Sensor]):
             )
             yield Doubt(self.about, "noise or scrambled values", evidence, bool((jitter > _MOST_NOISE).any()))
             return
-        conventions = self._gains(tuple(suspects(self.sensor)))
+        kinds = self.accused.conventions
+        explained = self._gains([kind.mended for kind in kinds])
+        conventions = [
+            _Gain(kind.name, float(gain), turning)
+            for kind, gain, turning in zip(kinds, explained, self.accused.turning, strict=True)
+        ]
         conventions.append(_Gain("another recording, or scrambled values", self._gain_of_still()))
         best = max(conventions, key=lambda gain: gain.total)
         turned, degrees = self._mounting()
@@ -278,33 +304,19 @@ class _Examination(Generic[Sensor]):
             return gain.images > _POSE_GAIN
         return gain.total > (_GYROSCOPE_GAIN if gain.gyroscope > _GYROSCOPE_GAIN else _TURN_GAIN)
 
-    def _gains(self, accused: Sequence[Suspect[Sensor]]) -> list[_Gain]:
-        """What each fault, put right, would explain."""
-        explained = self.misfit - self.seen.misfits([suspect.mended for suspect in accused], self.noise)
-        return [
-            _Gain(suspect.name, float(gain), self._turning(suspect.mended))
-            for suspect, gain in zip(accused, np.broadcast_to(explained, len(accused)), strict=True)
-        ]
-
-    def _turning(self, mended: Sensor) -> float:
-        """How much better a mended sensor fits its gyroscope, which no mounting changes."""
-        if self.gyroscope is None or not isinstance(mended, OrientationSensor):
-            return 0.0
-        evidence = None if mended.readings is self.sensor.readings else gyroscope_evidence(mended)
-        return 0.0 if evidence is None else self.gyroscope.misfit - evidence.misfit
+    def _gains(self, mended: Sequence[Sensor]) -> FloatArray:
+        """What each sensor put right would explain of the images."""
+        return self.misfit - self.seen.misfits(mended, self.noise)
 
     def _gain_of_still(self) -> float:
         return self.misfit - float(self.seen.misfits([self.sensor], self.noise, still=True)[0])
 
     def _mounting(self) -> tuple[_Gain, float]:
         """The rotation of the image on the sensor that fits best, and its angle, degrees."""
-        best, degrees = _Gain("mounting", -np.inf), 0.0
         turns = [self.seen.turn(self.sensor, self.noise, sign) for sign in (1, -1)]
-        turned = [Suspect("mounting", _turned(self.sensor, turn, self.seen.centre_mm)) for turn in turns]
-        for turn, gain in zip(turns, self._gains(turned), strict=True):
-            if gain.images > best.images:
-                best, degrees = gain, float(np.degrees(turn.magnitude()))
-        return best, degrees
+        gains = self._gains([_turned(self.sensor, turn, self.seen.centre_mm) for turn in turns])
+        best = int(np.argmax(gains))
+        return _Gain("mounting", float(gains[best])), float(np.degrees(turns[best].magnitude()))
 
     def _clock(self) -> tuple[_Gain, float]:
         """The delay at which the shortest steps fit best, s, over the same frames at every delay."""
