@@ -1,4 +1,4 @@
-"""Tiles that are made once, whichever threads ask, and forgotten in the order in which they were asked for."""
+"""Tiles that are made once, whichever threads ask, and forgotten in the order they were asked for."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
