@@ -148,7 +148,8 @@ def _run(
     for part in folders.glob(".part-*"):
         shutil.rmtree(part, ignore_errors=True)
     by_name = {job.name: job for job in jobs}
-    tasks, after = _tasks(jobs)
+    # The longest first, so that no worker is left with it while the others have nothing to do.
+    tasks, after = _tasks(sorted(jobs, key=lambda job: job.frames, reverse=True))
     so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
     tell = progress or (lambda at: None)
     tell(so_far)

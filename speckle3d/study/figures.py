@@ -286,7 +286,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
     figure.set_dpi(DOTS_PER_INCH)
     with atomic_path(path) as part:
         # `savefig` would draw everything twice, the first time for the layout alone.
-        FigureCanvasAgg(figure).print_png(part)
+        FigureCanvasAgg(figure).print_png(part)  # type: ignore[no-untyped-call]
     return path
 
 

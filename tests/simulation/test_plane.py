@@ -164,7 +164,7 @@ def test_no_scatterer_of_the_sheet_in_the_box_is_missed():
     image_from_sheet = RigidTransform.from_components([18.0, 20.0, 1.0], turn.inv())
     low, high = np.array([-2.7, 1.0, -4.0]), np.array([40.5, 45.0, 4.0])
     found = sheet.near(image_from_sheet, low, high)
-    everything = np.concatenate([sheet.tile(i, j) for i in range(-15, 15) for j in range(-15, 15)])
+    everything = np.concatenate(sheet.tiles((i, j) for i in range(-15, 15) for j in range(-15, 15)))
 
     def inside(position):
         place = image_from_sheet.apply(position)
