@@ -92,6 +92,7 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
         raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
     if _is_text(data):
         text = data.decode("utf-16" if data.startswith(_WIDE) else "utf-8-sig", errors="replace")
+        del data
         return parse_text(text, hints, str(path))
     return parse_stream(data, hints, str(path))
 
