@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,26 +17,28 @@ from speckle3d.correction.trust import believed, cleaned_readings, examine_senso
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import speckle_size
+from speckle3d.matching.texture import SpeckleSizes, speckle_size
 from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.curve_doubts import DepthFactors, doubt_curves, doubt_speed
-from speckle3d.motion.estimate import PairReader, SignedPair
+from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.plausibility import far_apart, folded, severed, standing, undetermined
+from speckle3d.motion.signs import SignedPairs
 
 
 def doubts_of_curves(
     sweep: Sweep,
     curves: DecorrelationCurves,
     matcher: FrameMatcher,
+    sizes: SpeckleSizes,
     reader: PairReader,
     factors: DepthFactors,
     flags: IntArray,
-    pairs: Sequence[SignedPair],
+    pairs: SignedPairs,
     coherence: Coherence | None,
     path: FloatArray,
 ) -> tuple[Doubt, ...]:
     """What a sweep's own speckle says against the curves; raises if it refutes them."""
-    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0))
+    size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0), sizes)
     found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
     return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
 
@@ -59,7 +60,7 @@ def doubts_of_path(
     image: RigidTransform,
     covariance: FloatArray,
     table: CorrelationTable,
-    pairs: Sequence[SignedPair],
+    pairs: SignedPairs,
     matcher: FrameMatcher,
     curves: DecorrelationCurves,
     flags: IntArray,
@@ -68,7 +69,7 @@ def doubts_of_path(
     z_mm, sigma_mm = image.apply(matcher.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2])
     found = (
         undetermined(z_mm, sigma_mm, float(curves.distance_mm[-1])),
-        severed([pair.first for pair in pairs], [pair.second for pair in pairs], flags == 0),
+        severed(pairs.first, pairs.second, flags == 0),
         folded(table, image, matcher.patches.centre_mm, flags == 0),
     )
     return unrefuted(found, sweep.name, InsufficientDataError)

@@ -6,7 +6,7 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,14 +36,15 @@ from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import doubt_images
+from speckle3d.matching.texture import SpeckleSizes, doubt_images
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import DepthFactors, doubt_depths, doubt_widths
 from speckle3d.motion.curve_prior import RowsSeen, rows_seen, straightened
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import PairReader, SignedPair
+from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
+from speckle3d.motion.signs import SignedPairs
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
 
 Progress = Callable[[int, int], None]
@@ -184,8 +185,9 @@ def track(
     )
 
     # RF -> intensity -> in-plane motion -> patch correlation
+    sizes = SpeckleSizes(sweep, matcher, images)
     found = match_sweep(
-        sweep, matcher, settings.trajectory, settings.quality, times, progress, images, matched
+        sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep, matched
     )
     flags = _flagged(sweep, found, settings)
 
@@ -198,7 +200,9 @@ def track(
         # What stands still would be blamed on the curves.
         doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
         factors = reader.depth_factors(found.table, path, sound, settings.coherence)
-        doubts += doubts_of_curves(sweep, curves, matcher, reader, factors, flags, pairs, coherence, path)
+        doubts += doubts_of_curves(
+            sweep, curves, matcher, sizes, reader, factors, flags, pairs, coherence, path
+        )
 
     # -> curves of the lens that the depths of the images agree on, and everything read with them
     mismatch, given = curves.mismatch(settings.curves.same_probe), curves
@@ -219,12 +223,12 @@ def track(
         ties = tie_returns(
             returns, table, path[:, 0], reader.fitter, coherence, settings.trajectory.least_correlation
         )
-        pairs = _in_order([*pairs, *(t for t in ties if not flags[t.first] and not flags[t.second])])
+        pairs = pairs.and_also(ties[(flags[ties.first] == 0) & (flags[ties.second] == 0)])
 
     # -> graph of relative poses -> trajectory
     with times.of("trajectory"):
         slopes = reader.slopes(pairs, coherence)
-        edges = reader.edges(table, pairs, [slopes.applied(pair.plane) for pair in pairs])
+        edges = reader.edges(table, pairs, slopes.applied(pairs.planes))
         trajectory = reader.solve(edges, with_covariance=True)
         covariance = pose_covariance(
             trajectory.poses,
@@ -335,7 +339,7 @@ def _measured(
     config: Config,
     times: StageTimes,
     known: FloatArray | None = None,
-) -> tuple[list[SignedPair], Coherence | None, FloatArray]:
+) -> tuple[SignedPairs, Coherence | None, FloatArray]:
     """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
 
     Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
@@ -372,35 +376,30 @@ def _rows_seen(factors: DepthFactors, coherence: Coherence | None, matcher: Fram
     return rows_seen(factors, matcher.patches.rows_of(coherence.share.mean(axis=0)).mean(axis=-1))
 
 
-def _in_order(pairs: Sequence[SignedPair]) -> list[SignedPair]:
-    return sorted(pairs, key=lambda pair: (pair.second, pair.first))
-
-
-def _with_unjoined(flags: IntArray, reader: PairReader, pairs: Sequence[SignedPair]) -> IntArray:
+def _with_unjoined(flags: IntArray, reader: PairReader, pairs: SignedPairs) -> IntArray:
     """Flags in which sound frames that no pair joins to earlier ones are unmatched, too."""
-    lone = reader.unjoined(np.array([pair.second for pair in pairs]))
+    lone = reader.unjoined(pairs.second)
     return np.where(lone & (flags == 0), int(FrameFlag.UNMATCHED), flags)
 
 
 def _consistent(
     sweep: Sweep,
     table: CorrelationTable,
-    pairs: Sequence[SignedPair],
+    pairs: SignedPairs,
     direction: int,
     reader: PairReader,
     config: Config,
-) -> tuple[RigidTransform | None, list[BoolArray]]:
-    """Poses from the orientation-consistent patches (None without a sensor), and the patches used by pair."""
+) -> tuple[RigidTransform | None, BoolArray]:
+    """Poses from the orientation-consistent patches (None without a sensor), and each pair's patches used."""
     sensed = sensed_orientation(sweep, config.sensors)
     if sensed is None:
-        return None, [pair.plane.used for pair in pairs]
+        return None, pairs.planes.used
     planes = reader.consistent(table, pairs, sensed, direction)
-    return reader.solve(reader.edges(table, pairs, planes)).poses, [plane.used for plane in planes]
+    return reader.solve(reader.edges(table, pairs, planes)).poses, planes.used
 
 
-def _rejected_share(pairs: Sequence[SignedPair], used: Sequence[BoolArray]) -> float:
-    rejected = sum(int((pair.plane.used & ~u).sum()) for pair, u in zip(pairs, used, strict=True))
-    return rejected / sum(int(pair.plane.used.sum()) for pair in pairs)
+def _rejected_share(pairs: SignedPairs, used: BoolArray) -> float:
+    return float((pairs.planes.used & ~used).sum() / pairs.planes.used.sum())
 
 
 def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:

@@ -218,6 +218,60 @@ def bin_by_distance(rho, offset_mm, slope, lateral_mm, edges_mm):
     return out
 
 
+def echo_model(bins, scale, stretch, length_mm, curves, redundancy, gain_precision):
+    """Twin of `speckle3d.kernels.coherence.fit_echo_models` for one patch and model: cost, share and gain."""
+    amplitude, step_mm, cells, of_echo = curves
+    n, d, rho, square = bins[bins[:, 0] > 0].T
+    d, mean, spread = d / n, rho / n, square / n - (rho / n) ** 2
+    at = np.minimum(d * scale / stretch / step_mm, amplitude.size - 1 - 1e-6)
+    g = np.interp(at, np.arange(amplitude.size), amplitude)
+    h = np.exp(-d * scale / length_mm) if length_mm > 0 else np.zeros_like(d)
+    share, gain = 0.1 if length_mm > 0 else 0.0, 1.0
+    for _ in range(8):
+        echo = share * h + (1 - share) * g
+        model = gain * echo**2
+        seen = np.minimum(model, 1.0)
+        variance = (1 - seen) ** 2 / cells * (2 * seen + 1 / cells if of_echo else (1 + seen) ** 2) + 1e-3
+        weight = n / (variance * redundancy)
+        cost = (weight * ((mean - model) ** 2 + spread)).sum() + (n * np.log(variance)).sum() / redundancy
+        if length_mm < 0:
+            break
+        cost += gain_precision * (gain - 1) ** 2
+        jacobian = np.stack([2 * gain * echo * (h - g), echo**2])
+        normal = (jacobian * weight) @ jacobian.T + np.diag([0.1, gain_precision])
+        pull = (jacobian * weight) @ (mean - model) - [0.0, gain_precision * (gain - 1)]
+        if length_mm == 0:
+            normal[0], normal[:, 0], pull[0] = [1.0, 0.0], [1.0, 0.0], 0.0
+        step = 0.8 * np.linalg.solve(normal, pull)
+        moved = np.clip([share + step[0], gain + step[1]], [0.0, 0.1], [0.97, 1.03])
+        if np.abs(moved - [share, gain]).sum() < 2e-3:
+            break
+        share, gain = moved
+    return cost, share, gain
+
+
+def pose_graph_step(poses, first, second, measured, information, huber):
+    """Twin of one round of `speckle3d.kernels.graph.relax`, dense: the normal equations and the gradient.
+
+    Parameters are exponential coordinates, rotation first, on the right of all poses but the first.
+    """
+    normal, gradient = 1e-9 * np.eye(6 * len(poses)), np.zeros(6 * len(poses))
+    for i, j, z, omega in zip(first, second, measured, information, strict=True):
+        relative = poses[i].inv() * poses[j]
+        error = (z.inv() * relative).as_exp_coords()
+        x, y, w = relative.inv().translation
+        turn = relative.inv().rotation.as_matrix()
+        carried = np.zeros((6, 6))
+        carried[:3, :3] = carried[3:, 3:] = turn
+        carried[3:, :3] = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]]) @ turn
+        weight = min(1.0, huber / max(np.sqrt(error @ omega @ error / 6), 1e-9))
+        jacobian = np.zeros((6, 6 * len(poses)))
+        jacobian[:, 6 * i : 6 * i + 6], jacobian[:, 6 * j : 6 * j + 6] = -carried, np.eye(6)
+        normal += weight * jacobian.T @ omega @ jacobian
+        gradient += weight * jacobian.T @ omega @ error
+    return normal[6:, 6:], gradient[6:]
+
+
 def edges_of_columns(samples, inside, sigma, threshold):
     """Twin of `calibration.detection.edges` by slope: each run of rows convolved alone, maxima by search.
 
@@ -379,3 +433,139 @@ def look_up_on_planes(points_mm, volume, planes, pixels):
         at = [[k + share], [(x - pixels[2]) / pixels[0]], [(y - pixels[3]) / pixels[1]]]
         found[n] = ndimage.map_coordinates(volume.astype(float), at, order=1, mode="constant", cval=np.nan)[0]
     return found
+
+
+def correlation_plane(rho, design, spread_mm, echo, curves, starts, prior, huber, outlying, evidence, enough,
+                      rounds):  # fmt: skip
+    """Twin of `speckle3d.kernels.planes.fit_planes` for one pair of which all patches take part.
+
+    echo: staying, moving, gain, stretch, staying_sd, stretch_sd, each (p,); prior: means, inverse variances.
+    Returns plane, information, cost, excess distances and their deviations.
+    """
+    patch = np.arange(rho.size)
+    staying, moving, gain, stretch, staying_sd, stretch_sd = echo
+
+    def predict(d):
+        at = np.minimum(d / stretch / curves.step_mm, curves.amplitude.shape[1] - 1.001)
+        k = at.astype(int)
+        low = curves.amplitude[patch, k]
+        rise = curves.amplitude[patch, k + 1] - low
+        g = low + (at - k) * rise
+        field = staying + moving * g
+        slope = 2 * gain * field * moving * (rise / curves.step_mm / stretch)
+        limited = np.minimum(gain * field * field, 0.999)
+        n = curves.cells
+        noise = 2 * limited * (1 - limited) ** 2 / n + (1 - limited) ** 2 / n**2
+        noise = noise if curves.of_echo else (1 - limited**2) ** 2 / n
+        uncertain = (staying_sd * (1 - g) * 2 * field * gain) ** 2 + (stretch_sd * slope * d) ** 2
+        return gain * field * field, slope, np.sqrt(noise + 0.003**2 + uncertain)
+
+    def compare(plane):
+        z = design[:, 0] * plane[0] + design[:, 1] * plane[1] + design[:, 2] * plane[2]
+        turned = spread_mm * plane[2]
+        d = np.sqrt(z * z + turned * turned)
+        model, slope, sigma = predict(d)
+        left = (rho - model) / sigma
+        weight = np.minimum(1.0, huber / np.maximum(np.abs(left), 1e-300))
+        change = z[:, None] * design
+        change[:, 2] += spread_mm * turned
+        return z, d, sigma, left, weight, (slope / np.maximum(d, 1e-9) / sigma)[:, None] * change
+
+    def descend(plane):
+        damping, last, trial = 1e-3, np.inf, plane
+        for _ in range(rounds + 1):
+            _, _, _, left, weight, jacobian = compare(trial)
+            size = np.abs(left)
+            total = (prior[1] * (trial - prior[0]) ** 2).sum()
+            total += np.where(size <= huber, left**2, huber * (2 * size - huber)).sum()
+            if total <= last:
+                settled, last, plane = last - total < 1e-6 * max(total, 1.0), total, trial
+                gradient = (weight * left) @ jacobian - prior[1] * (trial - prior[0])
+                hessian = (jacobian.T * weight) @ jacobian + np.diag(prior[1])
+                damping, capped = max(damping * 0.2, 1e-9), np.minimum(left**2, outlying).sum()
+                if settled:
+                    break
+            else:
+                damping *= 8.0
+            damped = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
+            trial = plane + np.linalg.solve(damped, gradient)
+        return capped, last, plane
+
+    best = (np.inf,)
+    for number, start in enumerate(starts):
+        capped, last, plane = descend(start)
+        capped += evidence if number else 0.0
+        best = min(best, (capped, last, plane), key=lambda each: each[0])
+        if capped < enough:
+            break
+    _, cost, plane = best
+    z, d, sigma, left, weight, _ = compare(plane)
+    steep = predict(np.maximum(d, 0.05))[1] / sigma
+    outer = (steep * np.sign(z) * np.maximum(np.abs(z), 0.05) / np.maximum(d, 0.05))[:, None] * design
+    deviation = 1 / np.maximum(-steep, 1e-6)
+    return plane, (outer.T * weight) @ outer + np.diag(prior[1]), cost, -left * deviation, deviation
+
+
+def likeliest_path(frames, first, second, moved, covariance, unlike, rules):
+    """Twin of `speckle3d.kernels.signs.follow_paths`: all paths as arrays, frame by frame.
+
+    unlike: earlier and later frames, (u, 2). Returns (n, 2).
+    """
+    paths, cost, trend = np.zeros((1, frames, 2)), np.zeros(1), np.ones(1)
+
+    def misfit(relative, unsigned, weight):
+        both = [
+            np.einsum("...i,...ij,...j->...", o, weight, o)
+            for o in (relative - unsigned, relative + unsigned)
+        ]
+        return np.minimum(*both), np.where(both[0] <= both[1], 1.0, -1.0)
+
+    for frame in range(1, frames):
+        of = second == frame
+        if not of.any():
+            if rules.hold:
+                paths[:, frame] = paths[:, frame - 1]
+            continue
+        at, step = first[of], moved[of]
+        weight = rules.placed * covariance[of]
+        weight[:, [0, 1], [0, 1]] += (rules.relative_error * step) ** 2
+        weight = np.linalg.inv(weight)
+        here, latest = paths[:, at], int(np.argmax(at))
+        candidates = np.concatenate([here + step, here - step], axis=1)
+        off, _ = misfit(candidates[:, :, None] - here[:, None], step, weight)
+        along = candidates[:, :, 0] - here[:, [latest], 0]
+        doubt = np.minimum(off, rules.cap).sum(axis=2) + rules.turning_cost * (along * trend[:, None] < 0)
+        near = np.abs(candidates[:, :, None] - paths[:, None, unlike[unlike[:, 1] == frame, 0]])
+        same = (near[..., 0] < rules.apart_mm) & (near[..., 1] < rules.apart_slope)
+        doubt = doubt + rules.apart_cost * same.sum(axis=2)
+        if not paths.any():
+            doubt = np.where(candidates[:, :, 0] < 0, np.inf, doubt)
+        total = cost[:, None] + doubt
+        kept = []
+        for flat in np.argsort(total, axis=None, kind="stable")[: 4 * rules.hypotheses]:
+            parent, which = np.unravel_index(flat, total.shape)
+            if not np.isfinite(total[parent, which]) or len(kept) == rules.hypotheses:
+                break
+            place = candidates[parent, which]
+            left, sign = misfit(place - here[parent], step, weight)
+            agree = left < rules.cap
+            if agree.any():
+                told = here[parent][agree] + sign[agree, None] * step[agree]
+                normal = weight[agree].sum(axis=0)
+                place = np.linalg.solve(normal, np.einsum("eij,ej->i", weight[agree], told))
+            seen = np.vstack([here[parent], place])
+            others = [np.abs(path - seen).max(axis=0) for _, path, _ in kept]
+            if not any(o[0] < rules.same_mm and o[1] < rules.same_slope for o in others):
+                kept.append((int(parent), seen, float(total[parent, which])))
+        parents = np.array([parent for parent, _, _ in kept])
+        places = np.array([seen[-1] for _, seen, _ in kept])
+        recent = max(0, frame - rules.open_frames)
+        best, paths = paths[np.argmin(cost)], paths[parents]
+        paths[:, :recent] = best[:recent]
+        paths[:, frame] = places
+        step = places[:, 0] - here[parents, latest, 0]
+        share = 1.0 - np.exp(-np.abs(step) / rules.trend_mm)
+        trend = trend[parents] + share * (np.sign(step) - trend[parents])
+        cost = np.array([c for _, _, c in kept])
+        cost = cost - cost.min()
+    return paths[np.argmin(cost)]

@@ -106,7 +106,8 @@ def simulate(
     from speckle3d.simulation.presets import simulate as prepare
 
     settings = from_options(SimulationSettings, locals())
-    prepared = prepare(settings)
+    with progress_bar("computing the beam"):
+        prepared = prepare(settings)
     paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(prepared)]
     for path in paths:
         require_own_place(path, "simulation")

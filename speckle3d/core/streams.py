@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import require_increasing
+from speckle3d.core.geometry import components, require_increasing
 
 DEFAULT_MAX_GAP_S = 0.2
 """Longest pause between two samples that interpolation bridges: five frames at 25 frames/s, about the time
@@ -45,13 +45,12 @@ class TimedSamples(Generic[Samples]):
     def covers(self, times_s: npt.ArrayLike) -> BoolArray:
         """Whether each of `times_s` lies on a sample or between two that are close enough."""
         t = np.asarray(times_s, dtype=float)
-        on_sample = np.isin(t, self.time_s)
         if len(self) < 2:
-            return on_sample
+            return np.asarray(t == self.time_s[0])
         right = np.clip(np.searchsorted(self.time_s, t), 1, len(self) - 1)
         before, after = self.time_s[right - 1], self.time_s[right]
-        inside = (t >= before) & (t <= after) & (after - before <= self.max_gap_s)
-        return np.asarray(inside | on_sample)
+        inside = (t > before) & (t < after) & (after - before <= self.max_gap_s)
+        return np.asarray(inside | (t == before) | (t == after))
 
     def at(self, times_s: npt.ArrayLike) -> Samples:
         """Sample at each of `times_s`: slerp of the rotation, linear interpolation of the translation.
@@ -89,6 +88,11 @@ class TimedSamples(Generic[Samples]):
                 f"gaps over {self.max_gap_s:g} s are not bridged"
             )
         return t
+
+    @cached_property
+    def components(self) -> tuple[FloatArray, FloatArray]:
+        """Quaternions, scalar last, and translations, zero for rotations alone: shapes (m, 4) and (m, 3)."""
+        return components(self.world_from_sensor)
 
     @cached_property
     def _slerp(self) -> Slerp:

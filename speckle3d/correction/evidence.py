@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.geometry import components
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.kernels.steps import Readings, steps_of_readings
 
 _SHORT_S = 0.3
 """A hand's wobble and tremor turn round within this time, which is what fixes a clock."""
@@ -36,31 +38,35 @@ _MEDIAN_SQUARE = 0.455
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well a sensor's steps over one lag fit the images', one entry for each of x, y, z, tilt, yaw, roll.
+    """How well a sensor's steps over one lag fit the images', an entry for each of x, y, z, tilt, yaw, roll.
 
-    An orientation sensor has the last three alone. Standard deviations are robust, in mm and degrees.
+    An orientation sensor has the last three alone. Standard deviations are robust, in mm and degrees. Several
+    sensors' may be stacked.
 
     Attributes
     ----------
-    left : ndarray
+    left : ndarray, shape (..., c)
         Of sensor less images.
-    seen : ndarray
+    seen : ndarray, shape (..., c)
         Of the images' steps.
-    noise : ndarray
+    noise : ndarray, shape (..., c)
         What honest sensors and images leave.
-    steps : float
+    steps : ndarray, shape (...)
         Number of independent ones.
     """
 
     left: FloatArray
     seen: FloatArray
     noise: FloatArray
-    steps: float
+    steps: FloatArray
 
     @property
-    def misfit(self) -> float:
+    def misfit(self) -> FloatArray:
         """Negative logarithm of the likelihood of normal residuals, their variance estimated."""
-        return float(self.steps * np.log(self.left**2 + self.noise**2).sum())
+        return np.asarray(self.steps * np.log(self.left**2 + self.noise**2).sum(axis=-1))
+
+    def __getitem__(self, one: int) -> Agreement:
+        return Agreement(self.left[one], self.seen[one], self.noise[one], self.steps[one])
 
 
 @dataclass(frozen=True)
@@ -106,9 +112,7 @@ class MotionEvidence:
         steps = steps_between(self.image[first], self.image[first + lag], self.centre_mm)
         return _Lag(first, first + lag, steps, (n - lag) / lag, lag * pause_s)
 
-    def agreements(
-        self, sensor: OrientationSensor | Tracker, noise: FloatArray, still: bool = False
-    ) -> list[Agreement]:
+    def agreements(self, sensor: OrientationSensor | Tracker, noise: FloatArray) -> list[Agreement]:
         """How a sensor's steps fit, over each lag that it covers, at the sign that fits better.
 
         Parameters
@@ -117,16 +121,36 @@ class MotionEvidence:
             Calibrated to the image.
         noise : ndarray, shape (6,)
             `noise_of` the sensor as it was recorded: a fault put right must not look better for being small.
+        """
+        signs = self._agreements([sensor], noise, False)
+        return [each[0] for each in signs[int(np.argmin([total_misfit(some)[0] for some in signs]))]]
+
+    def misfits(
+        self, sensors: Sequence[OrientationSensor | Tracker], noise: FloatArray, still: bool = False
+    ) -> FloatArray:
+        """Mean misfit of each of several sensors, that are read at the same times, as of its `agreements`.
+
+        Parameters
+        ----------
         still : bool
             Instead, how a sensor that does not move would fit.
         """
-        found: tuple[list[Agreement], ...] = ([], [])
-        for lag, covered, sensed in self._sensed(sensor):
-            if covered.sum() >= _FEWEST_STEPS:
-                both = self._both_signs(np.zeros_like(sensed) if still else sensed, noise, lag, covered)
-                for agreements, agreement in zip(found, both, strict=True):
+        ahead, back = self._agreements(sensors, noise, still)
+        return np.minimum(total_misfit(ahead), total_misfit(back))
+
+    def _agreements(
+        self, sensors: Sequence[OrientationSensor | Tracker], noise: FloatArray, still: bool
+    ) -> tuple[list[Agreement], list[Agreement]]:
+        """Of all sensors, stacked, over each lag that they cover, if the probe moved forward, and back."""
+        every = [self._sensed(sensor) for sensor in sensors]
+        signs: tuple[list[Agreement], list[Agreement]] = [], []
+        for number, lag in enumerate(self.lags):
+            sensed = np.stack([each[number] for each in every])
+            if np.isfinite(sensed[0, :, -1]).sum() >= _FEWEST_STEPS:
+                both = self._both_signs(0.0 * sensed if still else sensed, noise, lag)
+                for agreements, agreement in zip(signs, both, strict=True):
                     agreements.append(agreement)
-        return min(found, key=total_misfit)
+        return signs
 
     def delayed_misfits(
         self, sensor: OrientationSensor | Tracker, noise: FloatArray, delays_s: FloatArray
@@ -142,31 +166,24 @@ class MotionEvidence:
         misfit, steps : ndarray, shape (k,)
             NaN where the sensor covers too few frames; and how many independent steps there are.
         """
-        lag, k = self.lags[0], delays_s.size
-        times = self.time_s[np.stack([lag.first, lag.second])] + delays_s[:, None, None]
-        covered: BoolArray = np.all(sensor.covers(times.ravel()).reshape(times.shape), axis=1)
-        misfit, steps = np.full(k, np.nan), np.zeros(k)
-        enough: BoolArray = np.asarray(covered.sum(axis=1) >= _FEWEST_STEPS)
-        if not enough.any():
-            return misfit, steps
-        wanted = covered & enough[:, None]
-        first, second = (sensor.world_from_image(times[:, i][wanted]) for i in (0, 1))
-        sensed = steps_between(first, second, self.centre_mm)
-        parts = np.split(sensed, np.cumsum(wanted.sum(axis=1))[:-1])
-        for i in np.flatnonzero(enough):
-            best = min(
-                self._both_signs(parts[i], noise, lag, covered[i]), key=lambda agreement: agreement.misfit
-            )
-            misfit[i], steps[i] = best.misfit / best.steps, best.steps
+        lag, misfit, steps = self.lags[0], np.full(delays_s.size, np.nan), np.zeros(delays_s.size)
+        first, second = (self.time_s[frames] + delays_s[:, None] for frames in (lag.first, lag.second))
+        sensed = _steps_at(sensor, first, second, self.centre_mm)
+        enough = np.isfinite(sensed[..., -1]).sum(axis=1) >= _FEWEST_STEPS
+        if enough.any():
+            both = self._both_signs(sensed[enough], noise, lag)
+            steps[enough] = both[0].steps
+            misfit[enough] = np.minimum(both[0].misfit, both[1].misfit) / steps[enough]
         return misfit, steps
 
     def turn(self, sensor: OrientationSensor | Tracker, noise: FloatArray, sign: int) -> Rotation:
         """Rotation of the image on the sensor that best maps the images' steps to the sensor's."""
         sensed, seen = [], []
-        for lag, covered, measured in self._sensed(sensor):
+        for lag, every in zip(self.lags, self._sensed(sensor), strict=True):
+            covered = np.isfinite(every[:, -1])
             if covered.sum() < _FEWEST_STEPS:
                 continue
-            columns = measured.shape[1]
+            measured, columns = every[covered], every.shape[1]
             images = lag.steps[covered, -columns:] * (_MIRRORED[-columns:] if sign < 0 else 1.0)
             for axes in (slice(0, 3), slice(-3, None))[-(columns // 3) :]:
                 weight = 1.0 / (noise[-columns:][axes].max() * np.sqrt(lag.second[0] - lag.first[0]))
@@ -194,44 +211,45 @@ class MotionEvidence:
         spread = float(np.std(sensed - scale * seen))
         return abs(scale), spread * float(np.sqrt(covered.size / (_WANDERING * power)))
 
-    def _sensed(self, sensor: OrientationSensor | Tracker) -> Iterator[tuple[_Lag, BoolArray, FloatArray]]:
-        """Each lag, which of its steps a sensor covers, and these as the sensor has them."""
-        covered = sensor.covers(self.time_s)
-        poses, index = sensor.world_from_image(self.time_s[covered]), np.cumsum(covered) - 1
-        for lag in self.lags:
-            both: BoolArray = covered[lag.first] & covered[lag.second]
-            first, second = poses[index[lag.first[both]]], poses[index[lag.second[both]]]
-            yield lag, both, steps_between(first, second, self.centre_mm)
+    def _sensed(self, sensor: OrientationSensor | Tracker) -> list[FloatArray]:
+        """Steps over each lag as a sensor has them, shape (m, c); NaN where it has not."""
+        first, second = (
+            np.concatenate([getattr(lag, at) for lag in self.lags]) for at in ("first", "second")
+        )
+        steps = _steps_at(sensor, self.time_s[first], self.time_s[second], self.centre_mm)
+        return np.split(steps, np.cumsum([lag.first.size for lag in self.lags])[:-1])
 
-    def _both_signs(
-        self, sensed: FloatArray, noise: FloatArray, lag: _Lag, covered: BoolArray
-    ) -> tuple[Agreement, Agreement]:
-        """How steps fit the images' if the probe moved forward, and if it moved back."""
-        columns = sensed.shape[1]
-        forward = lag.steps[covered, -columns:]
+    def _both_signs(self, sensed: FloatArray, noise: FloatArray, lag: _Lag) -> tuple[Agreement, Agreement]:
+        """How steps, shape (k, m, c), fit the images' if the probe moved forward, and if it moved back."""
+        columns = sensed.shape[-1]
+        covered = np.isfinite(sensed[..., -1])
+        forward = np.where(covered[..., None], lag.steps[:, -columns:], np.nan)
         size = _spread(forward)
         wander = np.sqrt(lag.seconds / _SHORT_S) * np.array([_WANDER_MM] * 3 + [_WANDER_DEG] * 3)[-columns:]
-        turning = np.zeros(columns)
+        turning = np.zeros_like(size)
         if self.by_images:
-            turning[-3:-1] = np.hypot(_TURN_DEG, _TURN_SHARE * size[-3:-1])
+            turning[:, -3:-1] = np.hypot(_TURN_DEG, _TURN_SHARE * size[:, -3:-1])
         parts = (noise[-columns:], self._jitter[-columns:], wander, turning, _SCALE_ERROR * size)
-        expected = np.sqrt(np.sum(np.square(parts), axis=0))
-        independent = 1.0 + float(covered.mean()) * max(lag.independent, 0.0)
+        expected = np.sqrt(sum(np.square(part) for part in parts))
+        independent = 1.0 + covered.mean(axis=1) * max(lag.independent, 0.0)
 
         def fit(seen: FloatArray) -> Agreement:
             left = sensed - seen
             if columns == 6:
-                power = float(np.sum(seen[:, 2] ** 2))
-                scale = float(np.sum(sensed[:, 2] * seen[:, 2])) / power if power > 0 else 1.0
-                left[:, 2] = sensed[:, 2] - np.clip(scale, *_ELEVATION_RANGE) * seen[:, 2]
+                power = np.nansum(seen[..., 2] ** 2, axis=1)
+                scale = np.nansum(sensed[..., 2] * seen[..., 2], axis=1)
+                scale = np.divide(scale, power, out=np.ones_like(power), where=power > 0)
+                scale = np.clip(scale, *_ELEVATION_RANGE)[:, None]
+                left[..., 2] = sensed[..., 2] - scale * seen[..., 2]
             return Agreement(_spread(left), size, expected, independent)
 
-        return fit(forward), fit(forward * _MIRRORED[-columns:]) if self.by_images else fit(forward)
+        ahead = fit(forward)
+        return ahead, fit(forward * _MIRRORED[-columns:]) if self.by_images else ahead
 
 
-def total_misfit(agreements: list[Agreement]) -> float:
-    """Mean misfit over the lags, which share their information."""
-    return float(np.mean([each.misfit for each in agreements])) if agreements else 0.0
+def total_misfit(agreements: list[Agreement]) -> FloatArray:
+    """Mean misfit over the lags, which share their information; zero without any."""
+    return np.asarray(np.mean([each.misfit for each in agreements], axis=0) if agreements else np.zeros(1))
 
 
 def noise_of(sensor: OrientationSensor | Tracker, time_s: FloatArray, centre_mm: FloatArray) -> FloatArray:
@@ -326,6 +344,28 @@ def steps_between(
     return np.asarray((turns[0].inv() * turns[1]).as_rotvec(degrees=True))
 
 
+def _steps_at(
+    sensor: OrientationSensor | Tracker, first_s: FloatArray, second_s: FloatArray, centre_mm: FloatArray
+) -> FloatArray:
+    """`steps_between` the images at two times each, as a sensor has them, shape (..., 6) or (..., 3).
+
+    NaN where the sensor does not cover both.
+    """
+    covered = sensor.covers(first_s) & sensor.covers(second_s)
+    first, second = (
+        np.where(covered, each - sensor.time_offset_s, np.nan).ravel() for each in (first_s, second_s)
+    )
+    assert sensor.sensor_from_image is not None
+    mounting = components(sensor.sensor_from_image)
+    readings, steps = (
+        Readings(sensor.readings.time_s, *sensor.readings.components, *mounting),
+        np.empty((first_s.size, 6)),
+    )
+    steps_of_readings(readings, centre_mm, first, second, steps)
+    columns = 6 if isinstance(sensor, Tracker) else 3
+    return steps.reshape(*first_s.shape, 6)[..., -columns:]
+
+
 def _elevation(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     """Place of the image's centre along the first image's z, less its mean."""
     z_mm = (poses[0].inv() * poses).apply(centre_mm)[:, 2]
@@ -333,8 +373,14 @@ def _elevation(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
 
 
 def _spread(values: FloatArray) -> FloatArray:
-    """Root mean square by column, from the median: a tenth of wild values does not move it."""
-    return np.asarray(np.sqrt(np.median(values**2, axis=0) / _MEDIAN_SQUARE))
+    """Root mean square by column, from the median: a tenth of wild values does not move it.
+
+    Of shape (..., m, c) to (..., c); NaN are passed over.
+    """
+    squares = np.sort(np.swapaxes(values, -1, -2) ** 2, axis=-1)  # NaN come last
+    count = np.isfinite(squares).sum(axis=-1)[..., None]
+    middle = [np.take_along_axis(squares, at, axis=-1)[..., 0] for at in ((count - 1) // 2, count // 2)]
+    return np.asarray(np.sqrt((middle[0] + middle[1]) / 2.0 / _MEDIAN_SQUARE))
 
 
 def _jitter(path: FloatArray) -> float:

@@ -7,7 +7,7 @@ and the doubt goes with the results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic
 
@@ -226,6 +226,7 @@ class _Examination(Generic[Sensor]):
         self.sensor: Sensor = sensor
         self.noise = noise_of(sensor, seen.time_s, seen.centre_mm)
         self.agreements = seen.agreements(sensor, self.noise)
+        self.misfit = float(total_misfit(self.agreements).item())
         self.gyroscope = gyroscope_evidence(sensor) if isinstance(sensor, OrientationSensor) else None
 
     def doubts(self) -> Iterator[Doubt]:
@@ -237,7 +238,7 @@ class _Examination(Generic[Sensor]):
             )
             yield Doubt(self.about, "noise or scrambled values", evidence, bool((jitter > _MOST_NOISE).any()))
             return
-        conventions = [self._gain(suspect) for suspect in suspects(self.sensor)]
+        conventions = self._gains(tuple(suspects(self.sensor)))
         conventions.append(_Gain("another recording, or scrambled values", self._gain_of_still()))
         best = max(conventions, key=lambda gain: gain.total)
         turned, degrees = self._mounting()
@@ -277,24 +278,30 @@ class _Examination(Generic[Sensor]):
             return gain.images > _POSE_GAIN
         return gain.total > (_GYROSCOPE_GAIN if gain.gyroscope > _GYROSCOPE_GAIN else _TURN_GAIN)
 
-    def _gain(self, suspect: Suspect[Sensor]) -> _Gain:
-        misfit = total_misfit(self.seen.agreements(suspect.mended, self.noise))
-        turning = 0.0
-        if self.gyroscope is not None and isinstance(suspect.mended, OrientationSensor):
-            mended = gyroscope_evidence(suspect.mended)
-            turning = 0.0 if mended is None else self.gyroscope.misfit - mended.misfit
-        return _Gain(suspect.name, total_misfit(self.agreements) - misfit, turning)
+    def _gains(self, accused: Sequence[Suspect[Sensor]]) -> list[_Gain]:
+        """What each fault, put right, would explain."""
+        explained = self.misfit - self.seen.misfits([suspect.mended for suspect in accused], self.noise)
+        return [
+            _Gain(suspect.name, float(gain), self._turning(suspect.mended))
+            for suspect, gain in zip(accused, np.broadcast_to(explained, len(accused)), strict=True)
+        ]
+
+    def _turning(self, mended: Sensor) -> float:
+        """How much better a mended sensor fits its gyroscope, which no mounting changes."""
+        if self.gyroscope is None or not isinstance(mended, OrientationSensor):
+            return 0.0
+        evidence = None if mended.readings is self.sensor.readings else gyroscope_evidence(mended)
+        return 0.0 if evidence is None else self.gyroscope.misfit - evidence.misfit
 
     def _gain_of_still(self) -> float:
-        still = self.seen.agreements(self.sensor, self.noise, still=True)
-        return total_misfit(self.agreements) - total_misfit(still)
+        return self.misfit - float(self.seen.misfits([self.sensor], self.noise, still=True)[0])
 
     def _mounting(self) -> tuple[_Gain, float]:
         """The rotation of the image on the sensor that fits best, and its angle, degrees."""
         best, degrees = _Gain("mounting", -np.inf), 0.0
-        for sign in (1, -1):
-            turn = self.seen.turn(self.sensor, self.noise, sign)
-            gain = self._gain(Suspect("mounting", _turned(self.sensor, turn, self.seen.centre_mm)))
+        turns = [self.seen.turn(self.sensor, self.noise, sign) for sign in (1, -1)]
+        turned = [Suspect("mounting", _turned(self.sensor, turn, self.seen.centre_mm)) for turn in turns]
+        for turn, gain in zip(turns, self._gains(turned), strict=True):
             if gain.images > best.images:
                 best, degrees = gain, float(np.degrees(turn.magnitude()))
         return best, degrees

@@ -12,33 +12,23 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 from collections.abc import Iterator
 from io import BufferedReader
-from typing import Any, TypeAlias
+from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular, plausible_bytes
 from speckle3d.core.printable import printable
-
-Offset: TypeAlias = tuple[int, ...]
-"""Index of a chunk's first sample."""
+from speckle3d.io.inflate import CHECKSUM, DEFLATE, LZF, SHUFFLE, Offset, bytes_of, inflate, pipeline
 
 _MOST_HOPS = 16
 _MOST_LEVELS = 32
 _MOST_TIMES_THE_FILE = 2
 """Beside whatever compresses well, a file of this family holds echoes, which do not."""
 
-_DEFLATE, _SHUFFLE, _CHECKSUM, _LZF = (
-    h5py.h5z.FILTER_DEFLATE,
-    h5py.h5z.FILTER_SHUFFLE,
-    h5py.h5z.FILTER_FLETCHER32,
-    h5py.h5z.FILTER_LZF,
-)
 _CHECKSUM_BYTES = 4
 
 _REFERENCE = np.dtype([("length", "<u4"), ("place", "<u8"), ("index", "<u4")])
@@ -150,7 +140,7 @@ def require_held(node: h5py.Dataset) -> None:
     if node.chunks is not None:
         _require_chunks(node, file_bytes)
         return
-    declared, stored = _bytes_of(node, node.shape), node.id.get_storage_size()
+    declared, stored = bytes_of(node, node.shape), node.id.get_storage_size()
     if stored < declared or stored > file_bytes:
         raise InvalidInputError(f"expected {declared} bytes of data, got {min(stored, file_bytes)}")
 
@@ -189,8 +179,8 @@ def require_readable(node: h5py.Dataset) -> None:
     InvalidInputError
         If it would take far more memory than the file is long, or a chunk is shorter or longer than it says.
     """
-    _require_plausible(_bytes_of(node, node.shape), node.file.id.get_filesize())
-    if node.size and node.chunks is not None and _pipeline(node):
+    _require_plausible(bytes_of(node, node.shape), node.file.id.get_filesize())
+    if node.size and node.chunks is not None and pipeline(node):
         offsets: set[Offset] = set()
         node.id.chunk_iter(lambda chunk: offsets.add(chunk.chunk_offset))
         if len(offsets) != _chunk_count(node):
@@ -244,80 +234,29 @@ def require_whole_chunk(node: h5py.Dataset, offset: Offset) -> None:
         Naming the chunk's first sample.
     """
     skipped, raw = node.id.read_direct_chunk(offset)
-    expected = _bytes_of(node, node.chunks)
+    expected = bytes_of(node, node.chunks)
     packing = trailer = 0
-    for i, filter_id in enumerate(_pipeline(node)):
-        if skipped & (1 << i) or filter_id == _SHUFFLE:
+    for i, filter_id in enumerate(pipeline(node)):
+        if skipped & (1 << i) or filter_id == SHUFFLE:
             continue
-        if filter_id == _CHECKSUM:
+        if filter_id == CHECKSUM:
             trailer, expected = (_CHECKSUM_BYTES, expected) if packing else (0, expected + _CHECKSUM_BYTES)
-        elif filter_id in (_DEFLATE, _LZF) and not packing:
+        elif filter_id in (DEFLATE, LZF) and not packing:
             packing = filter_id
         else:
             return
     packed = raw[: len(raw) - trailer]
-    if packing == _DEFLATE:
+    if packing == DEFLATE:
         inflate(packed, expected, offset)
     else:
-        found = _lzf_length(packed) if packing == _LZF else len(packed)
+        found = _lzf_length(packed) if packing == LZF else len(packed)
         if found != expected:
             raise InvalidInputError(f"chunk {offset}: expected {expected} bytes, got {found}")
 
 
-def inflate(packed: bytes, expected: int, offset: Offset) -> bytes:
-    """Unpack a deflated chunk of `expected` bytes.
-
-    Raises
-    ------
-    InvalidInputError
-        If it unpacks to fewer bytes or more.
-    zlib.error
-        If it is damaged.
-    """
-    stream = zlib.decompressobj()
-    found = stream.decompress(packed, expected + 1)
-    if len(found) != expected or not stream.eof:
-        got = "more" if len(found) > expected else str(len(found))
-        raise InvalidInputError(f"chunk {offset}: expected {expected} bytes, got {got}")
-    return found
-
-
 def is_filtered(node: h5py.Dataset) -> bool:
     """Whether filters made a data set's chunks, whose length then says nothing."""
-    return bool(_pipeline(node))
-
-
-def is_only_deflated(node: h5py.Dataset) -> bool:
-    """Whether `unpacked` can make a data set's chunks: of a plain type, deflated, shuffled before or not."""
-    if h5py.h5t.py_create(node.dtype) != node.id.get_type():
-        return False
-    if _pipeline(node) != (_SHUFFLE, _DEFLATE):
-        return _pipeline(node) == (_DEFLATE,)
-    shuffled_by: tuple[int, ...] = node.id.get_create_plist().get_filter(0)[2]
-    return shuffled_by[:1] == (node.dtype.itemsize,)
-
-
-def unpacked(node: h5py.Dataset, offset: Offset) -> npt.NDArray[Any]:
-    """Read a chunk that `is_only_deflated`, as HDF5 would, but whole or not at all.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is damaged, or unpacks to fewer bytes or more than a chunk has.
-    """
-    skipped, raw = node.id.read_direct_chunk(offset)
-    pipeline = _pipeline(node)
-    stages = {filter_id for i, filter_id in enumerate(pipeline) if not skipped & (1 << i)}
-    expected = _bytes_of(node, node.chunks)
-    data = inflate(raw, expected, offset) if _DEFLATE in stages else raw
-    if len(data) != expected:
-        raise InvalidInputError(f"chunk {offset}: expected {expected} bytes, got {len(data)}")
-    values = np.frombuffer(data, dtype=np.uint8)
-    if _SHUFFLE in stages:
-        values = values.reshape(node.dtype.itemsize, -1).T
-    flat = np.ascontiguousarray(values).reshape(-1).view(node.dtype)
-    chunk: npt.NDArray[Any] = flat.reshape(node.chunks)
-    return chunk.astype(node.dtype.newbyteorder("="), copy=False)
+    return bool(pipeline(node))
 
 
 def _steps(path: bytes) -> list[bytes]:
@@ -342,26 +281,17 @@ def _external_names(settings: Any) -> str:
     return printable(repr(name.decode("utf-8", "replace")))
 
 
-def _bytes_of(node: h5py.Dataset, shape: Offset) -> int:
-    return math.prod(shape) * int(node.id.get_type().get_size())
-
-
 def _chunk_count(node: h5py.Dataset) -> int:
     return math.prod(-(-length // chunk) for length, chunk in zip(node.shape, node.chunks, strict=True))
 
 
-def _pipeline(node: h5py.Dataset) -> tuple[int, ...]:
-    settings = node.id.get_create_plist()
-    return tuple(settings.get_filter(i)[0] for i in range(settings.get_nfilters()))
-
-
 def _require_chunks(node: h5py.Dataset, file_bytes: int) -> None:
-    chunk_bytes = _bytes_of(node, node.chunks)
+    chunk_bytes = bytes_of(node, node.chunks)
     _require_plausible(chunk_bytes, file_bytes)
     expected, found = _chunk_count(node), node.id.get_num_chunks()
     if found != expected:
         raise InvalidInputError(f"expected {expected} chunks of data, got {found}")
-    filtered = bool(_pipeline(node))
+    filtered = bool(pipeline(node))
     wrong: list[tuple[Offset, int]] = []
 
     def check(chunk: Any) -> bool | None:

@@ -8,6 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -18,8 +19,10 @@ import numpy.typing as npt
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import require_finite
+from speckle3d.core.memory import borrowed
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
-from speckle3d.io.hdf5_guard import is_filtered, is_only_deflated, require_whole_chunk, unpacked
+from speckle3d.io.hdf5_guard import is_filtered, require_whole_chunk
+from speckle3d.io.inflate import Unpacker, is_only_deflated
 
 Slices: TypeAlias = Sequence[npt.NDArray[Any]]
 Turn: TypeAlias = Callable[[Slices], npt.NDArray[Any]]
@@ -27,11 +30,15 @@ Turn: TypeAlias = Callable[[Slices], npt.NDArray[Any]]
 so that frames can be sent to another process."""
 
 
-class OpenFrames(Protocol):
-    """An open recording."""
+Unpack: TypeAlias = Callable[[], npt.NDArray[Any]]
+"""Makes a frame of what was read of it, on several threads at once if need be."""
 
-    def read(self, i: int) -> npt.NDArray[Any]:
-        """Read frame `i`, shape (vector, sample)."""
+
+class OpenFrames(Protocol):
+    """An open recording, asked by one thread at a time."""
+
+    def read(self, i: int) -> Unpack:
+        """Read what the file holds of frame `i`; the function returned makes it (vector, sample)."""
 
     def close(self) -> None:
         """Close it."""
@@ -68,7 +75,9 @@ class LazyFrames(ABC):
         with self._lock, reading(where), naming(where):
             if self._open is None:
                 self._open = self._opened()
-            frame = self._open.read(i)
+            unpack = self._open.read(i)
+        with reading(where), naming(where):
+            frame = unpack()
             if frame.shape != self.shape[1:]:
                 raise InvalidInputError(f"expected shape {self.shape[1:]}, got {frame.shape}")
         if frame.dtype.kind in "fc":
@@ -130,8 +139,9 @@ class _OpenSlices:
             self._file.close()
             raise
 
-    def read(self, i: int) -> npt.NDArray[Any]:
-        return self._turn([part.read(i) for part in self._parts])
+    def read(self, i: int) -> Unpack:
+        unpacks = [part.read(i) for part in self._parts]
+        return lambda: self._turn([unpack() for unpack in unpacks])
 
     def close(self) -> None:
         self._file.close()
@@ -158,23 +168,24 @@ class _Part:
         self._node, self._on_disk = data.id, data.id.get_space()
         self._in_memory = h5py.h5s.create_simple(self._shape or (1,))
         self._kind = h5py.h5t.py_create(self._dtype)
-        self._unpacks = self._axis == 0 and data.chunks == (1, *self._shape) and is_only_deflated(data)
+        unpacks = self._axis == 0 and data.chunks == (1, *self._shape) and is_only_deflated(data)
+        self._unpacker = Unpacker(data) if unpacks else None
         # Chunks that no filter made were looked at when the data set was found.
         self._checks = data.chunks is not None and is_filtered(data)
         self._checked: set[tuple[int, ...]] = set()
 
-    def read(self, i: int) -> npt.NDArray[Any]:
+    def read(self, i: int) -> Unpack:
         if self._axis is not None:
             self._start[self._axis] = i
-        if self._unpacks:
-            whole: npt.NDArray[Any] = unpacked(self._data, tuple(self._start))[0]
-            return whole
+        if self._unpacker:
+            unpack = self._unpacker.read(tuple(self._start))
+            return lambda: unpack()[0]
         if self._checks:
             self._check_chunks(i, self._data.chunks)
-        values = np.empty(self._shape or (1,), self._dtype)
+        values = borrowed(self._shape or (1,), self._dtype)
         self._on_disk.select_hyperslab(tuple(self._start), self._count)
         self._node.read(self._in_memory, self._on_disk, values, self._kind)
-        return values.reshape(self._shape)
+        return lambda: values.reshape(self._shape)
 
     def _check_chunks(self, i: int, chunks: tuple[int, ...]) -> None:
         starts = (
@@ -223,7 +234,10 @@ class _OpenRaw:
     def __init__(self, frames: RawFrames) -> None:
         self._frames = frames
 
-    def read(self, i: int) -> npt.NDArray[Any]:
+    def read(self, i: int) -> Unpack:
+        return partial(self._frame, i)
+
+    def _frame(self, i: int) -> npt.NDArray[Any]:
         frames = self._frames
         count = frames.shape[1] * frames.shape[2]
         expected = count * frames.stored.itemsize

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -56,6 +56,14 @@ class CarriesMore(Protocol):
 
     def write_more(self, file: h5py.File) -> None:
         """Write that into groups of its own."""
+
+
+@runtime_checkable
+class MadeInOrder(Protocol):
+    """Frames that are computed when they are read, and fastest from the first to the last."""
+
+    def in_order(self) -> Iterator[npt.NDArray[Any]]:
+        """All frames."""
 
 
 class SweepWriter(HDF5Writer):
@@ -238,8 +246,14 @@ def write_sweep(
     3
     """
     with SweepWriter(path, sweep.grid, sweep.signal, stored_dtype(sweep.frames), compression) as writer:
-        for i, time_s in enumerate(sweep.frame_time_s):
-            writer.append(sweep.frames[i], time_s)
+        frames = sweep.frames
+        made = (
+            frames.in_order()
+            if isinstance(frames, MadeInOrder)
+            else map(frames.__getitem__, range(len(sweep)))
+        )
+        for i, (frame, time_s) in enumerate(zip(made, sweep.frame_time_s, strict=True)):
+            writer.append(frame, time_s)
             if progress is not None:
                 progress(i + 1, len(sweep))
         for sensor in (sweep.orientation, sweep.tracker):

@@ -1,4 +1,9 @@
-"""Correlation of matching patches of two images, or of their complex echoes, at neighbouring lags."""
+"""Correlation of matching patches of two images, or of their complex echoes, at neighbouring lags.
+
+A patch and its neighbourhood in the other frame are copied into rows of one padded length. What both have in
+common at a lag is then one long sum of products, the other's rows beginning so much later; the padding, zero
+in the patch, adds nothing.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,40 @@ from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
+_LANES = 16
+"""Rows are padded to a multiple of this many samples: a vector register's."""
+_TOGETHER = 4
+"""Rows whose sums are taken in float32; more would leave too much of a flat patch's variance."""
+
+Buffers = tuple[Float32Array, Float32Array, Float32Array]
+
+
+@njit(cache=True, nogil=True)
+def _stride(size: IntArray, axial_radius: int) -> int:
+    """Length of padded rows."""
+    return (size[1] + 2 * axial_radius + _LANES - 1) // _LANES * _LANES
+
+
+@njit(cache=True, nogil=True)
+def buffers(size: IntArray, lateral_radius: int, axial_radius: int) -> Buffers:
+    """Room for the real and imaginary parts of a patch and of its neighbourhood, and for what it covers.
+
+    Returns
+    -------
+    float32, shape (2, rows * stride)
+        The patch, or intensity and nothing.
+    float32, shape (2, (rows + 2 * lateral_radius + 1) * stride)
+    float32, shape (rows * stride + 1,)
+        One at the patch's samples, zero at its rows' padding; last the width of rows it was made for.
+    """
+    stride = _stride(size, axial_radius)
+    rows = size[0] + 2 * lateral_radius + 1
+    return (
+        np.zeros((2, size[0] * stride), np.float32),
+        np.zeros((2, rows * stride), np.float32),
+        np.zeros(size[0] * stride + 1, np.float32),
+    )
+
 
 @njit(cache=True, nogil=True)
 def _common(first: int, size: int, length: int, radius: int, shift: int) -> tuple[int, int]:
@@ -16,7 +55,191 @@ def _common(first: int, size: int, length: int, radius: int, shift: int) -> tupl
     return max(first, 0, radius - shift), min(first + size, length, length - radius - shift)
 
 
+@njit(cache=True, nogil=True)
+def _copy(
+    image: Float32Array, corner: tuple[int, int], rows: int, width: int, stride: int, out: Float32Array
+) -> None:
+    """Copy a window to rows `stride` apart; zeros behind each, and in one row more if there is room."""
+    # Unsigned indices are not tested for being negative, and slices would count their references.
+    v, s, at = np.uint64(corner[0]), np.uint64(corner[1]), np.uint64(0)
+    for _ in range(rows):
+        for n in range(np.uint64(width)):
+            out[at + n] = image[v, s + n]
+        for n in range(np.uint64(width), np.uint64(stride)):
+            out[at + n] = np.float32(0.0)
+        at += np.uint64(stride)
+        v += np.uint64(1)
+    for n in range(at, np.uint64(min(out.size, (rows + 1) * stride))):
+        out[n] = np.float32(0.0)
+
+
+@njit(cache=True, nogil=True)
+def _cover(width: int, stride: int, inside: Float32Array) -> None:
+    """Mark the first samples of each row, unless they are marked already."""
+    if inside[-1] != width:
+        for k in range(inside.size - 1):
+            inside[k] = np.float32(1.0 if k % stride < width else 0.0)
+        inside[-1] = np.float32(width)
+
+
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+def _sums(
+    a: Float32Array, b: Float32Array, start: int, inside: Float32Array, end: int, chunk: int
+) -> tuple[float, float, float]:
+    """Sum of a b, of b and of its square where `inside` is one, b beginning with its sample `start`."""
+    product, total, square = 0.0, 0.0, 0.0
+    behind = np.uint64(start)
+    for first in range(0, end, chunk):
+        some_product: Any = np.float32(0.0)
+        some: Any = np.float32(0.0)
+        some_square: Any = np.float32(0.0)
+        for k in range(np.uint64(first), np.uint64(min(first + chunk, end))):
+            other = b[behind + k]
+            value = inside[k] * other
+            some_product += a[k] * other
+            some += value
+            some_square += value * other
+        product += some_product
+        total += some
+        square += some_square
+    return product, total, square
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+def _echo_sums(
+    a: Float32Array,
+    ai: Float32Array,
+    b: Float32Array,
+    bi: Float32Array,
+    start: int,
+    inside: Float32Array,
+    end: int,
+) -> tuple[float, float, float]:
+    """Real and imaginary part of the sum of conj(a) b, and of the power of b where `inside` is one."""
+    in_phase: Any = np.float32(0.0)
+    quadrature: Any = np.float32(0.0)
+    power: Any = np.float32(0.0)
+    behind = np.uint64(start)
+    for k in range(np.uint64(end)):
+        real, imaginary = b[behind + k], bi[behind + k]
+        in_phase += a[k] * real + ai[k] * imaginary
+        quadrature += a[k] * imaginary - ai[k] * real
+        power += inside[k] * (real * real + imaginary * imaginary)
+    return float(in_phase), float(quadrature), float(power)
+
+
+@njit(cache=True, nogil=True)
+def correlate_patch(
+    fixed: Float32Array,
+    moving: Float32Array,
+    first: IntArray,
+    size: IntArray,
+    shift: IntArray,
+    least_overlap: float,
+    corners: bool,
+    room: Buffers,
+    out: FloatArray,
+) -> None:
+    """Fill ``out[i, j]`` for one patch as `patch_correlations` does, in `buffers`."""
+    lateral, axial = out.shape[0] // 2, out.shape[1] // 2
+    v0, v1 = _common(first[0], size[0], fixed.shape[0], lateral, shift[0])
+    s0, s1 = _common(first[1], size[1], fixed.shape[1], axial, shift[1])
+    rows, width = v1 - v0, s1 - s0
+    n, stride = rows * width, room[0].shape[1] // size[0]
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = np.nan
+    if rows <= 0 or width <= 0 or n < least_overlap * size[0] * size[1]:
+        return
+    end, chunk = rows * stride, _TOGETHER * stride
+    a, b, inside = room[0][0], room[1][0], room[2]
+    _copy(fixed, (v0, s0), rows, width, stride, a)
+    corner = v0 + shift[0] - lateral, s0 + shift[1] - axial
+    _copy(moving, corner, rows + 2 * lateral, width + 2 * axial, stride, b)
+    _cover(width, stride, inside)
+    aa_sum, a_sum, _ = _sums(a, a, 0, inside, end, chunk)
+    a_var = aa_sum - a_sum * a_sum / n
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            if not corners and i != lateral and j != axial:
+                continue
+            ab_sum, b_sum, bb_sum = _sums(a, b, i * stride + j, inside, end, chunk)
+            b_var = bb_sum - b_sum * b_sum / n
+            # Float32 sums leave about 1e-6 of the energy: less variance than that is a flat patch.
+            if a_var > 1e-6 * aa_sum and b_var > 1e-6 * bb_sum:
+                out[i, j] = (ab_sum - a_sum * b_sum / n) / np.sqrt(a_var * b_var)
+
+
+@njit(cache=True, nogil=True)
+def turns(size: IntArray, axial_radius: int, ramp_rad: FloatArray) -> Float32Array:
+    """Cosine and sine of a ramp's phase at the samples of a patch in `buffers`, shape (2, rows * stride)."""
+    stride = _stride(size, axial_radius)
+    out = np.empty((2, size[0] * stride), np.float32)
+    across, along = np.exp(1j * ramp_rad[0]), np.exp(1j * ramp_rad[1])
+    start = complex(1.0)
+    for v in range(size[0]):
+        phase = start
+        for k in range(v * stride, (v + 1) * stride):
+            out[0, k], out[1, k] = phase.real, phase.imag
+            phase *= along
+        start *= across
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+def _turn(a: Float32Array, ai: Float32Array, cosine: Float32Array, sine: Float32Array, end: int) -> float:
+    """Turn a patch's echo back by the ramp's phase, in place; return its power."""
+    power: Any = np.float32(0.0)
+    for k in range(np.uint64(end)):
+        real, imaginary = a[k], ai[k]
+        power += real * real + imaginary * imaginary
+        a[k] = real * cosine[k] + imaginary * sine[k]
+        ai[k] = imaginary * cosine[k] - real * sine[k]
+    return float(power)
+
+
+@njit(cache=True, nogil=True)
+def cohere_patch(
+    fixed: Float32Array,
+    moving: Float32Array,
+    first: IntArray,
+    size: IntArray,
+    shift: IntArray,
+    turn: Float32Array,
+    least_overlap: float,
+    corners: bool,
+    room: Buffers,
+    out: FloatArray,
+) -> None:
+    """Fill ``out[i, j]`` for one patch as `patch_coherences` does, in `buffers`, with a ramp's `turns`."""
+    lateral, axial = out.shape[0] // 2, out.shape[1] // 2
+    v0, v1 = _common(first[0], size[0], fixed.shape[1], lateral, shift[0])
+    s0, s1 = _common(first[1], size[1], fixed.shape[2], axial, shift[1])
+    rows, width, stride = v1 - v0, s1 - s0, room[0].shape[1] // size[0]
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = np.nan
+    if rows <= 0 or width <= 0 or rows * width < least_overlap * size[0] * size[1]:
+        return
+    end, inside = rows * stride, room[2]
+    a, ai, b, bi = room[0][0], room[0][1], room[1][0], room[1][1]
+    corner = v0 + shift[0] - lateral, s0 + shift[1] - axial
+    _copy(fixed[0], (v0, s0), rows, width, stride, a)
+    _copy(fixed[1], (v0, s0), rows, width, stride, ai)
+    _copy(moving[0], corner, rows + 2 * lateral, width + 2 * axial, stride, b)
+    _copy(moving[1], corner, rows + 2 * lateral, width + 2 * axial, stride, bi)
+    _cover(width, stride, inside)
+    power = _turn(a, ai, turn[0], turn[1], end)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            if not corners and i != lateral and j != axial:
+                continue
+            in_phase, quadrature, other = _echo_sums(a, ai, b, bi, i * stride + j, inside, end)
+            if power * other > 0.0:
+                out[i, j] = (in_phase**2 + quadrature**2) / (power * other)
+
+
+@njit(cache=True, nogil=True)
 def patch_correlations(
     fixed: Float32Array,
     moving: Float32Array,
@@ -45,59 +268,12 @@ def patch_correlations(
     corners : bool
         Whether to fill lags that are off the centre both ways; else they are NaN, for half the work.
     """
-    lateral_radius = out.shape[1] // 2
-    axial_radius = out.shape[2] // 2
+    room = buffers(size, out.shape[1] // 2, out.shape[2] // 2)
     for p in range(first.shape[0]):
-        dv, ds = shift[p, 0], shift[p, 1]
-        v0, v1 = _common(first[p, 0], size[0], fixed.shape[0], lateral_radius, dv)
-        s0, s1 = _common(first[p, 1], size[1], fixed.shape[1], axial_radius, ds)
-        n, width = (v1 - v0) * (s1 - s0), s1 - s0
-        if v1 <= v0 or s1 <= s0 or n < least_overlap * size[0] * size[1]:
-            out[p] = np.nan
-            continue
-        a_sum = 0.0
-        aa_sum = 0.0
-        for v in range(v0, v1):
-            a_row = fixed[v, s0:s1]
-            row_sum: Any = np.float32(0.0)
-            row_square: Any = np.float32(0.0)
-            for k in range(width):
-                row_sum += a_row[k]
-                row_square += a_row[k] * a_row[k]
-            a_sum += row_sum
-            aa_sum += row_square
-        a_var = aa_sum - a_sum * a_sum / n
-        for i in range(out.shape[1]):
-            for j in range(out.shape[2]):
-                if not corners and i != lateral_radius and j != axial_radius:
-                    out[p, i, j] = np.nan
-                    continue
-                b_sum = 0.0
-                bb_sum = 0.0
-                ab_sum = 0.0
-                start = s0 + ds + j - axial_radius
-                for v in range(v0, v1):
-                    a_row = fixed[v, s0:s1]
-                    b_row = moving[v + dv + i - lateral_radius, start : start + width]
-                    row_b: Any = np.float32(0.0)
-                    row_bb: Any = np.float32(0.0)
-                    row_ab: Any = np.float32(0.0)
-                    for k in range(width):
-                        row_b += b_row[k]
-                        row_bb += b_row[k] * b_row[k]
-                        row_ab += a_row[k] * b_row[k]
-                    b_sum += row_b
-                    bb_sum += row_bb
-                    ab_sum += row_ab
-                b_var = bb_sum - b_sum * b_sum / n
-                # Float32 row sums leave about 1e-6 of the energy: less variance than that is a flat patch.
-                if a_var > 1e-6 * aa_sum and b_var > 1e-6 * bb_sum:
-                    out[p, i, j] = (ab_sum - a_sum * b_sum / n) / np.sqrt(a_var * b_var)
-                else:
-                    out[p, i, j] = np.nan
+        correlate_patch(fixed, moving, first[p], size, shift[p], least_overlap, corners, room, out[p])
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True)
 def patch_coherences(
     fixed: Float32Array,
     moving: Float32Array,
@@ -120,55 +296,7 @@ def patch_coherences(
     first, size, shift, least_overlap, out, corners
         As for `patch_correlations`.
     """
-    lateral_radius = out.shape[1] // 2
-    axial_radius = out.shape[2] // 2
-    real, imaginary = np.empty(size[1], np.float32), np.empty(size[1], np.float32)
-    sums = np.empty((out.shape[1], out.shape[2], 3))
-    cosine, sine = np.empty(size[1], np.float32), np.empty(size[1], np.float32)
-    for k in range(size[1]):
-        cosine[k], sine[k] = np.cos(ramp_rad[1] * k), np.sin(ramp_rad[1] * k)
+    room = buffers(size, out.shape[1] // 2, out.shape[2] // 2)
+    turn = turns(size, out.shape[2] // 2, ramp_rad)
     for p in range(first.shape[0]):
-        dv, ds = shift[p, 0], shift[p, 1]
-        v0, v1 = _common(first[p, 0], size[0], fixed.shape[1], lateral_radius, dv)
-        s0, s1 = _common(first[p, 1], size[1], fixed.shape[2], axial_radius, ds)
-        n, width = (v1 - v0) * (s1 - s0), s1 - s0
-        if v1 <= v0 or s1 <= s0 or n < least_overlap * size[0] * size[1]:
-            out[p] = np.nan
-            continue
-        sums[:] = 0.0
-        power = 0.0
-        for v in range(v0, v1):
-            a_real, a_imaginary = fixed[0, v, s0:s1], fixed[1, v, s0:s1]
-            c: Any = np.float32(np.cos(ramp_rad[0] * (v - v0)))
-            s: Any = np.float32(np.sin(ramp_rad[0] * (v - v0)))
-            row_power: Any = np.float32(0.0)
-            for k in range(width):
-                turn_real = c * cosine[k] - s * sine[k]
-                turn_imaginary = c * sine[k] + s * cosine[k]
-                real[k] = a_real[k] * turn_real + a_imaginary[k] * turn_imaginary
-                imaginary[k] = a_imaginary[k] * turn_real - a_real[k] * turn_imaginary
-                row_power += a_real[k] * a_real[k] + a_imaginary[k] * a_imaginary[k]
-            power += row_power
-            for i in range(out.shape[1]):
-                for j in range(out.shape[2]):
-                    if not corners and i != lateral_radius and j != axial_radius:
-                        continue
-                    start = s0 + ds + j - axial_radius
-                    row = v + dv + i - lateral_radius
-                    b_real = moving[0, row, start : start + width]
-                    b_imaginary = moving[1, row, start : start + width]
-                    in_phase: Any = np.float32(0.0)
-                    quadrature: Any = np.float32(0.0)
-                    other_power: Any = np.float32(0.0)
-                    for k in range(width):
-                        in_phase += real[k] * b_real[k] + imaginary[k] * b_imaginary[k]
-                        quadrature += real[k] * b_imaginary[k] - imaginary[k] * b_real[k]
-                        other_power += b_real[k] * b_real[k] + b_imaginary[k] * b_imaginary[k]
-                    sums[i, j, 0] += in_phase
-                    sums[i, j, 1] += quadrature
-                    sums[i, j, 2] += other_power
-        for i in range(out.shape[1]):
-            for j in range(out.shape[2]):
-                energy = power * sums[i, j, 2]
-                together = sums[i, j, 0] ** 2 + sums[i, j, 1] ** 2
-                out[p, i, j] = together / energy if energy > 0.0 else np.nan
+        cohere_patch(fixed, moving, first[p], size, shift[p], turn, least_overlap, corners, room, out[p])

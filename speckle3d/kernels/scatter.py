@@ -5,74 +5,67 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 
-_BINS_PER_MM = 16.0
 _TURNS = 8192
 _TWO_PI = 2.0 * np.pi
 _PHASORS = np.exp(-1j * _TWO_PI * np.arange(_TURNS) / _TURNS).astype(np.complex64)
 
 
-class CellOrder(NamedTuple):
-    """Scatterers in the image frame, sorted by lateral cell.
-
-    Attributes
-    ----------
-    position_mm, strength : ndarray, shape (n, 3) and (n,)
-    start : ndarray, shape (cells + 1,)
-        First scatterer of each lateral cell.
-    """
-
-    position_mm: FloatArray
-    strength: Float32Array
-    start: IntArray
-
-
-class Vectors(NamedTuple):
-    """Lateral position of each vector, shape (v,), and its cells: `first` up to, not including, `last`."""
-
-    lateral_mm: FloatArray
-    first: IntArray
-    last: IntArray
-
-
 class FieldTable(NamedTuple):
-    """The two-way beam.
+    """The two-way beam, laid out so that one loop serves all vectors on one side of a scatterer.
+
+    The lateral steps divide the vectors' pitch: a scatterer that lies `r` steps and a fraction from the
+    nearest vector on one side lies ``r + m * steps per pitch`` steps and the same fraction from the m-th.
 
     Attributes
     ----------
-    field : ndarray, shape (y, x, z, nodes)
-        Two-way residual amplitude.
-    reach : ndarray, shape (y, x)
+    rows : float32, shape (y, z, steps per pitch + 1, m * nodes * 2)
+        Two-way residual amplitude, real and imaginary parts in turn.
+    reach : int64, shape (y, steps per pitch, m)
         How many elevational steps the beam reaches; beyond that the field is left out.
-    curvature_per_mm : ndarray, shape (y, 2)
+    vectors : int64, shape (y, z, steps per pitch)
+        How many vectors on one side may be in reach.
+    curvature_per_mm : float64, shape (y, 2)
         Path curvature, lateral and elevational: the echo comes from depth ``y + kx x^2 + kz z^2``.
-    grid : ndarray, shape (4,)
+    grid : float64, shape (4,)
         First depth, depth step, lateral step, elevational step, mm.
     """
 
-    field: Complex64Array
+    rows: Float32Array
     reach: IntArray
+    vectors: IntArray
     curvature_per_mm: FloatArray
     grid: FloatArray
 
 
-class BeamLimits(NamedTuple):
-    """How far from the image the beam reaches.
+class EchoGrid(NamedTuple):
+    """Where echoes are summed: depth of the first sample and per sample, and the carrier's cycles, per mm."""
 
-    Attributes
-    ----------
-    lateral_mm : ndarray, shape (2,)
-    depth_mm : ndarray, shape (2,)
-        First depth and step of `thickness_mm`.
-    thickness_mm : ndarray, shape (y,)
-    """
+    first_depth_mm: float
+    sample_mm: float
+    cycles_per_mm: float
 
-    lateral_mm: FloatArray
-    depth_mm: FloatArray
-    thickness_mm: FloatArray
+
+def field_table(
+    field: Complex64Array, reach: IntArray, curvature_per_mm: FloatArray, grid: FloatArray, per_pitch: int
+) -> FieldTable:
+    """Lay out a beam, shape (y, x, z, nodes), with its reach, shape (y, x), as `FieldTable` says."""
+    ny, nx, nz, nodes = field.shape
+    most = -(-nx // per_pitch)
+    steps = np.zeros((ny, most * per_pitch + per_pitch, nz, nodes), np.complex64)
+    steps[:, :nx] = field
+    rows = np.stack([steps[:, r : r + most * per_pitch : per_pitch] for r in range(per_pitch + 1)], axis=2)
+    rows = np.ascontiguousarray(rows.transpose(0, 3, 2, 1, 4)).view(np.float32)
+    # Between the last lateral step and the one after it, there is nothing to interpolate.
+    reached = np.zeros((ny, most * per_pitch), np.int64)
+    reached[:, : nx - 1] = reach[:, : nx - 1]
+    reached = np.ascontiguousarray(reached.reshape(ny, most, per_pitch).transpose(0, 2, 1))
+    inside = np.arange(nz)[:, None, None] < reached[:, None]
+    vectors = np.where(inside.any(axis=-1), most - np.argmax(inside[..., ::-1], axis=-1), 0)
+    return FieldTable(rows.reshape(ny, nz, per_pitch + 1, -1), reached, vectors, curvature_per_mm, grid)
 
 
 @njit(cache=True, inline="always")
@@ -84,141 +77,119 @@ def _unit_phasor(cycles: float) -> Any:
     return _PHASORS[nearest & (_TURNS - 1)] * np.complex64(complex(1.0, -rest))
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp"})
+def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out: Float32Array) -> None:
+    """Fill `out` with a weighted sum of eight pieces of a table.
+
+    Two lie a `row` apart from each of the corners, of two depths and two elevations: two lateral steps.
+    """
+    w0, w1, w2, w3, w4, w5, w6, w7 = weights
+    c0, c1, c2, c3 = corners
+    n = out.shape[0]
+    # Slices, not offsets: an index that may be negative keeps the compiler from using vector instructions.
+    a0, a1, a2, a3 = table[c0:][:n], table[c0 + row :][:n], table[c1:][:n], table[c1 + row :][:n]
+    a4, a5, a6, a7 = table[c2:][:n], table[c2 + row :][:n], table[c3:][:n], table[c3 + row :][:n]
+    for q in range(n):
+        near = w0 * a0[q] + w1 * a1[q] + w2 * a2[q] + w3 * a3[q]
+        out[q] = near + (w4 * a4[q] + w5 * a5[q] + w6 * a6[q] + w7 * a7[q])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp"})
 def scatter_echoes(
-    scatterers: CellOrder,
-    vectors: Vectors,
+    position_mm: FloatArray,
+    strength: Float32Array,
+    image_from_medium: FloatArray,
+    pitch_mm: float,
     table: FieldTable,
-    first_depth_mm: float,
-    sample_mm: float,
-    cycles_per_mm: float,
-    out: Complex64Array,
+    echoes: EchoGrid,
+    out: Float32Array,
 ) -> None:
-    """Add each scatterer's echo to ``out[vector, sample, node]`` of every vector that it lies near.
+    """Add each scatterer's echo to ``out[vector, sample]`` of every vector that it lies near.
+
+    Fastest if neighbours in the list are of similar depth: the beam's table is long.
 
     Parameters
     ----------
-    first_depth_mm, sample_mm, cycles_per_mm : float
-        Depth of the first sample of `out`, depth per sample, and carrier cycles per mm of depth.
+    position_mm, strength : ndarray, shape (n, 3) and (n,)
+        Scatterers in the medium.
+    image_from_medium : float64, shape (4, 4)
+    pitch_mm : float
+        Of the vectors, of which the first is at zero.
+    out : float32, shape (vector, sample, nodes * 2)
+        Real and imaginary parts in turn.
     """
-    position_mm, amplitude, cell_start = scatterers
-    field, reach, curvature_per_mm, grid = table
-    ny, nx, _, nodes = field.shape
-    samples = out.shape[1]
-    for v in prange(vectors.lateral_mm.shape[0]):
-        value = np.empty(nodes, dtype=np.complex64)
-        for j in range(cell_start[vectors.first[v]], cell_start[vectors.last[v]]):
-            fx = abs(position_mm[j, 0] - vectors.lateral_mm[v]) / grid[2]
-            ix = int(fx)
-            fy = (position_mm[j, 1] - grid[0]) / grid[1]
-            iy = int(np.floor(fy))
-            if ix >= nx - 1 or iy < 0 or iy >= ny - 1:
-                continue
-            fz = abs(position_mm[j, 2]) / grid[3]
-            iz = int(fz)
-            if iz >= reach[iy, ix]:
-                continue
-            wx, wy, wz = np.float32(fx - ix), np.float32(fy - iy), np.float32(fz - iz)
-            x2 = (fx * grid[2]) ** 2
-            z2 = position_mm[j, 2] ** 2
-            kx = (1.0 - wy) * curvature_per_mm[iy, 0] + wy * curvature_per_mm[iy + 1, 0]
-            kz = (1.0 - wy) * curvature_per_mm[iy, 1] + wy * curvature_per_mm[iy + 1, 1]
-            echo_mm = position_mm[j, 1] + kx * x2 + kz * z2
-            at = (echo_mm - first_depth_mm) / sample_mm
-            n = int(np.floor(at))
-            if n < 0 or n >= samples - 1:
-                continue
-            one = np.float32(1.0)
-            w000 = (one - wy) * (one - wx) * (one - wz)
-            w001 = (one - wy) * (one - wx) * wz
-            w010 = (one - wy) * wx * (one - wz)
-            w011 = (one - wy) * wx * wz
-            w100 = wy * (one - wx) * (one - wz)
-            w101 = wy * (one - wx) * wz
-            w110 = wy * wx * (one - wz)
-            w111 = wy * wx * wz
-            carrier = amplitude[j] * _unit_phasor(cycles_per_mm * echo_mm)
-            late = np.float32(at - n)
-            for k in range(nodes):
-                value[k] = carrier * (
-                    w000 * field[iy, ix, iz, k]
-                    + w001 * field[iy, ix, iz + 1, k]
-                    + w010 * field[iy, ix + 1, iz, k]
-                    + w011 * field[iy, ix + 1, iz + 1, k]
-                    + w100 * field[iy + 1, ix, iz, k]
-                    + w101 * field[iy + 1, ix, iz + 1, k]
-                    + w110 * field[iy + 1, ix + 1, iz, k]
-                    + w111 * field[iy + 1, ix + 1, iz + 1, k]
-                )
-            # The carrier's phase is exact; only the slow baseband is split between two samples.
-            for k in range(nodes):
-                out[v, n, k] += (one - late) * value[k]
-                out[v, n + 1, k] += late * value[k]
-
-
-@njit(cache=True)
-def gather_near(
-    scatterers: tuple[FloatArray, Float32Array],
-    image_from_medium: FloatArray,
-    limits: BeamLimits,
-    out: tuple[FloatArray, Float32Array],
-    filled: int,
-) -> int:
-    """Append the scatterers within the beam's reach, moved into the image frame; return how many there are.
-
-    Scatterers, and `out`, are positions, shape (n, 3), and strengths, shape (n,).
-    """
-    position_mm, strength = scatterers
-    out_position_mm, out_strength = out
-    lateral_mm, depth_mm, thickness_mm = limits
+    rows, reach, reached_vectors, curvature_per_mm, grid = table
+    first_depth_mm, sample_mm, cycles_per_mm = echoes
     m = image_from_medium
-    last = thickness_mm.shape[0] - 1
+    ny, nz = reached_vectors.shape[0], reached_vectors.shape[1]
+    per_pitch = reach.shape[1]
+    vectors, samples, width = out.shape
+    far_mm = reach.shape[2] * pitch_mm
+    row = rows.shape[3]
+    cell = (per_pitch + 1) * row
+    plane = nz * cell
+    flat = rows.reshape(rows.size)
+    one = np.float32(1.0)
+    value = np.empty(rows.shape[3], dtype=np.float32)
     for j in range(position_mm.shape[0]):
         a, b, c = position_mm[j, 0], position_mm[j, 1], position_mm[j, 2]
-        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
-        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
         z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
-        row = int(np.floor((y - depth_mm[0]) / depth_mm[1]))
-        if row < 0 or row >= last or x <= lateral_mm[0] or x >= lateral_mm[1]:
+        fz = abs(z) / grid[3]
+        iz = int(fz)
+        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
+        fy = (y - grid[0]) / grid[1]
+        iy = int(np.floor(fy))
+        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
+        if iz >= nz - 1 or iy < 0 or iy >= ny - 1 or x <= -far_mm or x >= vectors * pitch_mm + far_mm:
             continue
-        if abs(z) >= thickness_mm[row]:
-            continue
-        out_position_mm[filled, 0] = x
-        out_position_mm[filled, 1] = y
-        out_position_mm[filled, 2] = z
-        out_strength[filled] = strength[j]
-        filled += 1
-    return filled
-
-
-@njit(cache=True)
-def sort_into_cells(
-    position_mm: FloatArray,
-    strength: Float32Array,
-    left_mm: float,
-    cell_mm: float,
-    deep_mm: float,
-    out: CellOrder,
-) -> None:
-    """Sort by lateral cell and, within it, by depth bin, so that table and vector stay in cache.
-
-    All scatterers must lie inside the cells and between zero and ``deep_mm``. Fills `out`.
-    """
-    bins = int(deep_mm * _BINS_PER_MM) + 1
-    cells = out.start.shape[0] - 1
-    count = np.zeros(cells * bins + 1, dtype=np.int64)
-    n = position_mm.shape[0]
-    cell = np.empty(n, dtype=np.int64)
-    for j in range(n):
-        cell[j] = int((position_mm[j, 0] - left_mm) / cell_mm) * bins
-        cell[j] += int(position_mm[j, 1] * _BINS_PER_MM)
-        count[cell[j] + 1] += 1
-    for i in range(1, count.shape[0]):
-        count[i] += count[i - 1]
-    for i in range(cells + 1):
-        out.start[i] = count[i * bins]
-    for j in range(n):
-        at = count[cell[j]]
-        count[cell[j]] += 1
-        out.position_mm[at] = position_mm[j]
-        out.strength[at] = strength[j]
+        wy, wz = np.float32(fy - iy), np.float32(fz - iz)
+        part = fy - iy
+        kx = (1.0 - part) * curvature_per_mm[iy, 0] + part * curvature_per_mm[iy + 1, 0]
+        kz = (1.0 - part) * curvature_per_mm[iy, 1] + part * curvature_per_mm[iy + 1, 1]
+        axis_mm = y + kz * z * z
+        w00 = strength[j] * (one - wy) * (one - wz)
+        w01 = strength[j] * (one - wy) * wz
+        w10 = strength[j] * wy * (one - wz)
+        w11 = strength[j] * wy * wz
+        right = int(np.ceil(x / pitch_mm))
+        for side in range(2):
+            # From the scatterer to the right, its nearest vector included, then to the left.
+            nearest = right - side
+            turn = 1 - 2 * side
+            steps = turn * (nearest * pitch_mm - x) / grid[2]
+            r = min(int(steps), per_pitch - 1)
+            if side == 0:
+                first, last = max(0, -nearest), vectors - nearest
+            else:
+                first, last = max(0, nearest - vectors + 1), nearest + 1
+            last = min(last, reached_vectors[iy, iz, r])
+            if first >= last:
+                continue
+            wx = np.float32(steps - r)
+            wl = one - wx
+            weights = (w00 * wl, w00 * wx, w01 * wl, w01 * wx, w10 * wl, w10 * wx, w11 * wl, w11 * wx)
+            b = ((iy * nz + iz) * (per_pitch + 1) + r) * row + first * width
+            corners = (b, b + cell, b + plane, b + plane + cell)
+            _interpolate(flat, row, corners, weights, value[first * width : last * width])
+            for n in range(first, last):
+                if iz >= reach[iy, r, n]:
+                    continue
+                across_mm = (steps + n * per_pitch) * grid[2]
+                echo_mm = axis_mm + kx * across_mm * across_mm
+                at = (echo_mm - first_depth_mm) / sample_mm
+                sample = int(np.floor(at))
+                if sample < 0 or sample >= samples - 1:
+                    continue
+                # The carrier's phase is exact; only the slow baseband is split between two samples.
+                late = np.float32(at - sample)
+                early = one - late
+                carrier = _unit_phasor(cycles_per_mm * echo_mm)
+                line = out[nearest + turn * n]
+                for k in range(width // 2):
+                    q = n * width + 2 * k
+                    re = carrier.real * value[q] - carrier.imag * value[q + 1]
+                    im = carrier.real * value[q + 1] + carrier.imag * value[q]
+                    line[sample, 2 * k] += early * re
+                    line[sample, 2 * k + 1] += early * im
+                    line[sample + 1, 2 * k] += late * re
+                    line[sample + 1, 2 * k + 1] += late * im

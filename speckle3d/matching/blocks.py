@@ -7,16 +7,20 @@ after another or in any order, in any process, with the same result to the last 
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.threads import ahead, counting_seconds
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.matching.quality import FrameFeatures, FrameInspector, QualitySettings
@@ -30,36 +34,37 @@ AHEAD = 3
 MATCHING = "in-plane motion and correlation"
 """Name of the stage in `StageTimes`."""
 ImageSink = Callable[[int, Float32Array], None]
-"""Called with each frame's number and intensity image (vector, sample), in order, off the main thread."""
-
-
-_READS_AHEAD: ContextVar[bool] = ContextVar("reads_ahead", default=True)
-
-
-@contextmanager
-def on_one_thread() -> Iterator[None]:
-    """Do not read ahead on a second thread: for a cluster's workers, who are given a core each."""
-    token = _READS_AHEAD.set(False)
-    try:
-        yield
-    finally:
-        _READS_AHEAD.reset(token)
+"""Called with each frame's number and intensity image (vector, sample), in order."""
 
 
 @dataclass
 class StageTimes:
-    """Seconds spent in each stage; reading and intensity overlap with the rest on another core."""
+    """Time spent in each stage; reading and intensity overlap with the rest on other cores.
+
+    Attributes
+    ----------
+    seconds : dict
+        By stage: what its threads spent from beginning to end, waits included.
+    processor_seconds : dict
+        By stage: what processors spent on it.
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
+    processor_seconds: dict[str, float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
         """Add the time spent inside to a stage's."""
         then = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.include({stage: time.perf_counter() - then})
+        with counting_seconds() as spent:
+            try:
+                yield
+            finally:
+                took = time.perf_counter() - then
+        with self._lock:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + took
+            self.processor_seconds[stage] = self.processor_seconds.get(stage, 0.0) + sum(spent)
 
     def include(self, seconds: Mapping[str, float]) -> None:
         """Add what was spent elsewhere."""
@@ -168,6 +173,23 @@ def match_block(
     return _BlockMatcher(sweep, matcher, trajectory, quality, times or StageTimes()).run(block, images)
 
 
+@dataclass(frozen=True)
+class _MadeReady:
+    """A frame as read, its intensity, and what is kept of it."""
+
+    number: int
+    frame: npt.NDArray[Any]
+    intensity: Float32Array
+    ready: ReadyFrame
+    features: FrameFeatures
+
+    def repeats(self, before: npt.NDArray[Any] | None) -> bool:
+        """Whether the frame is bit for bit the one before; most differ in their first vector."""
+        if before is None:
+            return False
+        return np.array_equal(self.frame[0], before[0]) and np.array_equal(self.frame, before)
+
+
 class _BlockMatcher:
     """Matches the frames of a block; keeps those that later ones are still to be matched with."""
 
@@ -183,6 +205,7 @@ class _BlockMatcher:
         self._settings = trajectory
         self._inspector = FrameInspector(sweep.signal, matcher.patches, quality)
         self._schedule = PairSchedule(trajectory)
+        self._before: npt.NDArray[Any] | None = None
         self._ready: dict[int, ReadyFrame] = {}
         self._motion: dict[int, InPlaneMotion] = {}
 
@@ -191,9 +214,10 @@ class _BlockMatcher:
             self._lead_in(block.first)
         else:
             self._motion[0] = InPlaneMotion()
-        for frame, ready, features in self._prefetch(range(block.first, block.stop), block.first, images):
-            assert features is not None
-            yield MatchedFrame(frame, features, self._advance(frame, ready))
+        for made in self._made_ready(range(block.first, block.stop), images):
+            features = replace(made.features, identical=made.repeats(self._before))
+            self._before = made.frame
+            yield MatchedFrame(made.number, features, self._advance(made.number, made.ready))
 
     def _advance(self, frame: int, ready: ReadyFrame) -> dict[int, MatchedPair]:
         """Match a frame with its references, and drop frames that are no longer needed."""
@@ -213,7 +237,7 @@ class _BlockMatcher:
         for anchor in references[:SEARCHED]:
             found = self._matcher.search(self._ready[anchor], self._ready[frame])
             self._motion[frame] = compose(self._motion[anchor], found)
-            pairs = {first: self._match(first, frame) for first in references}
+            pairs = self._match(references, frame)
             if max(pair.median for pair in pairs.values()) >= self._settings.least_correlation:
                 break
         else:
@@ -221,13 +245,19 @@ class _BlockMatcher:
                 self._motion[frame] = self._motion[frame - 1]
         return pairs
 
-    def _match(self, first: int, second: int) -> MatchedPair:
-        fixed, moving = self._ready[first], self._ready[second]
-        start = compose(inverse(self._motion[first]), self._motion[second])
-        pair = MatchedPair.of(self._matcher.match(fixed, moving, start))
-        if second - first == 1 and pair.median >= self._settings.least_correlation:
-            self._motion[second] = compose(self._motion[first], pair.motion)
-        return pair
+    def _match(self, references: Sequence[int], frame: int) -> dict[int, MatchedPair]:
+        """Match a frame with its references, those after the frame before it from the motion found with that."""
+        before = frame - 1
+        split = references.index(before) + 1 if before in references else len(references)
+        pairs: dict[int, MatchedPair] = {}
+        for some in filter(None, (references[:split], references[split:])):
+            starts = [compose(inverse(self._motion[first]), self._motion[frame]) for first in some]
+            fixed = [self._ready[first] for first in some]
+            found = self._matcher.match_with_each(fixed, self._ready[frame], starts)
+            pairs.update({first: MatchedPair.of(match) for first, match in zip(some, found, strict=True)})
+            if some[-1] == before and pairs[before].median >= self._settings.least_correlation:
+                self._motion[frame] = compose(self._motion[before], pairs[before].motion)
+        return pairs
 
     def _lead_in(self, first: int) -> None:
         """Find the key frames before a block, going back from it no farther than a block is long.
@@ -240,10 +270,13 @@ class _BlockMatcher:
         recent, keys, sound = range(max(0, first - s.recent), first), [first - 1], None
         self._motion[first - 1] = InPlaneMotion()
         back = range(first - 1, max(-1, first - 1 - max(s.block_frames, s.recent)), -1)
-        with closing(self._prefetch(back, first - 1)) as earlier:
-            for frame, ready, _ in earlier:
+        with closing(self._made_ready(back)) as earlier:
+            for made in earlier:
+                frame = made.number
+                if self._before is None:
+                    self._before = made.frame
                 with self._times.of(MATCHING):
-                    self._ready[frame] = ready
+                    self._ready[frame] = made.ready
                     if frame < first - 1:
                         median = self._lead(keys[-1], frame)
                         if sound is None and median >= s.least_correlation:
@@ -264,36 +297,18 @@ class _BlockMatcher:
         self._motion[frame] = compose(self._motion[key], found.motion) if alike else self._motion[key]
         return median
 
-    def _prefetch(
-        self, numbers: range, inspected_from: int, images: ImageSink | None = None
-    ) -> Generator[tuple[int, ReadyFrame, FrameFeatures | None]]:
-        """Yield frames made ready, a few ahead of use, on a second thread; features from some frame on.
+    def _made_ready(self, numbers: range, images: ImageSink | None = None) -> Generator[_MadeReady]:
+        """Yield frames in order, made ready a few ahead of use; images go to their sink in order, too."""
 
-        The frame before a block is inspected, too: a frame's features say whether it repeats the one before.
-        """
-
-        def make(index: int) -> tuple[int, ReadyFrame, FrameFeatures | None]:
+        def make(index: int) -> _MadeReady:
             with self._times.of("reading"):
                 frame = self._sweep.frames[index]
             with self._times.of("intensity"):
-                echo, features = self._matcher.echo(frame), None
-                if index >= inspected_from:
-                    features = self._inspector.inspect(frame, echo.intensity)
-                if images:
-                    images(index, echo.intensity)
-                return index, self._matcher.prepare(echo), features
+                echo = self._matcher.echo(frame)
+                features = self._inspector.inspect(frame, echo.intensity)
+                return _MadeReady(index, frame, echo.intensity, self._matcher.prepare(echo), features)
 
-        if not _READS_AHEAD.get():
-            yield from map(make, numbers)
-            return
-        with ThreadPoolExecutor(1) as worker:
-            waiting: list[Future[tuple[int, ReadyFrame, FrameFeatures | None]]] = []
-            try:
-                for index in numbers:
-                    waiting.append(worker.submit(make, index))
-                    if len(waiting) > AHEAD:
-                        yield waiting.pop(0).result()
-                for future in waiting:
-                    yield future.result()
-            finally:
-                worker.shutdown(wait=True, cancel_futures=True)
+        for made in ahead(make, numbers, AHEAD):
+            if images:
+                images(made.number, made.intensity)
+            yield made

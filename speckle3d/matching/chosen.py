@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
+from operator import itemgetter
 
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.sweep import Sweep
+from speckle3d.core.threads import ahead
 from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
 from speckle3d.matching.table import CorrelationTable, MatchedPair
@@ -45,14 +47,37 @@ def match_in_order(
 
 
 def match_again(sweep: Sweep, matcher: FrameMatcher, pairs: Iterable[tuple[int, int]]) -> CorrelationTable:
-    """Match any pairs of a sweep, reading frames anew; in-plane motion is searched for in each pair."""
+    """Match any pairs of a sweep, reading frames anew; in-plane motion is searched for in each pair.
 
-    @lru_cache(KEPT_FRAMES)
-    def ready(frame: int) -> ReadyFrame:
-        return matcher.prepare(matcher.echo(sweep.frames[frame]))
+    Fastest where pairs of one second frame follow each other.
+    """
+    kept: dict[int, ReadyFrame] = {}
 
-    def matched(first: int, second: int) -> MatchedPair:
-        fixed, moving = ready(first), ready(second)
-        return MatchedPair.of(matcher.match(fixed, moving, matcher.search(fixed, moving)))
+    def matched() -> Iterator[tuple[int, int, MatchedPair]]:
+        for second, some in groupby(pairs, key=itemgetter(1)):
+            earlier = [first for first, _ in some]
+            _keep_ready(kept, [*earlier, second], sweep, matcher)
+            fixed, moving = [kept[first] for first in earlier], kept[second]
+            starts = _searched(fixed, moving, matcher)
+            found = matcher.match_with_each(fixed, moving, starts)
+            yield from ((i, second, MatchedPair.of(match)) for i, match in zip(earlier, found, strict=True))
 
-    return CorrelationTable.of(((i, j, matched(i, j)) for i, j in pairs), len(matcher.patches))
+    return CorrelationTable.of(matched(), len(matcher.patches))
+
+
+def _keep_ready(
+    kept: dict[int, ReadyFrame], wanted: Sequence[int], sweep: Sweep, matcher: FrameMatcher
+) -> None:
+    """Have some frames ready, and of others those that were last asked for."""
+    missing = sorted(set(wanted) - kept.keys())
+    made = ahead(lambda frame: matcher.prepare(matcher.echo(sweep.frames[frame])), missing)
+    kept |= dict(zip(missing, made, strict=True))
+    for frame in wanted:
+        kept[frame] = kept.pop(frame)
+    for frame in list(kept)[: max(0, len(kept) - max(KEPT_FRAMES, len(wanted)))]:
+        del kept[frame]
+
+
+def _searched(fixed: Sequence[ReadyFrame], moving: ReadyFrame, matcher: FrameMatcher) -> list[InPlaneMotion]:
+    """In-plane motion of a frame against each of some others, to the nearest sample."""
+    return list(ahead(lambda other: matcher.search(other, moving), fixed))

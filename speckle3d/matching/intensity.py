@@ -14,11 +14,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy import fft, ndimage
+from scipy import fft
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.memory import borrowed
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+from speckle3d.kernels.intensity import (
+    equalise_echo,
+    local_mean,
+    place_band,
+    place_band_of_real,
+    squared_magnitude,
+)
 
 _RATE_OVER_BAND = 100 / 27
 """Rate of the intensity's samples over the width of the pass-band, edges included, whatever the echoes were
@@ -48,13 +56,18 @@ class IntensitySettings(BaseModel):
 
 @dataclass(frozen=True)
 class _Resampling:
-    """Fourier bins of the band and where they go in the inverse transform of another length."""
+    """Fourier bins of the band and where they go in the inverse transform of another length.
+
+    Real rows of even length are transformed as half as many complex numbers, and only the band is made of
+    what comes out; `mirrored` is then what each bin takes from its mirror image.
+    """
 
     length: int
     out_length: int
-    bins: IntArray | slice
-    weights: Float32Array
-    destination: IntArray
+    runs: IntArray
+    """First bin, its place in the inverse transform and count, of bins that follow one another in both."""
+    weights: Complex64Array
+    mirrored: Complex64Array | None
 
     @property
     def step(self) -> float:
@@ -130,11 +143,34 @@ class IntensityExtractor:
         """
         if self.settings.equalise_mm == 0:
             return intensity
+        mean, floor = self._local_mean(intensity)
+        return np.divide(intensity, np.maximum(mean, np.float32(floor), out=mean), out=mean)
+
+    def equalise_echo(
+        self, analytic: Complex64Array, intensity: Float32Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """Divide out the local mean of an echo too, whose intensity is then the equalised one.
+
+        Returns
+        -------
+        image : ndarray of float32, shape (vector, grid.samples)
+            As from `equalise`.
+        echo : ndarray of float32, shape (2, vector, grid.samples)
+            Real and imaginary parts.
+        """
+        if self.settings.equalise_mm == 0:
+            return intensity, np.stack([analytic.real, analytic.imag])
+        mean, floor = self._local_mean(intensity)
+        image, parts = borrowed(mean.shape, np.float32), borrowed((2, *mean.shape), np.float32)
+        equalise_echo(_in_turn(analytic), np.ascontiguousarray(intensity), mean, floor, image, parts)
+        return image, parts
+
+    def _local_mean(self, intensity: Float32Array) -> tuple[Float32Array, float]:
+        """Mean over the window about each sample, and the least to divide by."""
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
-        size = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
-        mean = ndimage.uniform_filter(intensity, size=size, mode="nearest")
-        floor = np.float32(1e-9) * mean.max() + np.finfo(np.float32).tiny
-        return np.asarray(intensity / np.maximum(mean, floor), dtype=np.float32)
+        half = np.array([int(self.settings.equalise_mm / 2 / side) for side in sides])
+        mean = borrowed(intensity.shape, np.float32)
+        return mean, local_mean(np.ascontiguousarray(intensity, dtype=np.float32), half, mean)
 
     def _check(self, frame: npt.NDArray[Any]) -> None:
         if frame.shape != self._frame_shape:
@@ -143,7 +179,9 @@ class IntensityExtractor:
 
 def intensity_of(analytic: Complex64Array) -> Float32Array:
     """Squared magnitude."""
-    return np.asarray(analytic.real * analytic.real + analytic.imag * analytic.imag)
+    out = borrowed(analytic.shape, np.float32)
+    squared_magnitude(_in_turn(analytic), out)
+    return out
 
 
 def two_way_wavenumber(signal: RFSettings) -> float:
@@ -165,10 +203,18 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
     # Over the lengths' ratio for the inverse transform; the analytic signal is twice the positive half of a
     # real signal's spectrum.
     scale = (1.0 if signal.are_complex else 2.0) * out_length / length
-    chosen = (scale * weights[bins]).astype(np.float32)
-    rising = slice(int(bins[0]), int(bins[0]) + bins.size)
-    whole = rising if bins[-1] == rising.stop - 1 else bins
-    return _Resampling(length, out_length, whole, chosen, destination)
+    chosen, mirrored = scale * weights[bins].astype(complex), None
+    if not signal.are_complex and length % 2 == 0 and bins[-1] < length // 2:
+        turn = 1j * np.exp(-2j * np.pi * bins / length)
+        chosen, mirrored = chosen * (1 - turn) / 2, (chosen * (1 + turn) / 2).astype(np.complex64)
+    return _Resampling(length, out_length, _runs(bins, destination), chosen.astype(np.complex64), mirrored)
+
+
+def _runs(bins: IntArray, destination: IntArray) -> IntArray:
+    """First bin, first destination and count of the runs in which both rise by one, shape (r, 3)."""
+    breaks = np.flatnonzero((np.diff(bins) != 1) | (np.diff(destination) != 1)) + 1
+    first = np.concatenate([[0], breaks])
+    return np.stack([bins[first], destination[first], np.diff(first, append=bins.size)], axis=1)
 
 
 def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
@@ -193,17 +239,32 @@ def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -
 
 
 def _resample(frame: npt.NDArray[Any], plan: _Resampling, samples: int) -> Complex64Array:
-    if np.iscomplexobj(frame):
-        spectrum = fft.fft(frame.astype(np.complex64, copy=False), plan.length, axis=1)
+    rows, given = frame.shape
+    kind = np.float32 if plan.mirrored is not None else np.complex64
+    padded = borrowed((rows, plan.length), kind)
+    padded[:, :given] = frame
+    padded[:, given:] = 0
+    spectrum = np.asarray(fft.fft(padded.view(np.complex64), axis=1, overwrite_x=True), dtype=np.complex64)
+    band: Complex64Array = borrowed((rows, plan.out_length), np.complex64)
+    if plan.mirrored is None:
+        place_band(_in_turn(spectrum), _in_turn(plan.weights), plan.runs, _in_turn(band))
     else:
-        spectrum = fft.rfft(frame.astype(np.float32, copy=False), plan.length, axis=1)
-    band = spectrum[:, plan.bins] * plan.weights
-    out = np.zeros((frame.shape[0], plan.out_length), dtype=np.complex64)
-    out[:, plan.destination] = band
-    return np.asarray(fft.ifft(out, axis=1, overwrite_x=True)[:, :samples])
+        factors = _in_turn(plan.weights), _in_turn(plan.mirrored)
+        place_band_of_real(_in_turn(spectrum), *factors, plan.runs, _in_turn(band))
+    analytic = borrowed((rows, samples), np.complex64)
+    analytic[:] = fft.ifft(band, axis=1, overwrite_x=True)[:, :samples]
+    return analytic
+
+
+def _in_turn(values: Complex64Array) -> Float32Array:
+    """Real and imaginary parts in turn."""
+    return np.ascontiguousarray(values).view(np.float32)
 
 
 def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
     """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
+    if frame.dtype == np.uint8 and frame.size > 256:
+        table = _decompress(np.arange(256, dtype=np.float32), signal)
+        return np.take(table, frame, out=borrowed(frame.shape, np.float32), mode="clip")
     decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
     return np.asarray(10 ** (decibel / 10), dtype=np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from speckle3d.matching.inplane import (
     InPlaneMotion,
     InPlaneSettings,
     PatchMatch,
-    match_patches,
+    match_with_each,
 )
 from speckle3d.matching.intensity import (
     IntensityExtractor,
@@ -116,13 +117,14 @@ class FrameMatcher:
 
     def prepare(self, echo: Echo) -> ReadyFrame:
         """Equalise an echo and transform it for the coarse search."""
-        image = self.extractor.equalise(echo.intensity)
-        parts = None
-        if echo.analytic is not None:
-            floor = np.finfo(np.float32).tiny
-            gain = np.sqrt(image / np.maximum(echo.intensity, floor))
-            parts = np.stack([echo.analytic.real * gain, echo.analytic.imag * gain])
+        image, parts = self.equalised(echo)
         return ReadyFrame(image, self._coarse.spectrum(image), parts)
+
+    def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array | None]:
+        """Intensity and, where there is phase, echo over their local mean; see `ReadyFrame`."""
+        if echo.analytic is None:
+            return self.extractor.equalise(echo.intensity), None
+        return self.extractor.equalise_echo(echo.analytic, echo.intensity)
 
     def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:
         """In-plane motion to the nearest sample, looked for over the whole search range."""
@@ -131,17 +133,21 @@ class FrameMatcher:
 
     def match(self, fixed: ReadyFrame, moving: ReadyFrame, start: InPlaneMotion) -> PatchMatch:
         """In-plane motion and correlation of one pair, from a start that is right to about a sample."""
-        echoes = None
-        if fixed.echo is not None and moving.echo is not None:
-            echoes = fixed.echo, moving.echo
-        return match_patches(
-            fixed.image,
+        return self.match_with_each([fixed], moving, [start])[0]
+
+    def match_with_each(
+        self, fixed: Sequence[ReadyFrame], moving: ReadyFrame, starts: Sequence[InPlaneMotion]
+    ) -> list[PatchMatch]:
+        """In-plane motion and correlation of a frame's pairs with some others, from a start for each."""
+        theirs = [frame.echo for frame in fixed if frame.echo is not None]
+        return match_with_each(
+            [frame.image for frame in fixed],
             moving.image,
             self.patches,
-            start,
+            starts,
             self.centre_mm,
             self.inplane,
-            echoes,
+            None if moving.echo is None else (theirs, moving.echo),
             self._wavenumber,
         )
 

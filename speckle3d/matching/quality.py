@@ -15,7 +15,6 @@ References
 from __future__ import annotations
 
 import enum
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +26,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, RFSettings
+from speckle3d.kernels.quality import patch_statistics
 from speckle3d.matching.patches import PatchGrid
+
+try:  # Ten times as fast.
+    from isal.isal_zlib import crc32
+except ImportError:
+    from zlib import crc32
 
 _LEAST_RATIO = 1e-11
 """Intensity in the band over the square of the frame's peak below which there is no echo: 16 bits end above
@@ -152,13 +157,12 @@ class FrameInspector:
         self.settings = settings or QualitySettings()
         self._bmode = isinstance(signal, BModeSettings)
         self._columns = int(np.unique(patches.first[:, 0]).size)
-        self._rows = len(patches) // self._columns
-        self._first, self._size = patches.first[0], patches.size
+        self._first, self._size = patches.first, patches.size
         self._pitch_mm = float(patches.spacing_mm[0])
         self._last_digest: int | None = None
 
     def inspect(self, frame: npt.NDArray[Any], intensity: Float32Array) -> FrameFeatures:
-        """Describe one frame.
+        """Describe one frame, and compare it with the one that was inspected before.
 
         Parameters
         ----------
@@ -172,6 +176,14 @@ class FrameInspector:
         InvalidInputError
             If the intensity image does not hold the patches.
         """
+        digest = digest_of(frame)
+        self._last_digest, before = digest, self._last_digest
+        return self.features(frame, intensity, identical=digest == before)
+
+    def features(
+        self, frame: npt.NDArray[Any], intensity: Float32Array, identical: bool = False
+    ) -> FrameFeatures:
+        """Describe one frame as `inspect` does, whatever was inspected before."""
         samples = np.ascontiguousarray(frame)
         if np.iscomplexobj(samples):
             samples = samples.view(samples.real.dtype)
@@ -181,70 +193,66 @@ class FrameInspector:
         counted = samples.dtype.kind in "iu" or bool((some == np.rint(some)).all())
         floor, clipped = self._rails(samples, counted)
         with np.errstate(all="ignore"):  # Flat patches, and samples that are not finite, come out as NaN.
-            tiles = self._tiles(intensity)
-            mean: Float32Array = tiles.mean(axis=(1, 3))
-            speckle, noise, live = self._classify(tiles, mean, floor)
+            statistics = self._statistics(intensity)
+            mean = statistics[0]
+            speckle, noise, live = self._classify(statistics, floor)
             # A sample that is not finite spoils its whole vector, and equalising then the others.
             speckle &= np.isfinite(intensity.sum())
-            near = intensity[:, : self._first[1]]
-            top = (self._first[1] + self._size[1]) * samples.shape[1] // intensity.shape[1]
+            near = intensity[:, : self._first[0, 1]]
+            top = (self._first[0, 1] + self._size[1]) * samples.shape[1] // intensity.shape[1]
             below = some[:, top:].astype(np.float32)
             return FrameFeatures(
-                identical=self._repeats(samples),
+                identical=identical,
                 clipped=clipped,
-                samples_db=_decibel(np.mean(below * below)),
-                near_db=_decibel(near.mean()) if near.size else np.nan,
-                level_db=np.array([_decibel(row) for row in mean[live].mean(axis=0)]),
+                samples_db=float(_decibel(np.mean(below * below))),
+                near_db=float(_decibel(near.mean())) if near.size else np.nan,
+                level_db=_decibel(mean[live].mean(axis=0)),
                 speckle=speckle[live].mean(axis=0),
                 noise_share=float(noise[live].mean()),
             )
 
-    def _repeats(self, samples: npt.NDArray[Any]) -> bool:
-        """Whether the frame is the one before, which it replaces."""
-        digest = zlib.crc32(samples.data)  # Of another frame the same once in four thousand million.
-        self._last_digest, before = digest, self._last_digest
-        return digest == before
-
     def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
         """Intensity below which there is no echo, and clipping over its limit."""
-        low, high = float(samples.min()), float(samples.max())
-        clipped = _at_rail(samples, high, -1, counted)
+        lowest, highest = samples.min(axis=1), samples.max(axis=1)
+        low, high = float(lowest.min()), float(highest.max())
+        # Only vectors that come within a count of an extreme can hold what is counted there.
+        clipped = _at_rail(samples[highest >= high - 1], high, -1, counted, samples.size)
         if self._bmode:
             # Black is no echo: it is neither clipped nor counted.
             return 0.0, clipped / max(int(np.count_nonzero(samples)), 1) / self.settings.clipped_bmode
-        clipped += _at_rail(samples, low, 1, counted)
+        clipped += _at_rail(samples[lowest <= low + 1], low, 1, counted, samples.size)
         least = _LEAST_COUNTS if counted else 0.0
         floor = max(least, _LEAST_RATIO * max(abs(low), abs(high)) ** 2)
         return floor, clipped / samples.size / self.settings.clipped_rf
 
-    def _tiles(self, intensity: Float32Array) -> Float32Array:
-        """Patches as a view, shape (column, vector, row, sample)."""
-        (v, d), (wide, high) = self._first, self._size
-        inside = intensity[v : v + self._columns * wide, d : d + self._rows * high]
-        if inside.shape != (self._columns * wide, self._rows * high):
+    def _statistics(self, intensity: Float32Array) -> FloatArray:
+        """Mean, contrast and three correlations of the patches, shape (5, column, row)."""
+        needed = self._first.max(axis=0) + self._size
+        if (intensity.shape < needed).any():
             raise InvalidInputError(
-                f"expected an intensity image of at least {v + self._columns * wide} x "
-                f"{d + self._rows * high} samples, got {' x '.join(map(str, intensity.shape))}"
+                f"expected an intensity image of at least {needed[0]} x {needed[1]} samples, got "
+                f"{' x '.join(map(str, intensity.shape))}"
             )
-        return inside.reshape(self._columns, wide, self._rows, high)
+        found = np.empty((self._first.shape[0], 5))
+        image = np.ascontiguousarray(intensity, dtype=np.float32)
+        patch_statistics(image, self._first, self._size, found)
+        return np.moveaxis(found.reshape(self._columns, -1, 5), 2, 0)
 
-    def _classify(
-        self, tiles: Float32Array, mean: Float32Array, floor: float
-    ) -> tuple[BoolArray, BoolArray, BoolArray]:
+    def _classify(self, statistics: FloatArray, floor: float) -> tuple[BoolArray, BoolArray, BoolArray]:
         """Patches with speckle and with noise, shape (column, row), and the columns that hold anything."""
         s = self.settings
-        # Each patch over its own mean: neither precision nor range is then lost on any.
-        varying = tiles / mean[:, None, :, None] - np.float32(1)
-        contrast = np.sqrt(np.einsum("cvrs,cvrs->cr", varying, varying) / self._size.prod())
+        mean, contrast, alike, across, along = statistics
         echo = (mean > floor) & (contrast > s.least_contrast)
-        wide, high = self._size // 2
-        alike = _correlation(varying[:, :-1], varying[:, 1:])
-        across = _correlation(varying[:, :wide], varying[:, -wide:])
-        along = _correlation(varying[..., :high], varying[..., -high:])
         fine = (across < s.halves_correlation) & (along < s.halves_correlation)
         together = (alike > s.neighbour_correlation) | (self._pitch_mm > s.neighbour_pitch_mm)
-        live = (contrast > _CONSTANT).any(axis=1) | ~(contrast > _CONSTANT).any()
+        varies: BoolArray = contrast > _CONSTANT
+        live = np.asarray(varies.any(axis=1) | ~varies.any())
         return echo & together & fine, echo & ~together, live
+
+
+def digest_of(frame: npt.NDArray[Any]) -> int:
+    """Digest of a frame bit for bit; of another frame the same once in four thousand million."""
+    return int(crc32(np.ascontiguousarray(frame).data))
 
 
 def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | None = None) -> IntArray:
@@ -319,14 +327,14 @@ def _darkened(
     return np.asarray((darker > drop_db) & (beyond_near > drop_db) & (~few | (fainter > drop_db)))
 
 
-def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool) -> int:
-    """Samples at an extreme of the frame, less those one count inside it.
+def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool, of: int) -> int:
+    """Samples at an extreme of the frame, which has `of` samples, less those one count inside it.
 
     Clipping piles samples up at the rail; without it there are fewer at the extreme than next to it, however
     few the counts. A constant frame has no rail.
     """
     at = np.count_nonzero(samples == samples.dtype.type(rail)) if np.isfinite(rail) else 0
-    if at in (1, samples.size):
+    if at in (1, of):
         return 0
     beside: int = 0
     if counted:
@@ -334,15 +342,6 @@ def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool
     return max(int(at) - beside, 0)
 
 
-def _correlation(a: Float32Array, b: Float32Array) -> FloatArray:
-    """Pearson coefficients over axes 1 and 3; NaN where flat."""
-    count = a.shape[1] * a.shape[3]
-    mean_a, mean_b = (np.einsum("cvrs->cr", x) / count for x in (a, b))
-    ab, aa, bb = (np.einsum("cvrs,cvrs->cr", x, y) / count for x, y in ((a, b), (a, a), (b, b)))
-    covariance = ab - mean_a * mean_b
-    return np.asarray(covariance / np.sqrt((aa - mean_a**2) * (bb - mean_b**2)), dtype=float)
-
-
-def _decibel(power: Any) -> float:
+def _decibel(power: npt.ArrayLike) -> FloatArray:
     """Finite whatever comes in: nothing, and what is not a number, is far below everything."""
-    return float(10 * np.log10(np.clip(np.nan_to_num(power), 1e-38, 1e38)))
+    return np.asarray(10 * np.log10(np.fmin(np.fmax(power, 1e-38), 1e38)), dtype=float)

@@ -15,7 +15,8 @@ import numpy as np
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.sweep import Sweep
-from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
+from speckle3d.core.threads import ahead
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 
 
@@ -34,19 +35,21 @@ def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -
         Of power, or with images of intensity of its variation; of either sign and about zero where nothing
         stays. NaN where there is no echo.
     """
-    echoes = [
-        _normalised(matcher.prepare(matcher.echo(sweep.frames[frame])), matcher.patches) for frame in frames
-    ]
+
+    def look(frame: int) -> Float32Array:
+        return _normalised(*matcher.equalised(matcher.echo(sweep.frames[frame])), matcher.patches)
+
+    echoes = list(ahead(look, frames))
     shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(echoes, 2)]
     return np.asarray(np.median(shared, axis=0), dtype=float)
 
 
-def _normalised(frame: ReadyFrame, patches: PatchGrid) -> Float32Array:
+def _normalised(image: Float32Array, echo: Float32Array | None, patches: PatchGrid) -> Float32Array:
     """Samples of every patch, of unit energy in all, shape (p, k); NaN where there is no echo."""
-    parts = frame.image[None] if frame.echo is None else frame.echo
+    parts = image[None] if echo is None else echo
     wide, high = patches.size
     tiles = np.stack([parts[:, v : v + wide, s : s + high].ravel() for v, s in patches.first])
-    if frame.echo is None:
+    if echo is None:
         tiles -= tiles.mean(axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(tiles / np.linalg.norm(tiles, axis=1, keepdims=True), dtype=np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -30,8 +31,7 @@ class MatchedPair:
     @classmethod
     def of(cls, match: PatchMatch) -> MatchedPair:
         """Keep what later stages need."""
-        known = match.correlation[np.isfinite(match.correlation)]
-        return cls(match.correlation, float(np.median(known)) if known.size else 0.0, match.motion)
+        return cls(match.correlation, match.median, match.motion)
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,8 @@ class CorrelationTable:
 
     def followed_by(self, other: CorrelationTable) -> CorrelationTable:
         """Return a table of these pairs and, in the rows after them, another's."""
+        if not len(other):
+            return self
         return CorrelationTable(
             np.concatenate([self.first, other.first]),
             np.concatenate([self.second, other.second]),
@@ -84,9 +86,16 @@ class CorrelationTable:
             self.motion + other.motion,
         )
 
-    def moved_mm(self, row: int) -> FloatArray:
-        """In-plane displacement of one pair's second frame, lateral and axial, shape (2,)."""
-        return np.array([self.motion[row].x_mm, self.motion[row].y_mm])
+    @cached_property
+    def inplane(self) -> FloatArray:
+        """In-plane motion (x, y, roll) of each pair's second frame, mm and rad, shape (e, 3)."""
+        return np.array([(m.x_mm, m.y_mm, m.roll_rad) for m in self.motion], dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def inplane_covariance(self) -> FloatArray:
+        """Covariance of `inplane`, shape (e, 3, 3); the identity where it is not known."""
+        known = [m.covariance if m.covariance is not None else np.eye(3) for m in self.motion]
+        return np.array(known, dtype=float).reshape(-1, 3, 3)
 
     def unmatched(self, frames: int, least_correlation: float) -> BoolArray:
         """Frames after the first that resemble none of those they were matched with, shape (frames,)."""

@@ -7,12 +7,14 @@ on what is scanned as long as it scatters as a phantom does; patches whose contr
 from __future__ import annotations
 
 import numpy as np
+from scipy import fft
 
 from speckle3d.core.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import SpeckleSize
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.matching.blocks import ImageSink
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 
@@ -32,24 +34,54 @@ simulated tissue of 0.5 dB/cm/MHz it falls by 0.14 in 4 cm); coherence below whi
 _LEAST_ECHO = 0.05
 
 
-def speckle_size(sweep: Sweep, matcher: FrameMatcher, among: IntArray | None = None) -> SpeckleSize:
+class SpeckleSizes:
+    """Speckle's sizes in the frames that are looked at if none is left out, kept as the sweep is matched.
+
+    Parameters
+    ----------
+    then : callable, optional
+        To which every image is passed on.
+    """
+
+    def __init__(self, sweep: Sweep, matcher: FrameMatcher, then: ImageSink | None = None) -> None:
+        self._wanted, self._patches, self._then = (
+            _spread(np.arange(len(sweep)), FRAMES),
+            matcher.patches,
+            then,
+        )
+        self.by_frame: dict[int, FloatArray] = {}
+
+    def keep(self, frame: int, intensity: Float32Array) -> None:
+        """Take the intensity image of one frame."""
+        if frame in self._wanted:
+            self.by_frame[frame] = _sizes(intensity, self._patches)
+        if self._then:
+            self._then(frame, intensity)
+
+
+def speckle_size(
+    sweep: Sweep, matcher: FrameMatcher, among: IntArray | None = None, known: SpeckleSizes | None = None
+) -> SpeckleSize:
     """Measure lateral and axial speckle size in each row of the patches that are matched.
 
     Parameters
     ----------
     among : ndarray of int, optional
         Frames to choose from; by default all.
+    known : SpeckleSizes, optional
+        Of frames that need not be read anew.
 
     Returns
     -------
     SpeckleSize
         Of shape (r,); NaN where too few patches hold fully developed speckle.
     """
-    frames = np.arange(len(sweep)) if among is None else among
-    found = [
-        _sizes(matcher.echo(sweep.frames[k]).intensity, matcher.patches) for k in _spread(frames, FRAMES)
-    ]
-    sizes = matcher.patches.rows_of(np.stack(found))
+    frames = _spread(np.arange(len(sweep)) if among is None else among, FRAMES)
+    found = dict(known.by_frame) if known else {}
+    for k in frames:
+        if k not in found:
+            found[k] = _sizes(matcher.echo(sweep.frames[k]).intensity, matcher.patches)
+    sizes = matcher.patches.rows_of(np.stack([found[k] for k in frames]))
     lateral, axial = sizes.transpose(1, 2, 0, 3).reshape(*sizes.shape[1:3], -1)
     return SpeckleSize(_medians(lateral), _medians(axial))
 
@@ -227,16 +259,19 @@ def _sizes(intensity: Float32Array, patches: PatchGrid) -> FloatArray:
     """Lateral and axial size of each patch's speckle, mm, shape (2, p); NaN unless it is fully developed."""
     (wide, high), first = patches.size, patches.first
     tiles = np.stack([intensity[v : v + wide, d : d + high] for v, d in first]).astype(float)
-    mean = tiles.mean(axis=(1, 2), keepdims=True)
     with np.errstate(all="ignore"):  # Flat patches come out as NaN.
-        varying = tiles / mean - 1.0
-        contrast = varying.std(axis=(1, 2))
+        varying = tiles / tiles.mean(axis=(1, 2), keepdims=True) - 1.0
+        contrast = np.sqrt(_mean_product(varying, varying))
         lags = (varying[:, :-1], varying[:, 1:]), (varying[..., :-1], varying[..., 1:])
-        rho = np.stack([(a * b).mean(axis=(1, 2)) / (contrast**2) for a, b in lags])
+        rho = np.stack([_mean_product(a, b) / contrast**2 for a, b in lags])
         # The width of a Gaussian with this correlation one sample off.
         size = patches.spacing_mm[:, None] / np.sqrt(-2.0 * np.log(np.clip(rho, 1e-3, 0.999)))
         fair = (contrast > CONTRAST[0]) & (contrast < CONTRAST[1])
     return np.where(fair & np.isfinite(rho), size, np.nan)
+
+
+def _mean_product(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("pvs,pvs->p", a, b) / (a.shape[1] * a.shape[2]))
 
 
 def _bins(signal: RFSettings, count: int) -> tuple[FloatArray, IntArray]:
@@ -249,11 +284,13 @@ def _bins(signal: RFSettings, count: int) -> tuple[FloatArray, IntArray]:
 
 def _spectrum(sweep: Sweep, signal: RFSettings) -> tuple[FloatArray, FloatArray]:
     """Power by frequency, over all vectors of some frames."""
-    samples = sweep.grid.samples
+    # A few samples less make a transform of small factors several times as fast.
+    samples = fft.prev_fast_len(sweep.grid.samples, not signal.are_complex)
     frequency_hz, bins = _bins(signal, samples)
     window = np.hanning(samples).astype(np.float32)
     total = np.zeros(bins.size)
     for k in _spread(np.arange(len(sweep)), SPECTRA):
-        spectrum = np.fft.fft(sweep.frames[k] * window, axis=1)[:, bins]
-        total = total + (np.abs(spectrum) ** 2).mean(axis=0)
+        frame = sweep.frames[k][:, :samples] * window
+        spectrum = (fft.fft(frame, axis=1) if signal.are_complex else fft.rfft(frame, axis=1))[:, bins]
+        total = total + (spectrum.real**2 + spectrum.imag**2).mean(axis=0)
     return frequency_hz, total

@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
 from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.matching.patches import PatchGrid
@@ -48,6 +49,8 @@ DEPARTURE_ERROR = 0.165
 on sweeps over simulated tissue and noise, from 3 to 6 % of length."""
 _EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Bins of distance: fine where the curves fall, coarse where only what stays is left."""
+_GRAIN = 16
+"""Patches whose models are fitted at a time: with all kinds and scales some 0.1 ms each."""
 
 
 class CoherenceSettings(BaseModel):
@@ -91,14 +94,18 @@ class Coherence:
     scale: FloatArray
     scale_sigma: float
 
-    def models(self, frame: FloatArray, distance_mm: FloatArray) -> list[EchoModel]:
+    def models(self, frame: FloatArray, distance_mm: FloatArray) -> EchoModel:
         """Echo models of pairs about given frames and so far apart, both of shape (e,)."""
+        at = np.clip(frame, self.frame[0], self.frame[-1])
+        before = np.searchsorted(self.frame, at, side="right") - 1
+        after, width = (at - self.frame[before])[:, None], np.diff(self.frame)[:, None]
+        flat = np.zeros((1, self.share.shape[1]))
         share, gain, stretch, decay = (
-            np.stack([np.interp(frame, self.frame, column) for column in values.T], axis=1)
+            np.concatenate([np.diff(values, axis=0) / width, flat])[before] * after + values[before]
             for values in (self.share, self.gain, self.stretch, self.decay_per_mm)
         )
         staying = share * np.exp(-np.abs(distance_mm)[:, None] * decay)
-        return [EchoModel(*one) for one in zip(staying, 1 - share, gain, stretch, strict=True)]
+        return EchoModel(staying, 1 - share, gain, stretch)
 
 
 def scale_sigma(coherence: Coherence | None) -> float:
@@ -218,16 +225,11 @@ class EchoProblem:
         evidence: float,
     ) -> tuple[FloatArray, FloatArray]:
         """Costs of every block, shape (b, s, p, k, l), penalties included, and shares and gains fitted."""
-        moved = path[self._second] - path[self._first]
-        middle = (self._first + self._second) / 2
-        patches = self._rho.shape[1]
-        shape = (self.centres.size, scales.size, patches, stretches.size, lengths_mm.size)
+        bins = self._bins(path)
+        shape = (len(bins), scales.size, stretches.size, lengths_mm.size)
         cost, found = np.empty(shape), np.empty((*shape, 2))
-        bins = np.empty((patches, _EDGES_MM.size - 1, 4))
-        for block, centre in enumerate(self.centres):
-            inside = (np.abs(middle - centre) <= self._half) & (np.abs(moved[:, 0]) <= self._reach_mm)
-            offset, slope = moved[inside].T.copy()
-            bin_by_distance(self._rho[inside], offset, slope, self._lateral, _EDGES_MM, bins)
+
+        def some(first: int, stop: int) -> None:
             fit_echo_models(
                 bins,
                 scales,
@@ -236,11 +238,28 @@ class EchoProblem:
                 self._curves,
                 self._settings.redundancy,
                 GAIN_PRECISION,
-                cost[block],
-                found[block],
+                first,
+                stop,
+                cost,
+                found,
             )
-        departures = 1.0 * (stretches > 1)[:, None] + (lengths_mm != NO_GAIN)
-        return cost + evidence * departures, found
+
+        in_parallel(some, len(bins), _GRAIN)
+        cost += evidence * (1.0 * (stretches > 1)[:, None] + (lengths_mm != NO_GAIN))
+        blocks = self.centres.size
+        cost, found = (each.reshape(blocks, -1, *each.shape[1:]).swapaxes(1, 2) for each in (cost, found))
+        return cost, found
+
+    def _bins(self, path: FloatArray) -> FloatArray:
+        """Sums over pairs of like distance, patch by patch within each block, shape (b p, bins, 4)."""
+        moved = path[self._second] - path[self._first]
+        middle = (self._first + self._second) / 2
+        bins = np.empty((self.centres.size, self._rho.shape[1], _EDGES_MM.size - 1, 4))
+        for block, centre in enumerate(self.centres):
+            inside = (np.abs(middle - centre) <= self._half) & (np.abs(moved[:, 0]) <= self._reach_mm)
+            offset, slope = moved[inside].T.copy()
+            bin_by_distance(self._rho[inside], offset, slope, self._lateral, _EDGES_MM, bins[block])
+        return bins.reshape(-1, *bins.shape[2:])
 
     def cost_of_scales(self, path: FloatArray, scales: FloatArray) -> FloatArray:
         """Twice the negative log-likelihood of each scale for each patch, shape (s, p), whatever stays."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.kernels.planes import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.patches import PatchGrid
 
@@ -24,11 +26,11 @@ STRETCH_ERROR = 0.1
 
 @dataclass(frozen=True)
 class PatchDistances:
-    """Unsigned elevational distance of each patch between two frames.
+    """Unsigned elevational distance of each patch between the frames of each pair.
 
     Attributes
     ----------
-    distance_mm, sigma_mm : ndarray, shape (p,)
+    distance_mm, sigma_mm : ndarray, shape (e, p)
         NaN where a patch holds no distance.
     """
 
@@ -38,13 +40,14 @@ class PatchDistances:
 
 @dataclass(frozen=True)
 class EchoModel:
-    """How a patch's correlation departs from fully developed speckle's, rho_F, in one pair.
+    """How patches' correlations depart from fully developed speckle's, rho_F, in each pair.
 
     rho(d) = gain (staying + moving sqrt(rho_F(d / stretch)))^2; see `speckle3d.motion.coherence`.
 
     Attributes
     ----------
-    staying, moving, gain, stretch : ndarray, shape (p,)
+    staying, moving, gain, stretch : ndarray, shape (e, p)
+        Or (1, p), if it is the same for all pairs.
     """
 
     staying: FloatArray
@@ -54,22 +57,24 @@ class EchoModel:
 
     @classmethod
     def fully_developed(cls, patches: int) -> EchoModel:
-        """Return the model of a phantom's speckle."""
-        one = np.ones(patches)
-        return cls(np.zeros(patches), one, one, one)
+        """Return the model of a phantom's speckle, for all pairs."""
+        one = np.ones((1, patches))
+        return cls(np.zeros((1, patches)), one, one, one)
 
-    def table(self) -> FloatArray:
-        """Parameters and the errors of the first and the last, shape (p, 6), as kernels take them."""
-        return np.column_stack(
-            [
-                self.staying,
-                self.moving,
-                self.gain,
-                self.stretch,
-                SHARE_ERROR * self.staying,
-                np.where(self.stretch > 1.0 + 1e-9, STRETCH_ERROR, 0.0),
-            ]
-        )
+    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> EchoModel:
+        """Return the model of some of the pairs."""
+        if len(self.gain) == 1:
+            return self
+        return EchoModel(self.staying[pairs], self.moving[pairs], self.gain[pairs], self.stretch[pairs])
+
+    def followed_by(self, others: EchoModel) -> EchoModel:
+        """Return the model of these pairs and of others."""
+        mine, theirs = vars(self), vars(others)
+        return EchoModel(**{name: np.concatenate([mine[name], theirs[name]]) for name in mine})
+
+    def for_kernels(self) -> EchoModels:
+        """Return the same with the errors of shares and stretches, as kernels take it."""
+        return EchoModels(self.staying, self.moving, self.gain, self.stretch, SHARE_ERROR, STRETCH_ERROR)
 
 
 class DistanceEstimator:
@@ -97,7 +102,7 @@ class DistanceEstimator:
         self.amplitude = np.ascontiguousarray(np.sqrt(here.correlation))
         self.tilt = here.tilt
         self._grid = curves.distance_mm
-        self._rho = here.correlation
+        self._rho = np.ascontiguousarray(here.correlation)
         end = here.correlation[:, -1]
         self._least = np.maximum(LEAST_CORRELATION, end)
         self.end_amplitude = np.where(end > WELL_FALLEN, self.amplitude[:, -1], 0.0)
@@ -110,56 +115,57 @@ class DistanceEstimator:
         # sqrt(-ln rho) is nearly straight in distance, so a uniform table of it inverts well.
         self._distance = np.stack([np.interp(roots, row, self._grid) for row in root])
 
-    def distances(self, correlation: FloatArray, model: EchoModel | None = None) -> PatchDistances:
-        """Distance and standard deviation for one correlation per patch, shape (p,)."""
+    def distances(
+        self, correlation: npt.NDArray[np.floating], model: EchoModel | None = None
+    ) -> PatchDistances:
+        """Distance and standard deviation for one correlation per pair and patch, shape (e, p)."""
         if model is not None:
             echo = np.sqrt(np.maximum(correlation, 0.0) / model.gain)
             correlation = np.maximum((echo - model.staying) / model.moving, 0.0) ** 2
-        rho = np.where(correlation > self._least, np.minimum(correlation, 0.9999), np.nan)
-        with np.errstate(invalid="ignore"):
-            position = np.sqrt(-np.log(rho)) / self._root_step
-        cell = np.clip(np.nan_to_num(position), 0, TABLE_STEPS - 1.001).astype(int)
-        patch = np.arange(rho.size)
-        low, high = self._distance[patch, cell], self._distance[patch, cell + 1]
-        distance = low + np.clip(position - cell, 0, 1) * (high - low)
+        known = correlation > self._least
+        rho = np.where(known, np.minimum(correlation, 0.9999), 1.0).astype(float)
+        position = np.sqrt(-np.log(rho)) / self._root_step
+        cell = np.minimum(position, TABLE_STEPS - 1.001).astype(int)
+        at = cell + TABLE_STEPS * np.arange(rho.shape[-1])
+        low, high = self._distance.take(at), self._distance.take(at + 1)
+        distance = low + np.minimum(position - cell, 1.0) * (high - low)
         if model is not None:
             distance = distance * model.stretch
-        return PatchDistances(distance, np.where(np.isnan(rho), np.nan, self.sigma(distance, model)))
+        sigma = self.sigma(distance, model)
+        return PatchDistances(np.where(known, distance, np.nan), np.where(known, sigma, np.nan))
 
-    def typical_distance(self, amplitude: float) -> float:
-        """Distance at which the median patch's fully developed speckle keeps this amplitude, mm."""
+    def typical_distance(self, amplitude: FloatArray | float) -> FloatArray:
+        """Distance at which the median patch's fully developed speckle keeps an amplitude, mm."""
         falling = self._typical[::-1]
-        return float(np.interp(amplitude, falling, self._grid[: self._typical.size][::-1]))
+        return np.asarray(np.interp(amplitude, falling, self._grid[: self._typical.size][::-1]))
 
-    def fully_developed(self, distance_mm: float) -> FloatArray:
-        """Correlation of fully developed speckle at one distance, shape (p,); 0 where it was not measured."""
-        cell = round(distance_mm / self.step_mm)
-        known = self._rho[:, min(cell, self._grid.size - 1)]
-        return np.where((cell >= self._grid.size) & (self.end_amplitude > 0), 0.0, known)
+    def typical_correlation(self, distance_mm: FloatArray) -> FloatArray:
+        """Median over the patches of fully developed speckle's correlation; 0 where it was not measured."""
+        cell = np.rint(distance_mm / self.step_mm).astype(int)
+        beyond = np.median(np.where(self.end_amplitude > 0, 0.0, self._rho[:, -1]))
+        by_cell = np.append(np.median(self._rho, axis=0), beyond)
+        return np.asarray(by_cell[np.minimum(cell, self._grid.size)])
 
     def sigma(self, distance_mm: FloatArray, model: EchoModel | None = None) -> FloatArray:
-        """Standard deviation of a distance estimate where the true distance is `distance_mm`, shape (p,).
+        """Standard deviation of distance estimates where true distances are `distance_mm`, shape (e, p).
 
         From the correlation's variance over N independent cells and the curve's slope. Near zero the slope
         vanishes; there it is the squared distance whose deviation stays finite.
         """
-        m = model or EchoModel.fully_developed(self.cells.size)
-        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3) / m.stretch
-        position = np.clip(d / self.step_mm, 0, self._grid.size - 2.001)
+        staying, moving, gain, stretch = (0.0, 1.0, 1.0, 1.0) if model is None else vars(model).values()
+        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3) / stretch
+        position = np.minimum(d / self.step_mm, self._grid.size - 2.001)
         cell = position.astype(int)
-        patch, part = np.arange(cell.size), position - cell
-        rho, slope = (
-            (1 - part) * table[patch, cell] + part * table[patch, cell + 1]
-            for table in (self._rho, self._slope)
-        )
-        _, _, _, _, staying_sd, stretch_sd = m.table().T
+        at, part = cell + self._grid.size * np.arange(cell.shape[-1]), position - cell
+        rho, slope = ((1 - part) * t.take(at) + part * t.take(at + 1) for t in (self._rho, self._slope))
         g = np.sqrt(rho)
-        echo = m.staying + m.moving * g
-        seen = np.minimum(m.gain * echo**2, 0.999)
-        noise = np.sqrt(correlation_variance(seen, self.cells, self.of_echo) + INTERPOLATION**2)
-        misfit = staying_sd * (1 - g) * 2 * echo * m.gain
-        sigma_rho = np.hypot(noise, misfit) * g / np.maximum(m.gain * echo * m.moving, 1e-6)
+        echo = staying + moving * g
+        seen = np.minimum(gain * echo**2, 0.999)
+        noise = correlation_variance(seen, self.cells, self.of_echo) + INTERPOLATION**2
+        misfit = SHARE_ERROR * staying * (1 - g) * 2 * echo * gain
+        sigma_rho = np.sqrt(noise + misfit**2) * g / np.maximum(gain * echo * moving, 1e-6)
         d = np.minimum(d, self._grid[-1])
         direct = sigma_rho / np.maximum(slope, 1e-9)
-        sigma = np.minimum(direct, np.sqrt(2 * d * direct)) * m.stretch
-        return np.asarray(np.hypot(sigma, stretch_sd * d * m.stretch))
+        sigma = np.minimum(direct, np.sqrt(2 * d * direct))
+        stretch_sd = np.where(stretch > 1.0 + 1e-9, STRETCH_ERROR, 0.0)
+        return np.asarray(np.sqrt(sigma**2 + (stretch_sd * d) ** 2) * stretch)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -18,9 +17,16 @@ from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence, CoherenceSettings, estimate_coherence, scale_sigma
 from speckle3d.motion.curve_doubts import FLAT, DepthFactors, depth_factors, sum_ratios
-from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, EchoModel, PatchDistances
-from speckle3d.motion.planes import PairPlane, PlaneFitter, PlaneSettings, consistent_subset
-from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, SignResolver, pair_signs
+from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, PatchDistances
+from speckle3d.motion.planes import PairPlanes, PlaneFitter, PlaneSettings, consistent_subset
+from speckle3d.motion.signs import (
+    ADAPTED_ERROR,
+    PLAIN_ERROR,
+    SignedPairs,
+    Strangers,
+    pair_signs,
+    settled_path,
+)
 from speckle3d.motion.trajectory import (
     Trajectory,
     held,
@@ -32,28 +38,6 @@ from speckle3d.motion.uncertainty import SlopeEvidence, weigh_slopes
 
 ROWS_AT_ONCE = 1024
 ENOUGH_PAIRS = 3
-
-
-@dataclass(frozen=True)
-class SignedPair:
-    """The plane of one frame pair and on which side of the first frame it lies.
-
-    Attributes
-    ----------
-    row : int
-        Of the pair in its `CorrelationTable`.
-    model : EchoModel or None
-        With which its correlations are read; None for a phantom's curves as they are.
-    sign : float
-        +1 or -1.
-    """
-
-    row: int
-    first: int
-    second: int
-    model: EchoModel | None
-    plane: PairPlane
-    sign: float = 1.0
 
 
 class PairReader:
@@ -93,23 +77,27 @@ class PairReader:
         ndarray, shape (n, 2)
             Elevational position of each frame's centre, mm, and its slope along x.
         """
-        signs = SignResolver(self._frames)
-        for frame in range(1, self._frames):
-            planes = {}
-            for row in self._alike(table, frame):
-                plane = self.fitter.fit(table.correlation[row].astype(float), table.moved_mm(row))
-                if plane is not None:
-                    planes[int(table.first[row])] = plane
-            if planes:
-                unlike, apart_mm = self._unlike(table, frame)
-                signs.place(frame, list(planes), list(planes.values()), unlike, apart_mm)
-            else:
-                signs.hold(frame)
-        return signs.path
+        rows = self._alike(table)
+        found, coefficients, covariance = [], [], []
+        for some in _slices(rows, ROWS_AT_ONCE):
+            planes = self.fitter.fit(table.correlation[some], table.inplane[some, :2])
+            found.append(some[planes.determined])
+            coefficients.append(planes.coefficients[planes.determined, :2])
+            covariance.append(planes.covariance[planes.determined, :2, :2])
+        rows = np.concatenate(found)
+        return settled_path(
+            self._frames,
+            table.first[rows],
+            table.second[rows],
+            np.concatenate(coefficients),
+            np.concatenate(covariance),
+            strangers=self._strangers(table, np.ones(len(table), dtype=bool)),
+            hold=True,
+        )
 
     def measure(
         self, table: CorrelationTable, path: FloatArray, sound: BoolArray, coherence: Coherence | None
-    ) -> list[SignedPair]:
+    ) -> SignedPairs:
         """Planes and signs of the pairs that are near enough on a path to tell a distance.
 
         Parameters
@@ -129,23 +117,22 @@ class PairReader:
         chosen = self._choose(table, path[:, 0], sound)
         first, second = table.first[chosen], table.second[chosen]
         apart = path[second, 0] - path[first, 0]
-        models: Sequence[EchoModel | None] = [None] * chosen.size
-        if coherence is not None:
-            models = coherence.models((first + second) / 2, apart)
-        found = []
-        for row, i, j, model, d in zip(chosen, first, second, models, apart, strict=True):
-            rho = table.correlation[row].astype(float)
-            plane = self.fitter.fit(rho, table.moved_mm(row), model, start_mm=abs(float(d)))
-            if plane is not None:
-                found.append(SignedPair(int(row), int(i), int(j), model, plane))
-        if not found:
+        model = None if coherence is None else coherence.models((first + second) / 2, apart)
+        planes = self.fitter.fit(
+            table.correlation[chosen], table.inplane[chosen, :2], model, start_mm=np.abs(apart)
+        )
+        pairs = SignedPairs(chosen, first, second, model, planes, np.ones(chosen.size))[planes.determined]
+        if not len(pairs):
             patches = table.correlation.shape[1]
             raise InsufficientDataError(
                 f"expected frame pairs whose patches determine a plane, got none in {chosen.size} pairs of "
                 f"{patches} patches: is the image wide enough, and do the curves fit it?"
             )
-        signs = self._signs(table, sound, found, PLAIN_ERROR if coherence is None else ADAPTED_ERROR)
-        return [replace(pair, sign=float(sign)) for pair, sign in zip(found, signs, strict=True)]
+        moved, covariance = pairs.planes.coefficients[:, :2], pairs.planes.covariance[:, :2, :2]
+        signless = pairs.first, pairs.second, moved, covariance
+        error = PLAIN_ERROR if coherence is None else ADAPTED_ERROR
+        settled = settled_path(self._frames, *signless, error, self._strangers(table, sound))
+        return pairs.with_signs(pair_signs(settled, *signless))
 
     def coherence(
         self,
@@ -175,31 +162,25 @@ class PairReader:
         lateral = self._patches.centre_mm[:, 0] - self._centre[0]
         return depth_factors(table, sound, path, self._curves, self._patches, lateral, settings)
 
-    def sum_ratios(self, pairs: Sequence[SignedPair]) -> FloatArray:
+    def sum_ratios(self, pairs: SignedPairs) -> FloatArray:
         """Sums of two distances over the one that spans both; see `speckle3d.motion.curve_doubts`."""
-        first, second = (np.array([getattr(pair, name) for pair in pairs]) for name in ("first", "second"))
-        distance = np.array([pair.sign * pair.plane.offset_mm for pair in pairs])
-        return sum_ratios(first, second, distance, FLAT * self._estimator.typical_distance(np.sqrt(0.5)))
+        least = FLAT * float(self._estimator.typical_distance(np.sqrt(0.5)))
+        return sum_ratios(pairs.first, pairs.second, pairs.sign * pairs.planes.offset_mm, least)
 
-    def slopes(self, pairs: Sequence[SignedPair], coherence: Coherence | None) -> SlopeEvidence:
+    def slopes(self, pairs: SignedPairs, coherence: Coherence | None) -> SlopeEvidence:
         """Weigh what the images see of yaw and tilt."""
-        return weigh_slopes(
-            self.fitter.design(np.zeros(2)),
-            [pair.plane for pair in pairs],
-            scale_sigma(coherence),
-            float(np.deg2rad(self._planes.turn_deg_per_mm)),
-        )
+        expected = float(np.deg2rad(self._planes.turn_deg_per_mm))
+        return weigh_slopes(self.fitter.design(), pairs.planes, scale_sigma(coherence), expected)
 
-    def edges(
-        self, table: CorrelationTable, pairs: Sequence[SignedPair], planes: Sequence[PairPlane]
-    ) -> RelativePoses:
+    def edges(self, table: CorrelationTable, pairs: SignedPairs, planes: PairPlanes) -> RelativePoses:
         """Relative poses of pairs, from `planes` in place of their own."""
         return relative_poses_of(
-            [pair.first for pair in pairs],
-            [pair.second for pair in pairs],
-            [table.motion[pair.row] for pair in pairs],
+            pairs.first,
+            pairs.second,
+            table.inplane[pairs.row],
+            table.inplane_covariance[pairs.row],
             planes,
-            [pair.sign for pair in pairs],
+            pairs.sign,
         )
 
     def solve(self, edges: RelativePoses, with_covariance: bool = False) -> Trajectory:
@@ -218,18 +199,16 @@ class PairReader:
         lone[second] = False
         return lone
 
-    def path(
-        self, table: CorrelationTable, pairs: Sequence[SignedPair], coherence: Coherence | None
-    ) -> FloatArray:
+    def path(self, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None) -> FloatArray:
         """Elevational position of the image's centre and slope along x of every frame, shape (n, 2)."""
         slopes = self.slopes(pairs, coherence)
-        poses = self.solve(self.edges(table, pairs, [slopes.applied(p.plane) for p in pairs])).poses
+        poses = self.solve(self.edges(table, pairs, slopes.applied(pairs.planes))).poses
         return np.column_stack([poses.apply(self._centre)[:, 2], poses.rotation.as_matrix()[:, 2, 0]])
 
     def consistent(
-        self, table: CorrelationTable, pairs: Sequence[SignedPair], sensed: Rotation, direction: int
-    ) -> list[PairPlane]:
-        """Planes of the sensed orientation, through the patches that agree with it.
+        self, table: CorrelationTable, pairs: SignedPairs, sensed: Rotation, direction: int
+    ) -> PairPlanes:
+        """Planes of the sensed orientation, through the patches that agree with it; their own if too few do.
 
         Parameters
         ----------
@@ -238,19 +217,26 @@ class PairReader:
         direction : int
             Sign of the elevational motion, with which that of every pair is multiplied.
         """
-        first, second = ([getattr(pair, name) for pair in pairs] for name in ("first", "second"))
-        relative = (sensed[first].inv() * sensed[second]).as_matrix()[:, 2, :2]
-        return [
-            self._consistent_plane(table, pair, direction * pair.sign * slopes)
-            for pair, slopes in zip(pairs, relative, strict=True)
-        ]
+        relative = (sensed[pairs.first].inv() * sensed[pairs.second]).as_matrix()[:, 2, :2]
+        moved, slopes = table.inplane[pairs.row, :2], direction * pairs.sign[:, None] * relative
+        offset, correlation = pairs.planes.offset_mm, table.correlation[pairs.row]
+        agreed = np.empty(correlation.shape, dtype=bool)
+        open_side = np.empty(len(pairs), dtype=bool)
+        for some in _slices(np.arange(len(pairs)), ROWS_AT_ONCE):
+            raised = self.fitter.raised(moved[some], slopes[some])
+            # Only frames that cross, or nearly, leave the side open.
+            open_side[some] = offset[some] < np.ptp(raised, axis=1)
+            distances = self._distances(table, pairs[some])
+            agreed[some] = consistent_subset(distances, raised, self._planes.support_sigma, open_side[some])
+        planes = self.fitter.fit(correlation, moved, pairs.model, agreed, slopes, offset, open_side)
+        return planes.where(planes.determined, pairs.planes)
 
     def rows(
         self,
         table: CorrelationTable,
-        pairs: Sequence[SignedPair],
+        pairs: SignedPairs,
         edges: RelativePoses,
-        used: Sequence[BoolArray],
+        used: BoolArray,
         direction: int,
         scale_sigma: float,
     ) -> Iterator[FramePairs]:
@@ -258,31 +244,32 @@ class PairReader:
         centre = RigidTransform.from_translation(self._centre)
         flip = np.diag([1.0, 1.0, direction, 1.0])
         turn = MIRROR if direction < 0 else np.eye(6)
-        for start in range(0, len(pairs), ROWS_AT_ONCE):
-            some = slice(start, start + ROWS_AT_ONCE)
-            distances = [self._distances(table, pair) for pair in pairs[some]]
-            sigma = [np.hypot(d.sigma_mm, scale_sigma * d.distance_mm) for d in distances]
+        for some in _slices(np.arange(len(pairs)), ROWS_AT_ONCE):
+            d = self._distances(table, pairs[some])
             yield FramePairs(
                 first=edges.first[some],
                 second=edges.second[some],
                 first_from_second=flip @ (centre * edges.poses[some] * centre.inv()).as_matrix() @ flip,
                 covariance=turn @ edges.covariance[some] @ turn,
-                distance_mm=np.array([d.distance_mm for d in distances], dtype=np.float32),
-                sigma_mm=np.array(sigma, dtype=np.float32),
-                used=np.array(used[some]),
+                distance_mm=d.distance_mm.astype(np.float32),
+                sigma_mm=np.hypot(d.sigma_mm, scale_sigma * d.distance_mm).astype(np.float32),
+                used=used[some],
                 patch_centre_mm=self._patches.centre_mm,
             )
 
-    def _alike(self, table: CorrelationTable, frame: int) -> IntArray:
-        """Rows of a frame's pairs with earlier frames that it resembles; without any, of its best pair."""
-        rows = np.arange(*np.searchsorted(table.second, [frame, frame + 1]))
-        near = rows[table.median[rows] >= self._settings.least_correlation]
-        return near if near.size else rows[[np.argmax(table.median[rows])]]
+    def _alike(self, table: CorrelationTable) -> IntArray:
+        """Rows of frames' pairs with earlier frames that they resemble; without any, of their best pair."""
+        alike = table.median >= self._settings.least_correlation
+        best_first = np.lexsort((-table.median, table.second))
+        frame, best = np.unique(table.second[best_first], return_index=True)
+        without = ~np.isin(frame, table.second[alike])
+        alike[best_first[best[without]]] = True
+        return np.flatnonzero(alike)
 
     def _choose(self, table: CorrelationTable, position_mm: FloatArray, sound: BoolArray) -> IntArray:
         """Rows of pairs so near that fully developed speckle would keep enough correlation."""
         distance = np.abs(position_mm[table.second] - position_mm[table.first])
-        left = np.array([np.median(self._estimator.fully_developed(d)) for d in distance])
+        left = self._estimator.typical_correlation(distance)
         near = (left >= self._settings.clear_correlation) & sound
         # Frames without enough of them take those that tell less, and if need be one that tells little.
         pairs = np.bincount(table.second[near], minlength=self._frames)
@@ -293,49 +280,20 @@ class PairReader:
             near[best] = table.median[best] >= LEAST_CORRELATION
         return np.flatnonzero(near)
 
-    def _unlike(
-        self, table: CorrelationTable, frame: int, sound: BoolArray | None = None
-    ) -> tuple[IntArray, float]:
-        """Earlier frames that a frame was compared with and does not resemble, and how far it is from them.
+    def _strangers(self, table: CorrelationTable, sound: BoolArray) -> Strangers:
+        """Frames that were compared and do not resemble each other, and how far apart they are.
 
         Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
         error of curves makes the one look like the other, and what stays of echoes only adds to it.
         """
-        rows = np.arange(*np.searchsorted(table.second, [frame, frame + 1]))
-        far = table.median[rows] < self._settings.least_correlation
-        if sound is not None:
-            far &= sound[rows]
-        half = 0.5 * self._estimator.typical_distance(float(np.sqrt(self._settings.least_correlation)))
-        return table.first[rows[far]], half
+        far = (table.median < self._settings.least_correlation) & sound
+        half = 0.5 * float(self._estimator.typical_distance(np.sqrt(self._settings.least_correlation)))
+        return Strangers(table.first[far], table.second[far], half)
 
-    def _signs(
-        self, table: CorrelationTable, sound: BoolArray, pairs: Sequence[SignedPair], relative_error: float
-    ) -> FloatArray:
-        resolver = SignResolver(self._frames, relative_error)
-        second = np.array([pair.second for pair in pairs])
-        start = 0
-        while start < len(pairs):
-            stop = int(np.searchsorted(second, second[start], side="right"))
-            some = pairs[start:stop]
-            frame = int(second[start])
-            unlike = self._unlike(table, frame, sound)
-            resolver.place(frame, [p.first for p in some], [p.plane for p in some], *unlike)
-            start = stop
-        first = np.array([pair.first for pair in pairs])
-        return pair_signs(resolver.path, first, second, [pair.plane for pair in pairs])
+    def _distances(self, table: CorrelationTable, pairs: SignedPairs) -> PatchDistances:
+        return self._estimator.distances(table.correlation[pairs.row].astype(float), pairs.model)
 
-    def _consistent_plane(self, table: CorrelationTable, pair: SignedPair, slopes: FloatArray) -> PairPlane:
-        """Plane of known slopes through the patches that agree with them; the pair's own if too few do."""
-        moved = table.moved_mm(pair.row)
-        raised = self.fitter.design(moved)[:, 1:] @ slopes
-        # Only frames that cross, or nearly, leave the side open.
-        open_side = bool(pair.plane.offset_mm < np.ptp(raised))
-        agreed = consistent_subset(
-            self._distances(table, pair), raised, self._planes.support_sigma, open_side
-        )
-        rho = table.correlation[pair.row].astype(float)
-        plane = self.fitter.fit(rho, moved, pair.model, agreed, slopes, pair.plane.offset_mm, open_side)
-        return plane or pair.plane
 
-    def _distances(self, table: CorrelationTable, pair: SignedPair) -> PatchDistances:
-        return self._estimator.distances(table.correlation[pair.row].astype(float), pair.model)
+def _slices(rows: IntArray, most: int) -> Iterator[IntArray]:
+    """Rows, some at a time: once at least."""
+    return (rows[start : start + most] for start in range(0, max(rows.size, 1), most))

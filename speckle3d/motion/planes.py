@@ -12,13 +12,14 @@ with depth as y does. The fit keeps what is seen; `speckle3d.motion.uncertainty`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.kernels.planes import PlaneFit, fit_correlation_plane
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.threads import in_parallel
+from speckle3d.kernels.planes import FitRules, FittedPlanes, Levers, agreeing_patches, fit_planes
 from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
 
@@ -38,6 +39,8 @@ LEAST_PATCHES = 6
 NEAR_MM = 0.15
 """Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
 tilt."""
+GRAIN = 32
+"""Pairs that are worth another thread's while."""
 
 
 class PlaneSettings(BaseModel):
@@ -64,34 +67,56 @@ class PlaneSettings(BaseModel):
 
 
 @dataclass(frozen=True)
-class PairPlane:
-    """Plane of one frame pair.
+class PairPlanes:
+    """Planes of frame pairs.
 
     Attributes
     ----------
-    offset_mm, slope_x, slope_y : float
+    coefficients : ndarray, shape (e, 3)
         a, b and c.
-    covariance : ndarray, shape (3, 3)
+    covariance : ndarray, shape (e, 3, 3)
         Of (a, b, c).
-    used : ndarray of bool, shape (p,)
+    used : ndarray of bool, shape (e, p)
         Patches that took part.
-    excess_mm, sigma_mm : ndarray, shape (p,)
+    excess_mm, sigma_mm : ndarray, shape (e, p)
         How much farther each patch is than the plane has it, and the standard deviation of that, both to
         first order in the correlation; NaN for patches that took no part.
+    determined : ndarray of bool, shape (e,)
+        Pairs whose patches determine a plane; the others' mean nothing.
     """
 
-    offset_mm: float
-    slope_x: float
-    slope_y: float
+    coefficients: FloatArray
     covariance: FloatArray
     used: BoolArray
     excess_mm: FloatArray
     sigma_mm: FloatArray
+    determined: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.coefficients)
+
+    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> PairPlanes:
+        """Planes of some of the pairs."""
+        return PairPlanes(*(getattr(self, each.name)[pairs] for each in fields(self)))
+
+    def followed_by(self, others: PairPlanes) -> PairPlanes:
+        """Return these planes and others."""
+        return PairPlanes(
+            *(np.concatenate([getattr(p, each.name) for p in (self, others)]) for each in fields(self))
+        )
 
     @property
-    def coefficients(self) -> FloatArray:
-        """(a, b, c)."""
-        return np.array([self.offset_mm, self.slope_x, self.slope_y])
+    def offset_mm(self) -> FloatArray:
+        """Offset a of each pair, shape (e,)."""
+        return self.coefficients[:, 0]
+
+    def where(self, mask: BoolArray, others: PairPlanes) -> PairPlanes:
+        """These planes where the mask of pairs says so, and those of `others` elsewhere."""
+        chosen = []
+        for each in fields(self):
+            mine, theirs = getattr(self, each.name), getattr(others, each.name)
+            chosen.append(np.where(mask.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs))
+        return PairPlanes(*chosen)
 
 
 class PlaneFitter:
@@ -100,166 +125,203 @@ class PlaneFitter:
     def __init__(
         self, estimator: DistanceEstimator, at_mm: FloatArray, settings: PlaneSettings | None = None
     ) -> None:
-        self._estimator, self._at = estimator, at_mm
+        self._estimator = estimator
         self.settings = settings or PlaneSettings()
         self._curves = PatchCurves(estimator.amplitude, estimator.step_mm, estimator.cells, estimator.of_echo)
         zero = np.zeros(len(at_mm))
         tilt = estimator.tilt
         # Where the curves know nothing of tilt, it is taken to turn about the focus, and the focus to be at
         # the image's centre: all depths then see the centre's distance.
-        self._lever = zero if tilt is None else at_mm[:, 1] - tilt.pivot_mm
-        self._spread = zero if tilt is None else tilt.spread_mm
+        self._levers = Levers(
+            np.ascontiguousarray(at_mm[:, 0]),
+            zero if tilt is None else at_mm[:, 1] - tilt.pivot_mm,
+            zero if tilt is None else np.ascontiguousarray(tilt.spread_mm),
+        )
+        self._has_lever = tilt is not None
 
-    def design(self, moved_mm: FloatArray) -> FloatArray:
-        """What a, b and c are multiplied by for each patch, shape (p, 3).
+    def design(self) -> FloatArray:
+        """What a, b and c are multiplied by for each patch, without in-plane motion, shape (p, 3)."""
+        lateral, lever, _ = self._levers
+        return np.column_stack([np.ones(len(lateral)), lateral, lever])
+
+    def raised(self, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:
+        """How much farther patches are than the image's centre on planes of some slopes, shape (e, p).
 
         Parameters
         ----------
-        moved_mm : ndarray, shape (2,)
+        moved_mm : ndarray, shape (e, 2)
             In-plane displacement of the second frame.
+        slopes : ndarray, shape (e, 2)
+            b and c.
         """
-        lateral = self._at[:, 0] - moved_mm[0]
-        return np.column_stack([np.ones(len(lateral)), lateral, self._lever - moved_mm[1] * self._has_lever])
+        lost = (slopes * self._lost(moved_mm)).sum(axis=1, keepdims=True)
+        return np.asarray(slopes @ self.design()[:, 1:].T - lost)
 
-    @property
-    def _has_lever(self) -> float:
-        return float(self._estimator.tilt is not None)
+    def _lost(self, moved_mm: FloatArray) -> FloatArray:
+        """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
+        return np.ascontiguousarray(moved_mm * np.array([1.0, float(self._has_lever)]))
 
     def fit(
         self,
-        correlation: FloatArray,
+        correlation: Float32Array,
         moved_mm: FloatArray,
         model: EchoModel | None = None,
         subset: BoolArray | None = None,
         slopes: FloatArray | None = None,
-        start_mm: float | None = None,
-        either_side: bool = True,
-    ) -> PairPlane | None:
-        """Robust maximum likelihood.
+        start_mm: FloatArray | None = None,
+        either_side: BoolArray | None = None,
+    ) -> PairPlanes:
+        """Robust maximum likelihood, pair by pair.
 
-        None if fewer than six patches can take part, or if the image's centre comes to lie farther away than
-        the curves were measured, or might.
+        A pair determines no plane if fewer than six patches can take part, or if the image's centre comes to
+        lie farther away than the curves were measured, or might.
 
         Parameters
         ----------
-        correlation : ndarray, shape (p,)
-        moved_mm : ndarray, shape (2,)
+        correlation : ndarray of float32, shape (e, p)
+        moved_mm : ndarray, shape (e, 2)
             In-plane displacement of the second frame.
-        subset : ndarray of bool, shape (p,), optional
+        model : EchoModel, optional
+            Of each pair, shape (e, p), or of all, shape (1, p).
+        subset : ndarray of bool, shape (e, p), optional
             Patches allowed to take part.
-        slopes : ndarray, shape (2,), optional
-            b and c as a sensor has them. The plane's sign is then theirs, and a may be negative.
-        start_mm : float, optional
+        slopes : ndarray, shape (e, 2), optional
+            b and c as a sensor has them. The planes' signs are then theirs, and a may be negative.
+        start_mm : ndarray, shape (e,), optional
             About how far apart the frames are, if it is known.
-        either_side : bool
-            Whether a plane of known slopes may have a < 0.
+        either_side : ndarray of bool, shape (e,), optional
+            Whether a plane of known slopes may have a < 0; all may, if not given.
         """
-        model = model or EchoModel.fully_developed(correlation.size)
+        pairs, patches = correlation.shape
+        model = model or EchoModel.fully_developed(patches)
         used = np.isfinite(correlation) & self._measured(correlation, model)
         used = used if subset is None else used & subset
-        if used.sum() < LEAST_PATCHES:
-            return None
-        rho = np.where(used, correlation, np.nan).astype(float)
-        echo, design = model.table(), self.design(moved_mm)
-        middle = self._middle(rho, model) if start_mm is None else max(start_mm, NEAR_MM)
-        best, least = np.zeros(3), np.inf
-        for number, (start, prior) in enumerate(self._starts(middle, design, used, slopes, either_side)):
-            fitted = PlaneFit(start.copy(), np.empty((3, 3)), np.empty(rho.size), np.empty(rho.size))
-            cost = fit_correlation_plane(
-                rho, design, self._spread, echo, self._curves, prior, self.settings.huber, ROUNDS, fitted
-            )
-            plane, information, standard, sensitivity = fitted
-            misfit = float(np.nansum(np.minimum(standard**2, OUTLYING)))
-            misfit += CROSSING_EVIDENCE if number else 0.0
-            if misfit < least:
-                best, least, total, normal = plane, misfit, cost, information
-                sigma = np.where(used, 1 / np.maximum(sensitivity, 1e-6), np.nan).astype(float)
-                excess = np.asarray(-standard * sigma)
-            if slopes is None and misfit < WELL_FITTED * used.sum():
-                break
-        covariance = np.linalg.inv(normal) * max(1.0, total / max(int(used.sum()) - 3, 1))
-        covariance[0, 0] += self.settings.bias_mm**2
-        # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
-        reach = self._estimator.reach_mm * max(1.0, float(np.median(model.stretch)))
-        if not (abs(best[0]) <= reach and covariance[0, 0] <= reach**2):
-            return None
-        if best[0] < 0 and slopes is None:
-            best = -best
-        return PairPlane(
-            float(best[0]), float(best[1]), float(best[2]), np.asarray(covariance, float), used, excess, sigma
+        determined = used.sum(axis=1) >= LEAST_PATCHES
+        used &= determined[:, None]
+        middle = self._middle(correlation, used, model) if start_mm is None else start_mm
+        if start_mm is not None:
+            middle = np.maximum(start_mm, NEAR_MM)
+        told = np.zeros((pairs, 2)) if slopes is None else np.ascontiguousarray(slopes)
+        side = np.ones(pairs, dtype=bool) if either_side is None else either_side
+        rules = self._rules(slopes is not None)
+        lost = self._lost(moved_mm)
+        fitted = FittedPlanes(
+            np.full((pairs, 3), np.nan),
+            np.tile(np.eye(3), (pairs, 1, 1)),
+            np.zeros(pairs),
+            np.full((pairs, patches), np.nan),
+            np.full((pairs, patches), np.nan),
         )
 
-    def _measured(self, correlation: FloatArray, model: EchoModel) -> BoolArray:
+        def work(first: int, stop: int) -> None:
+            some = slice(first, stop)
+            fit_planes(
+                correlation[some],
+                used[some],
+                lost[some],
+                model[some].for_kernels(),
+                self._levers,
+                self._curves,
+                middle[some],
+                told[some],
+                side[some],
+                rules,
+                FittedPlanes(*(array[some] for array in fitted)),
+            )
+
+        in_parallel(work, pairs, GRAIN)
+        return self._concluded(fitted, used, model, turned=slopes is None)
+
+    def _rules(self, sensed: bool) -> FitRules:
+        return FitRules(
+            sensed,
+            SENSED_SLOPE if sensed else LOOSE_SLOPE,
+            LOOSE_SLOPE,
+            self.settings.huber,
+            OUTLYING,
+            CROSSING_EVIDENCE,
+            WELL_FITTED,
+            ROUNDS,
+        )
+
+    def _concluded(self, fitted: FittedPlanes, used: BoolArray, model: EchoModel, turned: bool) -> PairPlanes:
+        """Planes with their covariances; those with a < 0 turned over if `turned`."""
+        coefficients, information, cost, excess, sigma = fitted
+        patches = used.sum(axis=1)
+        scatter = np.maximum(1.0, cost / np.maximum(patches - 3, 1))
+        covariance = np.linalg.inv(information) * scatter[:, None, None]
+        covariance[:, 0, 0] += self.settings.bias_mm**2
+        # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
+        reach = self._estimator.reach_mm * np.maximum(1.0, np.median(model.stretch, axis=1))
+        determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
+        if turned:
+            coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
+        return PairPlanes(coefficients, covariance, used, excess, sigma, determined)
+
+    def _measured(self, correlation: Float32Array, model: EchoModel) -> BoolArray:
         """Patches that correlate more than at their curve's last distance."""
         end = self._estimator.end_amplitude
+        if not end.any():
+            return np.ones(correlation.shape, dtype=bool)
         least = model.gain * (model.staying + model.moving * end) ** 2
         return np.asarray((end == 0.0) | (correlation > least))
 
-    def _middle(self, rho: FloatArray, model: EchoModel) -> float:
-        known = rho[np.isfinite(rho)]
-        share = model.staying.mean()
-        left = (np.sqrt(max(float(np.median(known)), 0.0)) - share) / max(1.0 - share, 0.1)
+    def _middle(self, correlation: Float32Array, used: BoolArray, model: EchoModel) -> FloatArray:
+        """About how far apart frames are, by the median of their patches' correlations, shape (e,)."""
+        known = np.sort(np.where(used, correlation, np.inf), axis=1)
+        count = np.maximum(used.sum(axis=1), 1)
+        pair = np.arange(len(known))
+        median = (known[pair, (count - 1) // 2].astype(float) + known[pair, count // 2]) / 2
+        share = model.staying.mean(axis=1)
+        left = (np.sqrt(np.maximum(np.where(np.isfinite(median), median, 0.0), 0.0)) - share) / np.maximum(
+            1.0 - share, 0.1
+        )
         return self._estimator.typical_distance(left)
-
-    def _starts(
-        self,
-        middle: float,
-        design: FloatArray,
-        used: BoolArray,
-        slopes: FloatArray | None,
-        either_side: bool,
-    ) -> list[tuple[FloatArray, FloatArray]]:
-        """Starts with their priors: all patches on one side, then frames that cross within the image."""
-        if slopes is not None:
-            known = np.array([[0.0, *slopes], [1e-6, SENSED_SLOPE**-2, SENSED_SLOPE**-2]])
-            sides = (1.0, -1.0) if either_side else (1.0,)
-            return [(np.array([side * middle, *slopes]), known) for side in sides]
-        loose = np.array([[0.0, 0.0, 0.0], [1e-6, LOOSE_SLOPE**-2, LOOSE_SLOPE**-2]])
-        starts = [np.array([middle, 0.0, 0.0])]
-        lateral = design[used, 1]
-        half = np.ptp(lateral) / 2
-        # V-shaped distances, which no plane on one side explains, fall towards the crossing.
-        if half > 0 and middle < LOOSE_SLOPE * half:
-            for at in (-0.5, 0.0, 0.5):
-                centre = lateral.mean() + at * half
-                slope = middle / np.abs(lateral - centre).mean()
-                starts.append(np.array([-slope * centre, slope, 0.0]))
-        return [(start, loose) for start in starts]
 
 
 def consistent_subset(
-    distances: PatchDistances, raised_mm: FloatArray, support_sigma: float = 1.0, either_side: bool = True
+    distances: PatchDistances,
+    raised_mm: FloatArray,
+    support_sigma: float = 1.0,
+    either_side: BoolArray | None = None,
 ) -> BoolArray:
-    """Patches whose distances agree on one plane of the orientation that the sensor measured.
+    """Patches of each pair whose distances agree on one plane of the orientation that the sensor measured.
 
     Every patch in turn places the plane, through +d and through -d; the placement that most others agree
     with, in magnitude and within `support_sigma` of their own deviations, keeps its supporters.
 
     Parameters
     ----------
-    raised_mm : ndarray, shape (p,)
+    distances : PatchDistances
+        Of shape (e, p).
+    raised_mm : ndarray, shape (e, p)
         How much farther each patch is than the image's centre, by the sensor's relative rotation.
-    either_side : bool
-        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it.
+    either_side : ndarray of bool, shape (e,), optional
+        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it; it
+        may in all pairs, if not given.
+
+    Returns
+    -------
+    ndarray of bool, shape (e, p)
 
     References
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, "Sensorless drift correction using
        orientation measurements", figure 4.
     """
-    d, sigma = distances.distance_mm, distances.sigma_mm
-    known = np.flatnonzero(np.isfinite(d))
-    support = np.zeros(len(d), dtype=bool)
-    if known.size == 0:
-        return support
-    raised = raised_mm[known]
-    sides = (1.0, -1.0) if either_side else (1.0,)
-    offsets = np.concatenate([side * d[known] - raised for side in sides])
-    distance = np.abs(offsets[:, None] + raised)
-    error = np.abs(distance - d[known]) / sigma[known]
-    agree = error <= support_sigma
-    # Among placements of equal support, the one whose supporters lie closest.
-    score = agree.sum(axis=1) - np.where(agree, error, 0.0).sum(axis=1) / (agree.shape[1] * support_sigma + 1)
-    best = int(np.argmax(score))
-    support[known] = agree[best]
+    support = np.zeros(raised_mm.shape, dtype=bool)
+    side = np.ones(len(support), dtype=bool) if either_side is None else either_side
+
+    def work(first: int, stop: int) -> None:
+        some = slice(first, stop)
+        agreeing_patches(
+            distances.distance_mm[some],
+            distances.sigma_mm[some],
+            raised_mm[some],
+            side[some],
+            support_sigma,
+            support[some],
+        )
+
+    in_parallel(work, len(support), GRAIN)
     return support

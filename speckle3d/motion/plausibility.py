@@ -7,8 +7,6 @@ that are equally alike and not equally far apart, and a length that the images l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.spatial.transform import RigidTransform
@@ -212,18 +210,18 @@ def folded(
     return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted)
 
 
-def severed(first: Sequence[int], second: Sequence[int], usable: BoolArray) -> Doubt | None:
+def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:
     """Doubt a sweep in pieces: frames that no pair joins to any before them, though both sides are sound.
 
     Parameters
     ----------
-    first, second : sequence of int
+    first, second : ndarray of int, shape (e,)
         Frames of the pairs that the trajectory was solved from.
     usable : ndarray of bool, shape (n,)
     """
     spans = np.zeros(usable.size + 1, dtype=int)
-    np.add.at(spans, np.asarray(first, dtype=int) + 1, 1)
-    np.add.at(spans, np.asarray(second, dtype=int) + 1, -1)
+    np.add.at(spans, first + 1, 1)
+    np.add.at(spans, second + 1, -1)
     open_before = np.flatnonzero(np.cumsum(spans)[:-1] == 0)
     cuts = [k for k in open_before[open_before > 0].tolist() if usable[:k].any() and usable[k:].any()]
     # Lost frames are open on both sides; one cut at each run of them.

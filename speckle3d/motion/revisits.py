@@ -6,16 +6,16 @@ earlier one however far the probe travelled between them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.estimate import SignedPair
-from speckle3d.motion.planes import PairPlane, PlaneFitter
+from speckle3d.motion.planes import PairPlanes, PlaneFitter
+from speckle3d.motion.signs import SignedPairs
 
 AWAY_MM = 3.0
 """Travel between two visits: less is within reach of the pairs measured anyway."""
@@ -57,7 +57,7 @@ def find_returns(position_mm: FloatArray, every_mm: float) -> list[Return]:
         return []
     travel = _travel(position_mm)
     found: list[Return] = []
-    for frame in range(1, position_mm.size):
+    for frame in _maybe_back(position_mm, travel):
         if found and travel[frame] - travel[found[-1].frame] < every_mm:
             continue
         earlier = _candidates(frame, position_mm, travel)
@@ -73,7 +73,7 @@ def tie_returns(
     fitter: PlaneFitter,
     coherence: Coherence | None,
     least_correlation: float,
-) -> list[SignedPair]:
+) -> SignedPairs:
     """Pairs of returns with the frames they came back to, where these agree on one place for the return.
 
     Parameters
@@ -84,26 +84,34 @@ def tie_returns(
     position_mm : ndarray, shape (n,)
         As for `find_returns`.
     """
-    rows = {
-        pair: row for row, pair in enumerate(zip(table.first.tolist(), table.second.tolist(), strict=True))
-    }
-    travel = _travel(position_mm)
-    ties: list[SignedPair] = []
+    wanted = {pair for each in returns for pair in each.pairs()}
+    every = zip(table.first.tolist(), table.second.tolist(), strict=True)
+    rows = {pair: row for row, pair in enumerate(every) if pair in wanted} if wanted else {}
+    alike = [row for row in rows.values() if table.median[row] >= least_correlation]
+    read = _read(np.array(alike, dtype=np.int64), table, position_mm, fitter, coherence)
+    at = {row: k for k, row in enumerate(read.row.tolist())}
+    travel, sign = _travel(position_mm), np.zeros(len(read))
     for each in returns:
-        read: dict[int, SignedPair] = {}
-        for pair in each.pairs():
-            row = rows[pair]
-            if table.median[row] >= least_correlation:
-                one = _read(row, table, position_mm, fitter, coherence)
-                if one is not None:
-                    read[pair[0]] = one
-        if len(read) >= LEAST_PAIRS:
-            ties += _agreeing(each, read, position_mm, travel)
-    return ties
+        known = np.array([at.get(rows[pair], -1) for pair in each.pairs()])
+        if (known >= 0).sum() >= LEAST_PAIRS:
+            place = _agreed(each, known, read.planes, position_mm, travel)
+            if place is not None:
+                told = known[known >= 0]
+                sign[told] = np.where(place >= position_mm[read.first[told]], 1.0, -1.0)
+    return read.with_signs(sign)[sign != 0]
 
 
 def _travel(position_mm: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(position_mm)))])
+
+
+def _maybe_back(position_mm: FloatArray, travel: FloatArray) -> list[int]:
+    """Frames within reach of the range of positions that the path had covered before it was away."""
+    before = np.searchsorted(travel, travel - AWAY_MM)
+    reach = REACH_MM + REACH_PER_MM * travel
+    low = np.minimum.accumulate(position_mm)[before - 1] - reach
+    high = np.maximum.accumulate(position_mm)[before - 1] + reach
+    return np.flatnonzero((before > 0) & (position_mm > low) & (position_mm < high)).tolist()
 
 
 def _candidates(second: int, position_mm: FloatArray, travel: FloatArray) -> list[int]:
@@ -120,58 +128,59 @@ def _candidates(second: int, position_mm: FloatArray, travel: FloatArray) -> lis
 
 
 def _read(
-    row: int,
+    rows: IntArray,
     table: CorrelationTable,
     position_mm: FloatArray,
     fitter: PlaneFitter,
     coherence: Coherence | None,
-) -> SignedPair | None:
-    first, second = int(table.first[row]), int(table.second[row])
+) -> SignedPairs:
+    """Planes of some pairs, as far as they are determined; their signs are not."""
+    first, second = table.first[rows], table.second[rows]
     model = None
     if coherence is not None:
         # Structure is what the earlier visit saw of it.
-        apart = np.array([position_mm[second] - position_mm[first]])
-        model = coherence.models(np.array([float(first)]), apart)[0]
-    plane = fitter.fit(table.correlation[row].astype(float), table.moved_mm(row), model)
-    return None if plane is None else SignedPair(row, first, second, model, plane)
+        model = coherence.models(first.astype(float), position_mm[second] - position_mm[first])
+    planes = fitter.fit(table.correlation[rows], table.inplane[rows, :2], model)
+    return SignedPairs(rows, first, second, model, planes, np.ones(rows.size))[planes.determined]
 
 
-def _agreeing(
-    each: Return, read: Mapping[int, SignedPair], position_mm: FloatArray, travel: FloatArray
-) -> list[SignedPair]:
-    """Pairs of one return with their signs, if they agree on one place for it."""
+def _agreed(
+    each: Return, known: IntArray, planes: PairPlanes, position_mm: FloatArray, travel: FloatArray
+) -> float | None:
+    """Place of a return on which its pairs agree; None if there is none.
+
+    Parameters
+    ----------
+    known : ndarray of int, shape (c,)
+        Which of the planes is that of each earlier frame; -1 for none.
+    """
     earlier = list(each.earlier)
     reach = REACH_MM + REACH_PER_MM * float(np.ptp(travel[[*earlier, each.frame]]))
-    planes = [read[i].plane if i in read else None for i in earlier]
-    shift = _place(position_mm[each.frame] - position_mm[earlier], planes, reach)
-    if shift is None:
-        return []
-    at = position_mm[each.frame] + shift
-    return [replace(pair, sign=1.0 if at >= position_mm[i] else -1.0) for i, pair in read.items()]
+    offset = np.where(known >= 0, planes.offset_mm[known], np.nan)
+    apart = position_mm[each.frame] - position_mm[earlier]
+    shift = _place(apart, offset, planes.covariance[known, 0, 0], reach)
+    return None if shift is None else float(position_mm[each.frame] + shift)
 
 
-def _place(apart_mm: FloatArray, planes: Sequence[PairPlane | None], reach_mm: float) -> float | None:
+def _place(
+    apart_mm: FloatArray, offset_mm: FloatArray, variance: FloatArray, reach_mm: float
+) -> float | None:
     """Shift of a frame at which all its distances agree; None if no place is clearly the best.
 
     Parameters
     ----------
     apart_mm : ndarray, shape (c,)
         Signed distance from each candidate as the path has it.
-    planes : sequence of PairPlane or None
-        None for candidates without common speckle.
+    offset_mm, variance : ndarray, shape (c,)
+        Unsigned distance as it was read, NaN for candidates without common speckle, and its variance.
     """
     shifts = np.arange(-reach_mm, reach_mm + 0.01, 0.02)
     distance = np.abs(apart_mm[:, None] + shifts)
-    cost = np.zeros(shifts.size)
-    for row, plane in zip(distance, planes, strict=True):
-        if plane is None:
-            misfit = np.maximum(BEYOND_MM - row, 0.0) / BEYOND_SIGMA_MM
-        else:
-            sigma = np.sqrt(
-                plane.covariance[0, 0] + (RELATIVE_ERROR * plane.offset_mm) ** 2 + FIXED_ERROR_MM**2
-            )
-            misfit = (row - plane.offset_mm) / sigma
-        cost += np.minimum(misfit**2, CAP)
+    sigma = np.sqrt(variance + (RELATIVE_ERROR * offset_mm) ** 2 + FIXED_ERROR_MM**2)
+    read = (distance - offset_mm[:, None]) / sigma[:, None]
+    beyond = np.maximum(BEYOND_MM - distance, 0.0) / BEYOND_SIGMA_MM
+    misfit = np.where(np.isnan(offset_mm)[:, None], beyond, read)
+    cost = np.minimum(misfit**2, CAP).sum(axis=0)
     best = int(np.argmin(cost))
     others = np.abs(shifts - shifts[best]) > SPACING_MM
     if others.any() and cost[others].min() - cost[best] < MARGIN:

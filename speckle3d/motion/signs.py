@@ -7,12 +7,14 @@ are followed until the frames that come later tell them apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.motion.planes import PairPlane
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.kernels.signs import PathRules, follow_paths
+from speckle3d.motion.distances import EchoModel
+from speckle3d.motion.planes import PairPlanes
 
 HYPOTHESES = 8
 PLAIN_ERROR, ADAPTED_ERROR = 0.25, 0.1
@@ -37,147 +39,162 @@ OPEN_FRAMES = 400
 """Paths may differ over this many frames, some twenty millimetres; before, the best one so far stands."""
 
 
-class SignResolver:
-    """Follows the most likely paths: elevational position and slope along x of one frame after the other.
+@dataclass(frozen=True)
+class SignedPairs:
+    """Planes of frame pairs, and on which side of the first frame they lie.
+
+    Attributes
+    ----------
+    row : ndarray of int, shape (e,)
+        Of each pair in its `CorrelationTable`.
+    first, second : ndarray of int, shape (e,)
+        Its frames.
+    model : EchoModel or None
+        With which correlations are read, shape (e, p); None for a phantom's curves as they are.
+    planes : PairPlanes
+    sign : ndarray, shape (e,)
+        +1 or -1.
+    """
+
+    row: IntArray
+    first: IntArray
+    second: IntArray
+    model: EchoModel | None
+    planes: PairPlanes
+    sign: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.row.size)
+
+    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> SignedPairs:
+        """Return some of the pairs."""
+        return SignedPairs(
+            self.row[pairs],
+            self.first[pairs],
+            self.second[pairs],
+            None if self.model is None else self.model[pairs],
+            self.planes[pairs],
+            self.sign[pairs],
+        )
+
+    def with_signs(self, sign: FloatArray) -> SignedPairs:
+        """Return the same planes on other sides."""
+        return replace(self, sign=sign)
+
+    def and_also(self, others: SignedPairs) -> SignedPairs:
+        """Return these pairs and others, in the order of their second and then their first frames."""
+        if not len(others):
+            return self
+        every = SignedPairs(
+            np.concatenate([self.row, others.row]),
+            np.concatenate([self.first, others.first]),
+            np.concatenate([self.second, others.second]),
+            None if self.model is None or others.model is None else self.model.followed_by(others.model),
+            self.planes.followed_by(others.planes),
+            np.concatenate([self.sign, others.sign]),
+        )
+        return every[np.lexsort((every.first, every.second))]
+
+
+@dataclass(frozen=True)
+class Strangers:
+    """Pairs of frames that do not resemble each other, and so are not near each other.
+
+    Attributes
+    ----------
+    first, second : ndarray of int, shape (u,)
+        The earlier and the later frame; sorted by the later.
+    apart_mm : float
+        How far they are from each other at least.
+    """
+
+    first: IntArray
+    second: IntArray
+    apart_mm: float
+
+
+def settled_path(
+    frames: int,
+    first: IntArray,
+    second: IntArray,
+    moved: FloatArray,
+    covariance: FloatArray,
+    relative_error: float = PLAIN_ERROR,
+    strangers: Strangers | None = None,
+    hold: bool = False,
+) -> FloatArray:
+    """Follow the most likely paths: elevational position and slope along x of one frame after the other.
+
+    A frame is placed by its planes against earlier frames, of which the latest settles the direction. The
+    sweep's first motion counts as positive.
 
     Parameters
     ----------
     frames : int
         Of the sweep.
+    first, second : ndarray of int, shape (e,)
+        Frames of each pair, sorted by the second.
+    moved : ndarray, shape (e, 2)
+        Offset and slope along x of each pair's plane, whose signs belong together.
+    covariance : ndarray, shape (e, 2, 2)
     relative_error : float
         Of offsets and slopes, besides their covariance: `PLAIN_ERROR` or `ADAPTED_ERROR`.
+    strangers : Strangers, optional
+    hold : bool
+        Leave frames that no pair places where the one before them is; else they stay at zero.
 
-    Notes
-    -----
-    The sweep's first motion counts as positive.
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Position and slope of every frame on the best path.
     """
-
-    def __init__(self, frames: int, relative_error: float = PLAIN_ERROR) -> None:
-        self._relative_error = relative_error
-        self._paths = np.zeros((1, frames, 2))
-        self._cost = np.zeros(1)
-        self._trend = np.ones(1)
-
-    @property
-    def path(self) -> FloatArray:
-        """Position and slope of every frame on the best path so far, shape (n, 2), mm."""
-        return np.asarray(self._paths[np.argmin(self._cost)])
-
-    def place(
-        self,
-        frame: int,
-        first: Sequence[int],
-        planes: Sequence[PairPlane],
-        unlike: IntArray | None = None,
-        apart_mm: float = 0.0,
-    ) -> None:
-        """Place a frame by its planes against earlier frames, of which the latest settles the direction.
-
-        Parameters
-        ----------
-        unlike : ndarray of int, shape (k,), optional
-            Earlier frames that it does not resemble, and so cannot be within `apart_mm` of.
-        """
-        at = np.asarray(first)
-        here = self._paths[:, at]
-        moved = np.array([p.coefficients[:2] for p in planes])
-        weight = self._weights(planes, moved)
-        candidates = np.concatenate([here + moved, here - moved], axis=1)
-        misfit = _misfit(candidates[:, :, None] - here[:, None], moved, weight)[0]
-        step = candidates[:, :, 0] - here[:, [int(np.argmax(at))], 0]
-        cost = np.minimum(misfit, CAP).sum(axis=2) + TURNING_COST * (step * self._trend[:, None] < 0)
-        if unlike is not None and unlike.size:
-            near = np.abs(candidates[:, :, None] - self._paths[:, None, unlike])
-            same = (near[..., 0] < apart_mm) & (near[..., 1] < APART_SLOPE)
-            cost = cost + APART_COST * same.sum(axis=2)
-        if not self._paths.any():
-            # The overall sign is open: of two mirror images one is enough.
-            cost = np.where(candidates[:, :, 0] < 0, np.inf, cost)
-        self._keep(frame, self._cost[:, None] + cost, here, moved, weight, candidates, int(np.argmax(at)))
-
-    def hold(self, frame: int) -> None:
-        """Leave a frame that no plane places where the one before it is."""
-        self._paths[:, frame] = self._paths[:, frame - 1]
-
-    def _weights(self, planes: Sequence[PairPlane], moved: FloatArray) -> FloatArray:
-        """Inverse covariances of offsets and slopes, shape (e, 2, 2)."""
-        covariance = PLACED * np.array([p.covariance[:2, :2] for p in planes])
-        covariance[:, [0, 1], [0, 1]] += (self._relative_error * moved) ** 2
-        return np.asarray(np.linalg.inv(covariance))
-
-    def _keep(
-        self,
-        frame: int,
-        cost: FloatArray,
-        here: FloatArray,
-        moved: FloatArray,
-        weight: FloatArray,
-        candidates: FloatArray,
-        latest: int,
-    ) -> None:
-        """Go on with the best paths that differ."""
-        recent = max(0, frame - OPEN_FRAMES)
-        kept: list[tuple[int, FloatArray]] = []
-        paths: list[FloatArray] = []
-        costs: list[float] = []
-        for flat in np.argsort(cost, axis=None)[: 4 * HYPOTHESES]:
-            parent, which = np.unravel_index(flat, cost.shape)
-            if not np.isfinite(cost[parent, which]) or len(kept) == HYPOTHESES:
-                break
-            place = _refined(candidates[parent, which], here[parent], moved, weight)
-            seen = np.vstack([here[parent], place])
-            others = (np.abs(path - seen).max(axis=0) for path in paths)
-            if not any(o[0] < SAME_MM and o[1] < SAME_SLOPE for o in others):
-                kept.append((int(parent), place))
-                paths.append(seen)
-                costs.append(float(cost[parent, which]))
-        parents = np.array([p for p, _ in kept])
-        places = np.array([x for _, x in kept])
-        self._advance(frame, recent, parents, places, np.array(costs), here[parents, latest, 0])
-
-    def _advance(
-        self,
-        frame: int,
-        recent: int,
-        parents: IntArray,
-        places: FloatArray,
-        cost: FloatArray,
-        before: FloatArray,
-    ) -> None:
-        paths = self._paths[parents]
-        paths[:, :recent] = self.path[:recent]
-        paths[:, frame] = places
-        step = places[:, 0] - before
-        # Averaged over travel and not over time, so that a pause, whose steps have random signs, keeps it.
-        share = 1.0 - np.exp(-np.abs(step) / TREND_MM)
-        trend = self._trend[parents]
-        self._trend = trend + share * (np.sign(step) - trend)
-        self._paths, self._cost = paths, cost - cost.min()
+    none = np.zeros(0, dtype=np.int64)
+    apart = strangers or Strangers(none, none, 0.0)
+    rules = PathRules(
+        HYPOTHESES,
+        relative_error,
+        PLACED,
+        CAP,
+        TURNING_COST,
+        TREND_MM,
+        SAME_MM,
+        SAME_SLOPE,
+        apart.apart_mm,
+        APART_SLOPE,
+        APART_COST,
+        OPEN_FRAMES,
+        hold,
+    )
+    every = np.arange(frames + 1)
+    path = np.zeros((frames, 2))
+    follow_paths(
+        np.searchsorted(second, every),
+        np.ascontiguousarray(first),
+        np.ascontiguousarray(moved),
+        np.ascontiguousarray(covariance),
+        np.searchsorted(apart.second, every),
+        np.ascontiguousarray(apart.first),
+        rules,
+        path,
+    )
+    return path
 
 
 def pair_signs(
-    path: FloatArray, first: IntArray, second: IntArray, planes: Sequence[PairPlane]
+    path: FloatArray, first: IntArray, second: IntArray, moved: FloatArray, covariance: FloatArray
 ) -> FloatArray:
-    """Sign of each pair's plane with which it agrees best with a path; shape (e,)."""
-    moved = np.array([p.coefficients[:2] for p in planes])
-    weight = np.linalg.inv(np.array([p.covariance[:2, :2] for p in planes]))
-    _, sign = _misfit((path[second] - path[first])[:, None], moved[:, None], weight[:, None])
-    return np.asarray(sign[:, 0])
+    """Sign of each pair's plane with which it agrees best with a path; shape (e,).
 
-
-def _misfit(relative: FloatArray, moved: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared deviations of signed planes from unsigned ones, and the signs that make them least."""
-    off = [relative - moved, relative + moved]
-    plus, minus = (np.einsum("...i,...ij,...j->...", o, weight, o) for o in off)
-    return np.minimum(plus, minus), np.where(plus <= minus, 1.0, -1.0)
-
-
-def _refined(place: FloatArray, here: FloatArray, moved: FloatArray, weight: FloatArray) -> FloatArray:
-    """Weighted mean of where the pairs that agree with a candidate put the frame."""
-    misfit, sign = _misfit(place - here, moved, weight)
-    near = misfit < CAP
-    if not near.any():
-        return place
-    told = here[near] + sign[near, None] * moved[near]
-    total = weight[near].sum(axis=0)
-    return np.asarray(np.linalg.solve(total, np.einsum("eij,ej->i", weight[near], told)))
+    Parameters
+    ----------
+    path : ndarray, shape (n, 2)
+    first, second : ndarray of int, shape (e,)
+    moved : ndarray, shape (e, 2)
+        As for `settled_path`.
+    covariance : ndarray, shape (e, 2, 2)
+    """
+    relative, weight = path[second] - path[first], np.linalg.inv(covariance)
+    plus, minus = (
+        np.einsum("ei,eij,ej->e", off, weight, off) for off in (relative - moved, relative + moved)
+    )
+    return np.where(plus <= minus, 1.0, -1.0)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import adjoint, rotation_from_fixed_angles
+from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.relative import RelativePoses
-from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.kernels.graph import PoseGraph, marginals, relax
 from speckle3d.matching.schedule import TrajectorySettings
-from speckle3d.motion.planes import PairPlane
+from speckle3d.motion.planes import PairPlanes
 
 SETTLED = 1e-7
 ROUNDS = 6
@@ -27,26 +24,35 @@ KNOWN_FRAMES = 80
 
 
 def relative_poses_of(
-    first: Sequence[int],
-    second: Sequence[int],
-    motions: Sequence[InPlaneMotion],
-    planes: Sequence[PairPlane],
-    signs: Sequence[float],
+    first: IntArray,
+    second: IntArray,
+    inplane: FloatArray,
+    inplane_covariance: FloatArray,
+    planes: PairPlanes,
+    sign: FloatArray,
 ) -> RelativePoses:
-    """Relative poses from in-plane motion and signed planes."""
-    a, b, c = (np.array([p.coefficients for p in planes]) * np.asarray(signs)[:, None]).T
+    """Relative poses from in-plane motion and signed planes.
+
+    Parameters
+    ----------
+    first, second : ndarray of int, shape (e,)
+    inplane, inplane_covariance : ndarray, shape (e, 3) and (e, 3, 3)
+        As of `CorrelationTable`.
+    planes : PairPlanes
+    sign : ndarray, shape (e,)
+    """
+    a, b, c = (planes.coefficients * sign[:, None]).T
     yaw = -np.arcsin(np.clip(b, -1, 1))
     tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
-    x, y, roll = np.array([(m.x_mm, m.y_mm, m.roll_rad) for m in motions]).T
+    x, y, roll = inplane.T
     rotation = rotation_from_fixed_angles(roll, yaw, tilt)
     poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
     covariance = np.zeros((len(planes), 6, 6))
-    inplane = [m.covariance if m.covariance is not None else np.eye(3) for m in motions]
-    covariance[:, [[0], [1], [5]], [0, 1, 5]] = np.array(inplane) + np.diag(INPLANE_FLOOR)
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = inplane_covariance + np.diag(INPLANE_FLOOR)
     # (a, b, c) is (z, -yaw, tilt) for small angles.
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
-    covariance[:, 2:5, 2:5] = order @ np.array([p.covariance for p in planes]) @ order.T
-    return RelativePoses(np.asarray(first), np.asarray(second), poses, covariance)
+    covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T
+    return RelativePoses(first, second, poses, covariance)
 
 
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
@@ -104,20 +110,12 @@ def solve_trajectory(
     """
     s = settings or TrajectorySettings()
     _require_connected(pairs.second, frames)
-    whitening = np.linalg.cholesky(np.linalg.inv(pairs.covariance)).transpose(0, 2, 1)
-    poses = _chain(pairs, frames, s.join == "chain")
-    for _ in range(ROUNDS if s.join == "graph" else 0):
-        normal, gradient = _normal_equations(poses, pairs, whitening, s.huber)
-        step = np.concatenate([np.zeros((1, 6)), splu(normal).solve(-gradient).reshape(-1, 6)])
-        poses = poses * RigidTransform.from_exp_coords(step)
-        if np.abs(step).max() < SETTLED:
-            break
-    covariance = np.zeros((frames, 6, 6))
-    if with_covariance:
-        normal, _ = _normal_equations(poses, pairs, whitening, s.huber)
-        covariance = _marginals(normal, frames)
+    graph, poses = _graph(pairs, frames), _chain(pairs, frames, s.join == "chain")
+    if s.join == "graph":
+        relax(graph, poses, s.huber, ROUNDS, SETTLED)
+    covariance = _marginals(graph, poses, s.huber) if with_covariance else np.zeros((frames, 6, 6))
     centre = RigidTransform.from_translation(centre_mm)
-    return Trajectory(centre * poses * centre.inv(), covariance)
+    return Trajectory(centre * RigidTransform.from_matrix(poses) * centre.inv(), covariance)
 
 
 def _require_connected(second: IntArray, frames: int) -> None:
@@ -132,71 +130,51 @@ def _require_connected(second: IntArray, frames: int) -> None:
         )
 
 
-def _chain(pairs: RelativePoses, frames: int, relative: bool) -> RigidTransform:
+def _chain(pairs: RelativePoses, frames: int, relative: bool) -> FloatArray:
     """Each frame from the pair whose distance is most certain, absolutely or relative to its size."""
     doubt = pairs.covariance[:, 2, 2]
     if relative:
         doubt = doubt / np.maximum(pairs.poses.translation[:, 2] ** 2, 1e-6)
-    best: dict[int, int] = {}
-    for row, second in enumerate(pairs.second.tolist()):
-        if second not in best or doubt[row] < doubt[best[second]]:
-            best[second] = row
-    step = pairs.poses.as_matrix()
+    best = np.zeros(frames, dtype=np.int64)
+    backwards = np.lexsort((doubt, pairs.second))[::-1]
+    best[pairs.second[backwards]] = backwards  # the last that is written stays
+    first, step = pairs.first[best].tolist(), pairs.poses.as_matrix()[best]
     matrices = np.tile(np.eye(4), (frames, 1, 1))
     for frame in range(1, frames):
-        matrices[frame] = matrices[pairs.first[best[frame]]] @ step[best[frame]]
-    return RigidTransform.from_matrix(matrices)
+        matrices[frame] = matrices[first[frame]] @ step[frame]
+    return matrices
 
 
-def _normal_equations(
-    poses: RigidTransform, pairs: RelativePoses, whitening: FloatArray, huber: float
-) -> tuple[sparse.csc_matrix, FloatArray]:
-    """For right increments of every pose but the first, each a rotation and a translation."""
-    first, second = pairs.first, pairs.second
-    relative = poses[first].inv() * poses[second]
-    error = (pairs.poses.inv() * relative).as_exp_coords()
-    # The covariance's order is translation, rotation; exponential coordinates' is rotation, translation.
-    swap = [3, 4, 5, 0, 1, 2]
-    w = whitening[:, :, swap]
-    r = np.einsum("eij,ej->ei", w, error)
-    size = np.linalg.norm(r, axis=1) / np.sqrt(6)
-    w = w * np.sqrt(np.minimum(1.0, huber / np.maximum(size, 1e-9)))[:, None, None]
-    r = np.einsum("eij,ej->ei", w, error)
-    j_second = w
-    j_first = -w @ adjoint(relative.inv())
-    edges, n = first.size, len(poses)
-    rows = (6 * np.arange(edges)[:, None, None] + np.arange(6)[:, None]) + np.zeros((1, 1, 6), dtype=int)
-    column = np.arange(6)[None, None, :] + np.zeros((1, 6, 1), dtype=int)
-    jacobian = sparse.csr_matrix(
-        (
-            np.concatenate([j_first.ravel(), j_second.ravel()]),
-            (
-                np.concatenate([rows.ravel(), rows.ravel()]),
-                np.concatenate(
-                    [
-                        (6 * first[:, None, None] + column).ravel(),
-                        (6 * second[:, None, None] + column).ravel(),
-                    ]
-                ),
-            ),
-        ),
-        shape=(6 * edges, 6 * n),
-    )[:, 6:]
-    normal = (jacobian.T @ jacobian + 1e-9 * sparse.identity(6 * (n - 1))).tocsc()
-    return normal, np.asarray(jacobian.T @ r.ravel())
+# The covariance's order is translation, rotation; exponential coordinates' is rotation, translation.
+_SWAPPED = np.array([3, 4, 5, 0, 1, 2])
 
 
-def _marginals(normal: sparse.csc_matrix, frames: int) -> FloatArray:
+def _graph(pairs: RelativePoses, frames: int) -> PoseGraph:
+    """The edges, and the envelope of their normal equations."""
+    first, second = (np.ascontiguousarray(each, dtype=np.int64) for each in (pairs.first, pairs.second))
+    earliest = np.arange(frames)
+    # Frames joined to the first, which is no unknown, reach back no farther for that.
+    lower = np.minimum(first, second)
+    np.minimum.at(earliest, np.maximum(first, second)[lower > 0], lower[lower > 0])
+    begin = np.repeat(6 * (earliest[1:] - 1), 6)
+    length = np.arange(begin.size) + 1 - begin
+    return PoseGraph(
+        first,
+        second,
+        pairs.poses.inv().as_matrix(),
+        np.ascontiguousarray(np.linalg.inv(pairs.covariance)[:, _SWAPPED[:, None], _SWAPPED]),
+        begin,
+        np.cumsum(length) - length - begin,
+        np.empty(int(length.sum())),
+    )
+
+
+def _marginals(graph: PoseGraph, poses: FloatArray, huber: float) -> FloatArray:
     """Covariance of each frame's pose, shape (n, 6, 6), in the order of `RelativePoses`."""
-    solver = splu(normal)
-    known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(int))
-    blocks = np.zeros((known.size + 1, 36))
-    for k, frame in enumerate(known, start=1):
-        rows = 6 * (frame - 1) + np.arange(6)
-        unit = np.zeros((normal.shape[0], 6))
-        unit[rows, np.arange(6)] = 1.0
-        block = solver.solve(unit)[rows]
-        blocks[k] = (block + block.T)[np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])].ravel() / 2
-    at = np.concatenate([[0], known])
-    every = [np.interp(np.arange(frames), at, column) for column in blocks.T]
+    frames = len(poses)
+    known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(np.int64))
+    blocks = np.zeros((known.size + 1, 6, 6))
+    marginals(graph, poses, huber, known, blocks[1:])
+    at, columns = np.concatenate([[0], known]), blocks[:, _SWAPPED[:, None], _SWAPPED].reshape(-1, 36).T
+    every = [np.interp(np.arange(frames), at, column) for column in columns]
     return np.stack(every, axis=1).reshape(frames, 6, 6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
-from speckle3d.motion.planes import PairPlane
+from speckle3d.motion.planes import PairPlanes
 
 
 def pose_covariance(
@@ -96,23 +95,25 @@ class SlopeEvidence:
     share: FloatArray
     deviation_per_mm: FloatArray
 
-    def applied(self, plane: PairPlane) -> PairPlane:
-        """Keep only the believed shares of a plane's slopes; its offset follows as the fit has it."""
-        keep = np.eye(3)
-        slopes = plane.covariance[1:, 1:]
-        keep[1:, 1:] = np.diag(self.share)
-        keep[0, 1:] = -plane.covariance[0, 1:] @ np.linalg.inv(slopes) @ np.diag(1.0 - self.share)
-        a, b, c = keep @ plane.coefficients
-        sign = -1.0 if a < 0 else 1.0
-        covariance = keep @ plane.covariance @ keep.T
-        left = self.deviation_per_mm * max(abs(a), NEAR_MM)
-        covariance[[1, 2], [1, 2]] += left**2
-        return replace(plane, offset_mm=sign * a, slope_x=sign * b, slope_y=sign * c, covariance=covariance)
+    def applied(self, planes: PairPlanes) -> PairPlanes:
+        """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it."""
+        covariance = planes.covariance
+        keep = np.zeros_like(covariance)
+        keep[:, 0, 0] = 1.0
+        keep[:, [1, 2], [1, 2]] = self.share
+        slopes = np.linalg.inv(covariance[:, 1:, 1:])
+        keep[:, :1, 1:] = -covariance[:, :1, 1:] @ slopes * (1.0 - self.share)
+        kept = (keep @ planes.coefficients[:, :, None])[:, :, 0]
+        covariance = keep @ covariance @ keep.transpose(0, 2, 1)
+        left = np.maximum(np.abs(kept[:, :1]), NEAR_MM) * self.deviation_per_mm
+        covariance[:, [1, 2], [1, 2]] += left**2
+        sign = np.where(kept[:, :1] < 0, -1.0, 1.0)
+        return replace(planes, coefficients=sign * kept, covariance=covariance)
 
 
 def weigh_slopes(
     design: FloatArray,
-    planes: Sequence[PairPlane],
+    planes: PairPlanes,
     scale_sigma: float,
     expected_per_mm: float,
 ) -> SlopeEvidence:
@@ -127,10 +128,8 @@ def weigh_slopes(
     expected_per_mm : float
         Slope per distance that sweeps have, standard deviation, rad/mm.
     """
-    coefficients = np.array([plane.coefficients for plane in planes])
-    weight = np.zeros(design.shape[0])
-    for plane in planes:
-        weight += np.nan_to_num(1.0 / plane.sigma_mm**2)
+    coefficients = planes.coefficients
+    weight = np.nansum(planes.sigma_mm**-2.0, axis=0)
     lever = np.array([_deviation(design[:, k], weight) for k in (1, 2)])
     false = UNEVENNESS * scale_sigma / np.maximum(lever, 1e-6)
     travelled = np.maximum((coefficients[:, 0] ** 2).sum(), 1e-12)

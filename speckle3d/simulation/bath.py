@@ -5,16 +5,17 @@ The medium's y axis points down and the floor is its plane y = 0, so that the pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.simulation.medium import Layer, Scatterers, TiledMedium, Waves, bounds_in_medium, tile_seed
+from speckle3d.simulation.medium import Layer, Scatterers, TiledMedium, Waves, bounds_in_medium
+from speckle3d.simulation.tiles import Tiles, tile_seed
 
 Reflector = Literal["wall", "bar"]
 
@@ -50,9 +51,9 @@ class RoughSheet:
     tile_mm: float = 4.0
 
     @cached_property
-    def tile(self) -> Callable[[int, int], FloatArray]:
-        """Positions of the scatterers on the tile whose first corner is at i, j tiles, shape (n, 3)."""
-        return lru_cache(_KEPT_TILES)(self._make)
+    def tiles(self) -> Tiles[FloatArray]:
+        """Positions of the scatterers on tiles whose first corners are at i, j tiles, shape (n, 3) each."""
+        return Tiles(self._make, _KEPT_TILES)
 
     def _make(self, i: int, j: int) -> FloatArray:
         rng = np.random.default_rng([self.entropy, *tile_seed(i, j)])
@@ -69,7 +70,7 @@ class RoughSheet:
         middle = np.insert((tiles + 0.5) * self.tile_mm, 1, 0.0, axis=1)
         place, corner = image_from_sheet.apply(middle), self.tile_mm / np.sqrt(2.0)
         reached = ((place >= low_mm - corner) & (place <= high_mm + corner)).all(axis=1)
-        found = [self.tile(int(i), int(j)) for i, j in tiles[reached]]
+        found = self.tiles(tiles[reached])
         return np.concatenate(found) if found else np.empty((0, 3))
 
 

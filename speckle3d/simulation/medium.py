@@ -7,15 +7,16 @@ media that presets name are at the end: a uniform phantom, a phantom with inclus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.simulation.tiles import Tiles, tile_seed
 
 Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
@@ -26,6 +27,9 @@ _KEPT_TILES = 160
 
 _PER_MM3 = 100.0
 """Density of the diffuse background of the media that presets name."""
+
+_DEPTH_BIN_MM = 0.25
+"""Tiles are sorted by depth in such steps, half of the beam table's."""
 
 _CELL_MM = 0.5
 """Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
@@ -52,11 +56,6 @@ def bounds_in_medium(
     corners = np.stack(np.meshgrid(x, y, z), axis=-1)
     seen = medium_from_image.apply(corners.reshape(-1, 3))
     return seen.min(axis=0), seen.max(axis=0)
-
-
-def tile_seed(i: int, j: int) -> tuple[int, int]:
-    """Tile indices as non-negative numbers, which seeds require, distinct on either side of the origin."""
-    return i % 2**32, j % 2**32
 
 
 @dataclass(frozen=True)
@@ -218,24 +217,31 @@ class TiledMedium:
         first = np.floor(low_mm[[0, 2]] / self.tile_mm).astype(int)
         last = np.floor(high_mm[[0, 2]] / self.tile_mm).astype(int)
         columns = range(first[0], last[0] + 1), range(first[1], last[1] + 1)
-        return [self._tile(i, j) for i in columns[0] for j in columns[1]]
+        return self._tiles((i, j) for i in columns[0] for j in columns[1])
 
     @cached_property
-    def _tile(self) -> Callable[[int, int], Scatterers]:
-        return lru_cache(_KEPT_TILES)(self._make)
+    def _tiles(self) -> Tiles[Scatterers]:
+        return Tiles(self._make, _KEPT_TILES)
+
+    @cached_property
+    def _families(self) -> Tiles[Scatterers]:
+        return Tiles(self._draw, _KEPT_TILES)
 
     def _make(self, i: int, j: int) -> Scatterers:
         parts = [self._background(i, j)]
         parts += [self._fascia(layer, n, i, j) for n, layer in enumerate(self.layers) if layer.fascia]
         # Children of a neighbouring tile's parents may lie in this tile.
         around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)] if self.clusters else []
-        parts += [self._children(i, j, *neighbour) for neighbour in around]
+        parts += [_within(i, j, self.tile_mm, family) for family in self._families(around)]
         position = np.concatenate([p for p, _ in parts])
         strength = np.concatenate([s for _, s in parts])
         for sphere in self.spheres:
             inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
             strength[inside] *= sphere.factor
-        kept = strength != 0.0
+        kept = np.flatnonzero(strength)
+        # By depth, so that neighbours meet the same part of the beam's table.
+        depth = (position[kept, 1] - self.depth_mm[0]) / _DEPTH_BIN_MM
+        kept = kept[np.argsort(depth.astype(np.int16), kind="stable")]
         return position[kept], strength[kept]
 
     def _rng(self, part: int, i: int, j: int) -> np.random.Generator:
@@ -287,16 +293,20 @@ class TiledMedium:
         position[:, 1] = layer.top_at(position) + rng.normal(0.0, 0.015, n)
         return position, np.full(n, layer.fascia / self.fascia_per_mm2, np.float32)
 
-    def _children(self, i: int, j: int, parent_i: int, parent_j: int) -> Scatterers:
-        corner = np.array([parent_i, parent_j]) * self.tile_mm
+    def _draw(self, i: int, j: int) -> Scatterers:
+        """Children of all parents in a tile; some lie outside it."""
+        corner = np.array([i, j]) * self.tile_mm
         drawn = [
-            kind.draw(self._rng(1000 + number, parent_i, parent_j), corner, self.tile_mm)
+            kind.draw(self._rng(1000 + number, i, j), corner, self.tile_mm)
             for number, kind in enumerate(self.clusters)
         ]
-        position = np.concatenate([p for p, _ in drawn])
-        strength = np.concatenate([s for _, s in drawn])
-        mine = (np.floor(position[:, [0, 2]] / self.tile_mm) == [i, j]).all(axis=1)
-        return position[mine], strength[mine]
+        return np.concatenate([p for p, _ in drawn]), np.concatenate([s for _, s in drawn])
+
+
+def _within(i: int, j: int, tile_mm: float, scatterers: Scatterers) -> Scatterers:
+    position, strength = scatterers
+    mine = (np.floor(position[:, [0, 2]] / tile_mm) == [i, j]).all(axis=1)
+    return position[mine], strength[mine]
 
 
 def fully_developed(entropy: int, length_mm: float) -> TiledMedium:

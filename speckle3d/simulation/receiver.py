@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -13,6 +14,7 @@ from scipy import signal as filters
 from speckle3d.core.arrays import Complex64Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep
+from speckle3d.core.threads import ahead
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
 GUARD = 0.1
@@ -119,6 +121,13 @@ class _Received:
 
     def __len__(self) -> int:
         return self.frames.shape[0]
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        raise NotImplementedError
+
+    def in_order(self) -> Iterator[npt.NDArray[Any]]:
+        """All frames from the first, made on all cores."""
+        return ahead(self.__getitem__, range(len(self)))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,15 +14,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.kernels.scatter import (
-    BeamLimits,
-    CellOrder,
-    FieldTable,
-    Vectors,
-    gather_near,
-    scatter_echoes,
-    sort_into_cells,
-)
+from speckle3d.core.threads import ahead
+from speckle3d.kernels.scatter import EchoGrid, FieldTable, field_table, scatter_echoes
 from speckle3d.simulation.beam import BeamTable
 from speckle3d.simulation.medium import Medium
 
@@ -36,9 +30,6 @@ _NOISE_BAND_HZ = (2e6, 13e6)
 
 _MOST_GAIN_DB = 40.0
 """Most that time-gain compensation, which is fixed for a uniform medium, amplifies over the focus."""
-
-_CELL_MM = 0.3
-"""Lateral cells that scatterers are sorted into: a vector skips those out of its reach."""
 
 _GUARD_SAMPLES = 160
 """Longer than the pulse (its raised-cosine spectrum is 10 MHz wide): keeps the FFT's ends apart."""
@@ -89,22 +80,22 @@ class SimulatedFrames:
         counts = self._spectra.waveforms(self.echoes(index), self._noise(index)) * self._gain
         return np.clip(np.rint(counts), -FULL_SCALE, FULL_SCALE).astype(np.int16)
 
+    def in_order(self) -> Iterator[npt.NDArray[np.int16]]:
+        """All frames from the first, made on all cores."""
+        return ahead(self.__getitem__, range(len(self)))
+
     def echoes(self, index: int) -> Complex64Array:
         """Baseband echoes of frame `index`, shape (vector, sample, component of the beam)."""
-        probe, image, beam = self.beam.probe, self.image, self.beam
-        out = np.zeros((image.vectors, self._spectra.length, beam.grid.components), np.complex64)
-        vector_mm = np.arange(image.vectors, dtype=np.float64) * image.vector_pitch_mm
-        near = (vector_mm - vector_mm[0]) / _CELL_MM
-        far = near + 2.0 * beam.lateral_extent_mm / _CELL_MM
-        scatter_echoes(
-            self._near(self.medium_from_image[index]),
-            Vectors(vector_mm, (near + 1e-6).astype(np.int64), (far + 1e-6).astype(np.int64) + 1),
-            FieldTable(beam.residual, beam.reach, beam.curvature_per_mm, self._table_steps),
-            image.first_sample_depth_mm,
-            image.sample_spacing_mm,
-            2e-3 * self._spectra.carrier_hz / probe.speed_of_sound_m_s,
-            out,
-        )
+        probe, image = self.beam.probe, self.image
+        out = np.zeros((image.vectors, self._spectra.length, self.beam.grid.components), np.complex64)
+        carrier = 2e-3 * self._spectra.carrier_hz / probe.speed_of_sound_m_s
+        grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
+        medium_from_image = self.medium_from_image[index]
+        matrix = medium_from_image.inv().as_matrix()
+        for position, strength in self.medium.seen(medium_from_image, *self._box):
+            scatter_echoes(
+                position, strength, matrix, image.vector_pitch_mm, self._field, grid, out.view(np.float32)
+            )
         return out
 
     @cached_property
@@ -112,9 +103,19 @@ class SimulatedFrames:
         return _Spectra(self.beam, self.image.samples)
 
     @cached_property
-    def _table_steps(self) -> FloatArray:
-        depth, lateral, elevation = self.beam.depth_mm, self.beam.lateral_mm, self.beam.elevation_mm
-        return np.array([depth[0], depth[1] - depth[0], lateral[1], elevation[1]])
+    def _field(self) -> FieldTable:
+        beam = self.beam
+        depth, lateral, elevation = beam.depth_mm, beam.lateral_mm, beam.elevation_mm
+        steps = np.array([depth[0], depth[1] - depth[0], lateral[1], elevation[1]])
+        return field_table(beam.residual, beam.reach, beam.curvature_per_mm, steps, beam.grid.per_pitch)
+
+    @cached_property
+    def _box(self) -> tuple[FloatArray, FloatArray]:
+        """Opposite corners of what the beam reaches, in the image."""
+        margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
+        depth = self.beam.depth_mm
+        low = np.array([-margin, depth[0], -thick])
+        return low, np.array([self.image.width_mm + margin, depth[-1], thick])
 
     @cached_property
     def _rms(self) -> tuple[FloatArray, float]:
@@ -147,26 +148,6 @@ class SimulatedFrames:
         noise[:, band] = scale * white.view(np.complex64)[..., 0]
         return noise
 
-    def _near(self, medium_from_image: RigidTransform) -> CellOrder:
-        """Scatterers within the beam's reach."""
-        margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm
-        lateral = np.array([-margin, self.image.width_mm + margin])
-        depth = self.beam.depth_mm
-        low = np.array([lateral[0], depth[0], -thick.max()])
-        high = np.array([lateral[1], depth[-1], thick.max()])
-        blocks = self.medium.seen(medium_from_image, low, high)
-        total = sum(strength.size for _, strength in blocks)
-        near = np.empty((total, 3)), np.empty(total, np.float32)
-        matrix, n = medium_from_image.inv().as_matrix(), 0
-        limits = BeamLimits(lateral, self._table_steps[:2], thick)
-        for block in blocks:
-            n = gather_near(block, matrix, limits, near, n)
-        # One spare cell: rounding may put the rightmost scatterer past the last one that a vector looks at.
-        cells = np.zeros(int(np.ptp(lateral) / _CELL_MM + 1e-6) + 3, np.int64)
-        ordered = CellOrder(np.empty((n, 3)), np.empty(n, np.float32), cells)
-        sort_into_cells(near[0][:n], near[1][:n], lateral[0], _CELL_MM, depth[-1], ordered)
-        return ordered
-
 
 class _Spectra:
     """Pulse spectra of the beam's components on the FFT's bins; turns baseband echoes into RF."""
@@ -185,8 +166,8 @@ class _Spectra:
     def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> Float32Array:
         """RF, shape (vector, sample): each component's echoes through its pulse, and the noise, summed."""
         # The band holds less than half of the bins: baseband bins wrap, so negative ones are in place.
-        baseband = fft(echoes, axis=1, workers=2)[:, self._band - self._carrier_bin]
+        baseband = fft(echoes, axis=1)[:, self._band - self._carrier_bin]
         spectrum = noise
         spectrum[:, self._band] += np.einsum("vfk,fk->vf", baseband, self._pulse)
-        wave: Float32Array = irfft(spectrum, self.length, axis=1, workers=2)[:, : self.samples]
+        wave: Float32Array = irfft(spectrum, self.length, axis=1)[:, : self.samples]
         return wave

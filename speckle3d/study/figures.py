@@ -283,8 +283,10 @@ def save_figure(figure: Figure, path: Path) -> Path:
         If the file cannot be written.
     """
     make_folder(path.parent)
+    figure.set_dpi(DOTS_PER_INCH)
     with atomic_path(path) as part:
-        figure.savefig(part, dpi=DOTS_PER_INCH, format="png")
+        # `savefig` would draw everything twice, the first time for the layout alone.
+        FigureCanvasAgg(figure).print_png(part)
     return path
 
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.threads import on_one_thread
 from speckle3d.io.hdf5 import one_line
-from speckle3d.matching.blocks import on_one_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

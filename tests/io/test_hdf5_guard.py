@@ -1,6 +1,7 @@
 """HDF5 files that point out of themselves, or claim data that they do not hold, are refused in one line."""
 
 import os
+import sys
 import zlib
 
 import h5py
@@ -15,6 +16,7 @@ from speckle3d.io.calibrations import read_calibration, write_calibration
 from speckle3d.io.challenge import is_challenge_scan
 from speckle3d.io.hdf5 import read_attribute, read_text
 from speckle3d.io.hdf5_guard import follow, require_texts
+from speckle3d.io.inflate import inflate
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.sweeps import read_sweep
 
@@ -211,6 +213,20 @@ def test_chunks_of_any_shape_and_filter_are_read_as_hdf5_does(path, chunks, how,
     values = np.random.default_rng(0).integers(-2000, 2000, SHAPE).astype(kind)
     in_place_of(path, "rf", lambda file, name: file.create_dataset(name, data=values, chunks=chunks, **how))
     np.testing.assert_array_equal(all_frames(path), values)
+
+
+@pytest.mark.parametrize("with_isal", [True, False])
+def test_a_chunk_is_unpacked_alike_with_and_without_isal(monkeypatch, with_isal):
+    if not with_isal:
+        monkeypatch.setitem(sys.modules, "isal", None)
+    packed = zlib.compress(bytes(range(200)) * 2)
+    assert inflate(packed, 400, (0,)) == bytes(range(200)) * 2
+    with pytest.raises(zlib.error, match="incorrect data check"):
+        inflate(packed[:-1] + b"x", 400, (0,))
+    with pytest.raises(InvalidInputError, match="399 bytes, got more"):
+        inflate(packed, 399, (0,))
+    with pytest.raises(InvalidInputError, match="expected 400 bytes"):
+        inflate(packed[:-5], 400, (0,))
 
 
 @pytest.mark.parametrize("size", [0, 1, 40, 300, 5000])

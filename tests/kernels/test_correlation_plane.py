@@ -22,7 +22,11 @@ def echo(staying=0.0, moving=1.0, gain=1.0, stretch=1.0, staying_sd=0.0, stretch
 
 
 def predict(d, model, of_echo=True):
-    return predict_correlation(d, AMPLITUDE, STEP_MM, model, CELLS, of_echo)
+    staying, moving, gain, stretch, staying_sd, stretch_sd = model
+    last = AMPLITUDE.size - 1.001
+    return predict_correlation(
+        d, AMPLITUDE, 0, last, STEP_MM, stretch, staying, moving, gain, staying_sd, stretch_sd, CELLS, of_echo
+    )
 
 
 def at_random(d):

@@ -40,12 +40,12 @@ def exact_bins(distance, rho, each=40.0):
 
 def fit(bins, scales=(1.0,), stretches=STRETCHES, lengths=LENGTHS_MM, of_echo=True, gain_precision=0.0):
     scales = np.array(scales)
-    shape = (scales.size, len(bins), stretches.size, lengths.size)
+    shape = (len(bins), scales.size, stretches.size, lengths.size)
     cost, found = np.empty(shape), np.empty((*shape, 2))
     table = np.tile(amplitude(GRID_MM), (len(bins), 1))
     curves = PatchCurves(table, STEP_MM, np.full(len(bins), CELLS), of_echo)
-    fit_echo_models(bins, scales, stretches, lengths, curves, 20.0, gain_precision, cost, found)
-    return cost, found
+    fit_echo_models(bins, scales, stretches, lengths, curves, 20.0, gain_precision, 0, len(bins), cost, found)
+    return cost.swapaxes(0, 1), found.swapaxes(0, 1)
 
 
 DISTANCE_MM = np.linspace(0.05, 2.5, 50)
@@ -125,3 +125,30 @@ def test_patches_are_fitted_each_for_itself_and_empty_bins_passed_over():
         alone_cost, alone = fit(kept)
         np.testing.assert_array_equal(cost[0, p], alone_cost[0, 0])
         np.testing.assert_array_equal(found[0, p], alone[0, 0])
+
+
+@pytest.mark.parametrize("of_echo", [True, False])
+def test_every_model_is_fitted_as_by_its_twin(of_echo):
+    rng = np.random.default_rng(3)
+    patches = 3
+    share, gain = rng.uniform(0, 0.9, (2, 2 * patches, 1))
+    rho = (0.3 + gain) * (share + (1 - share) * amplitude(DISTANCE_MM)) ** 2
+    rho = np.clip(rho + 0.05 * rng.normal(size=rho.shape), 0, 1)
+    count = rng.integers(0, 30, rho.shape).astype(float)
+    count[1] = 0.0
+    bins = np.stack([np.ones_like(rho), np.broadcast_to(DISTANCE_MM, rho.shape), rho, rho**2 + 0.01], axis=-1)
+    bins *= count[..., None]
+    scales, lengths = np.array([0.4, 1.0, 2.9]), np.array([NO_GAIN, 0.0, 0.004, 4.0, 40.0])
+    tables = amplitude(GRID_MM / rng.uniform(0.5, 2.0, (patches, 1)))
+    curves = PatchCurves(tables, STEP_MM, rng.uniform(30, 100, patches), of_echo)
+    shape = (2 * patches, scales.size, STRETCHES.size, lengths.size)
+    cost, found = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
+    # In two parts, as threads share them out.
+    for part in ((0, 2), (2, 2 * patches)):
+        fit_echo_models(bins, scales, STRETCHES, lengths, curves, 20.0, 40.0, *part, cost, found)
+    for at in np.ndindex(shape):
+        e, s, k, j = at
+        of_patch = tables[e % patches], STEP_MM, curves.cells[e % patches], of_echo
+        model = scales[s], STRETCHES[k], lengths[j]
+        expected = oracles.echo_model(bins[e], *model, of_patch, 20.0, 40.0)
+        np.testing.assert_allclose([cost[at], *found[at]], expected, rtol=1e-9, atol=1e-9)

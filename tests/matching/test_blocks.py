@@ -103,10 +103,11 @@ def test_a_block_reads_few_frames_before_it(sweep):
     frames = list(matched(part, CONFIG, Block(72, 96)))
     s = CONFIG.trajectory
     references = {first for each in frames for first in each.pairs if first < 72}
-    # Steps of 0.13 mm: a key frame every other frame, eight of them at most, and three read ahead.
+    # Steps of 0.13 mm: a key frame every other frame, eight of them at most, and three read ahead of the
+    # last one, which the block's own first key frame may have replaced.
     assert len(references) > s.key_frames
     assert min(references) > 72 - 3 * (s.key_frames + s.far_key_frames)
-    assert min(part.frames.reads) >= min(references) - 4
+    assert min(part.frames.reads) >= min(references) - 6
     assert max(map(part.frames.reads.count, part.frames.reads)) == 1
 
 

@@ -27,7 +27,7 @@ def test_rows_keep_their_order_and_another_tables_rows_come_after_them():
     assert both.first.tolist() == [0, 0, 0]
     assert both.second.tolist() == [1, 2, 9]
     np.testing.assert_array_equal(both.correlation[2], np.float32([0.6, np.nan, 0.2]))
-    np.testing.assert_array_equal(both.moved_mm(1), [0.0, -0.2])
+    np.testing.assert_array_equal(both.inplane[1], [0.0, -0.2, 0.0])
     # The tables they were made of are as they were.
     assert len(ours) == 2
 

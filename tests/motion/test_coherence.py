@@ -237,19 +237,20 @@ def test_a_known_scale_is_only_refined():
 def test_models_follow_the_sweep_and_what_stays_falls_with_distance():
     share = some([0.0, 0.5])
     found, _, _ = estimate(share)
-    near, far = found.models(np.array([found.frame[0]] * 2), np.array([0.1, -6.0]))
-    np.testing.assert_allclose(near.moving, 1 - found.share[0], rtol=1e-12)
-    np.testing.assert_allclose(near.gain, found.gain[0], rtol=1e-12)
-    np.testing.assert_allclose(near.stretch, found.stretch[0], rtol=1e-12)
-    np.testing.assert_allclose(far.staying, found.share[0] * np.exp(-6.0 * found.decay_per_mm[0]), rtol=1e-12)
+    both = found.models(np.array([found.frame[0]] * 2), np.array([0.1, -6.0]))
+    near, far = both[[0]], both[[1]]
+    np.testing.assert_allclose(near.moving[0], 1 - found.share[0], rtol=1e-12)
+    np.testing.assert_allclose(near.gain[0], found.gain[0], rtol=1e-12)
+    np.testing.assert_allclose(near.stretch[0], found.stretch[0], rtol=1e-12)
+    left = found.share[0] * np.exp(-6.0 * found.decay_per_mm[0])
+    np.testing.assert_allclose(far.staying[0], left, rtol=1e-12)
     assert (near.staying >= far.staying).all()
     assert (near.staying + near.moving <= 1 + 1e-12).all()
     # Before the first block and after the last as there; halfway between two blocks their mean.
     middle = found.frame[:2].mean()
     ends = found.models(np.array([-10.0, middle, 1e4]), np.zeros(3))
-    np.testing.assert_allclose(ends[0].staying, found.share[0])
-    np.testing.assert_allclose(ends[1].staying, found.share[:2].mean(axis=0))
-    np.testing.assert_allclose(ends[2].staying, found.share[-1])
+    expected = [found.share[0], found.share[:2].mean(axis=0), found.share[-1]]
+    np.testing.assert_allclose(ends.staying, expected)
 
 
 def test_patches_without_any_correlation_are_no_obstacle():

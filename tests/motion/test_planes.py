@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import speckle
+from pair_planes import fit, pair
 
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.sweep import ImageGrid
@@ -63,7 +64,9 @@ def drawn(rho, rng, law="gaussian", of_echo=True):
 def fits(fitter, plane, draws, law="gaussian", of="echo", tilt=TILT):
     rng = np.random.default_rng(1)
     rho = correlations(plane, tilt)
-    return [fitter.fit(drawn(rho, rng, law, of == "echo"), STILL) for _ in range(draws)]
+    every = np.array([drawn(rho, rng, law, of == "echo") for _ in range(draws)], np.float32)
+    planes = fitter.fit(every, np.zeros((draws, 2)))
+    return [pair(planes, k) for k in range(draws)]
 
 
 # ---- one side ---------------------------------------------------------------------------------------------
@@ -71,7 +74,7 @@ def fits(fitter, plane, draws, law="gaussian", of="echo", tilt=TILT):
 
 @pytest.mark.parametrize("plane", [*PLANES, (0.9, 0.005, 0.01)])
 def test_correlations_of_a_plane_give_it_back(plane):
-    found = fitter_of().fit(correlations(plane), STILL)
+    found = fit(fitter_of(), correlations(plane), STILL)
     # Steps end when the cost no longer falls by a millionth of itself; the slopes' prior pulls by less.
     np.testing.assert_allclose(found.coefficients, plane, atol=2e-4)
     assert found.used.all()
@@ -86,24 +89,24 @@ def test_in_plane_motion_shifts_the_patches_with_the_second_frame():
     spread = np.interp(PATCHES.centre_mm[:, 1], (5.0, 30.0), TILT.spread_mm)
     rho = speckle.gaussian_correlation(np.hypot(there - pivot * c, spread * c), SIGMA_MM)
     fitter = fitter_of()
-    np.testing.assert_allclose(fitter.fit(rho, moved).coefficients, (a, b, c), atol=2e-4)
+    np.testing.assert_allclose(fit(fitter, rho, moved).coefficients, (a, b, c), atol=2e-4)
     centre = a - b * moved[0] - c * moved[1]
-    np.testing.assert_allclose(fitter.fit(rho, STILL).offset_mm, centre, atol=5e-4)
+    np.testing.assert_allclose(fit(fitter, rho, STILL).offset_mm, centre, atol=5e-4)
 
 
 def test_curves_that_know_nothing_of_tilt_say_nothing_of_it():
     """All depths then see the centre's distance, and tilt is left to what is expected of it."""
-    found = fitter_of(tilt=None).fit(correlations((0.3, 0.006, 0.0), None), STILL)
+    found = fit(fitter_of(tilt=None), correlations((0.3, 0.006, 0.0), None), STILL)
     np.testing.assert_allclose(found.coefficients, (0.3, 0.006, 0.0), atol=2e-4)
     assert np.sqrt(found.covariance[2, 2]) > 0.04
-    assert np.sqrt(fitter_of().fit(correlations(PLANES[0]), STILL).covariance[2, 2]) < 0.002
+    assert np.sqrt(fit(fitter_of(), correlations(PLANES[0]), STILL).covariance[2, 2]) < 0.002
 
 
 def test_the_offset_is_told_positive_though_the_patches_lie_beyond_the_crossing():
     """Frames that cross left of all the patches used: seen from either side, the centre is 0.05 mm away."""
     truth = np.array([-0.05, 0.03, 0.0])
     rho = np.where(AT[:, 0] > 3.0, correlations(truth), np.nan)
-    found = fitter_of().fit(rho, STILL)
+    found = fit(fitter_of(), rho, STILL)
     np.testing.assert_allclose(found.coefficients, -truth, atol=5e-4)
 
 
@@ -125,7 +128,7 @@ def test_where_speckle_has_all_but_gone_distances_would_be_missing_but_planes_ar
     estimator = DistanceEstimator(speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS), PATCHES)
     lost, averages = [], []
     for _ in range(60):
-        read = estimator.distances(drawn(correlations(plane), rng)).distance_mm
+        read = estimator.distances(drawn(correlations(plane), rng)[None]).distance_mm
         lost.append(np.isnan(read).mean())
         averages.append(np.nanmean(read) / patch_distances(plane).mean())
     found = np.array([f.offset_mm for f in fits(fitter, plane, 150)])
@@ -166,7 +169,7 @@ def test_other_laws_of_noise_than_assumed_do_no_harm(plane, law):
 
 def test_the_common_bias_is_part_of_the_offsets_variance_alone():
     rho = correlations(PLANES[0])
-    without, with_it = (fitter_of(bias_mm=b).fit(rho, STILL).covariance for b in (0.0, 0.05))
+    without, with_it = (fit(fitter_of(bias_mm=b), rho, STILL).covariance for b in (0.0, 0.05))
     added = np.zeros((3, 3))
     added[0, 0] = 0.05**2
     np.testing.assert_allclose(with_it - without, added, atol=1e-12)
@@ -183,7 +186,7 @@ def test_excess_is_how_much_farther_a_patch_is():
     for patch, change in ((farther, 0.03), (nearer, -0.03)):
         rho[patch] = speckle.gaussian_correlation(patch_distances(plane)[patch] + change, SIGMA_MM)
     rho[5] = np.nan
-    found = fitter.fit(rho, STILL)
+    found = fit(fitter, rho, STILL)
     # To first order in the correlation, whose slope changes by a twentieth over 0.03 mm, less the hundredth
     # part of it that one of 120 patches moves the plane.
     np.testing.assert_allclose(found.excess_mm[[farther, nearer]], [0.03, -0.03], rtol=0.15)
@@ -198,7 +201,7 @@ def test_excess_counts_outwards_on_either_side_of_a_crossing():
     rho = correlations(plane)
     patches = [int(np.argmin(np.hypot(*(AT - at).T))) for at in ([-12, 0], [12, 0])]
     rho[patches] = speckle.gaussian_correlation(patch_distances(plane)[patches] + 0.02, SIGMA_MM)
-    found = fitter_of().fit(rho, STILL)
+    found = fit(fitter_of(), rho, STILL)
     np.testing.assert_allclose(found.excess_mm[patches], 0.02, rtol=0.15)
 
 
@@ -219,10 +222,10 @@ def test_outliers_do_not_move_the_plane():
     fitter = fitter_of()
     for plane in PLANES:
         rho = drawn(correlations(plane), rng)
-        before = fitter.fit(rho, STILL)
+        before = fit(fitter, rho, STILL)
         outlying = rng.choice(rho.size, rho.size // 10, replace=False)
         rho[outlying] *= 0.3
-        after = fitter.fit(rho, STILL)
+        after = fit(fitter, rho, STILL)
         # Huber's weights leave a tenth of outliers the pull of two deviations each: 0.2 of 0.05 mm.
         assert abs(after.offset_mm - before.offset_mm) < 0.015
         assert np.abs(after.coefficients - before.coefficients)[1:].max() < 0.002
@@ -236,7 +239,7 @@ def test_patches_without_correlation_and_outside_the_subset_take_no_part():
     subset = AT[:, 0] < 5.0
     rho[~subset] = 0.1
     rho[:3] = np.nan
-    found = fitter_of().fit(rho, STILL, subset=subset)
+    found = fit(fitter_of(), rho, STILL, subset=subset)
     np.testing.assert_allclose(found.coefficients, PLANES[1], atol=2e-4)
     assert np.array_equal(found.used, subset & np.isfinite(rho))
     assert np.array_equal(np.isfinite(found.sigma_mm), found.used)
@@ -246,9 +249,9 @@ def test_patches_without_correlation_and_outside_the_subset_take_no_part():
 def test_fewer_than_six_patches_make_no_plane():
     rho = np.full(len(AT), np.nan)
     rho[:5] = 0.8
-    assert fitter_of().fit(rho, STILL) is None
+    assert fit(fitter_of(), rho, STILL) is None
     rho[5] = 0.8
-    assert fitter_of().fit(rho, STILL) is not None
+    assert fit(fitter_of(), rho, STILL) is not None
 
 
 def test_what_stays_and_what_is_stretched_is_allowed_for():
@@ -257,13 +260,13 @@ def test_what_stays_and_what_is_stretched_is_allowed_for():
     some = np.arange(len(AT)) % 2 == 0
     staying = np.where(some, 0.4, 0.0)
     stretch = np.where(~some & (AT[:, 1] > 0), 1.4, 1.0)
-    model = EchoModel(staying, 1.0 - staying, np.full(len(AT), 0.95), stretch)
+    model = EchoModel(*(x[None] for x in (staying, 1.0 - staying, np.full(len(AT), 0.95), stretch)))
     g = np.sqrt(speckle.gaussian_correlation(patch_distances(plane) / stretch, SIGMA_MM))
     rho = 0.95 * (staying + (1.0 - staying) * g) ** 2
     fitter = fitter_of()
-    found = fitter.fit(rho, STILL, model)
+    found = fit(fitter, rho, STILL, model)
     np.testing.assert_allclose(found.coefficients, plane, atol=5e-4)
-    assert np.abs(fitter.fit(rho, STILL).coefficients - plane)[1:].min() > 1.5e-3
+    assert np.abs(fit(fitter, rho, STILL).coefficients - plane)[1:].min() > 1.5e-3
     # A share is not known exactly, so such patches tell less.
     plain = (stretch == 1.0) & ~some
     assert np.median(found.sigma_mm[some & (AT[:, 1] <= 0)]) > 1.3 * np.median(found.sigma_mm[plain])
@@ -310,7 +313,7 @@ def test_a_few_lost_patches_on_the_crossing_line_do_not_hide_it(plane):
     fitter = fitter_of()
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        found = fitter.fit(spoiled(drawn(correlations(plane), rng), rng, 0.08), STILL)
+        found = fit(fitter, spoiled(drawn(correlations(plane), rng), rng, 0.08), STILL)
         assert crosses(found), seed
         assert abs(abs(found.slope_x) - abs(plane[1])) < 0.004
 
@@ -320,7 +323,7 @@ def test_lost_patches_do_not_make_frames_cross():
     for plane in PARALLEL[1:4]:
         for seed in range(20):
             rng = np.random.default_rng(seed)
-            found = fitter.fit(spoiled(drawn(correlations(plane), rng), rng, 0.08), STILL)
+            found = fit(fitter, spoiled(drawn(correlations(plane), rng), rng, 0.08), STILL)
             assert not crosses(found), (plane, seed)
 
 
@@ -335,7 +338,7 @@ def test_known_slopes_are_kept_and_tell_the_side(plane):
     fitter, rng = fitter_of(), np.random.default_rng(5)
     slopes = np.array(plane[1:])
     for _ in range(40):
-        found = fitter.fit(drawn(correlations(plane), rng), STILL, slopes=slopes)
+        found = fit(fitter, drawn(correlations(plane), rng), STILL, slopes=slopes)
         # Four deviations of one draw.
         assert abs(found.offset_mm - plane[0]) < 0.01
         # The sensor is trusted to 5e-4, the images tell slopes of frames so near to 2 to 6e-4.
@@ -348,7 +351,7 @@ def test_known_slopes_hold_against_patches_that_under_read():
     rho = correlations((0.4, 0.0, 0.0))
     slow = AT[:, 0] > 5.0
     rho[slow] = speckle.gaussian_correlation(0.8 * 0.4, SIGMA_MM)
-    free, held = fitter.fit(rho, STILL), fitter.fit(rho, STILL, slopes=np.zeros(2))
+    free, held = fit(fitter, rho, STILL), fit(fitter, rho, STILL, slopes=np.zeros(2))
     assert abs(free.slope_x) > 0.003
     # A sensor that is sure to 5e-4 against images that claim 3e-4.
     assert abs(held.slope_x) < 0.75 * abs(free.slope_x)
@@ -358,7 +361,7 @@ def test_known_slopes_hold_against_patches_that_under_read():
 def test_a_side_that_a_sensor_has_wrong_is_not_forced():
     """Slopes of the mirror image put every patch on the wrong side of where the correlations have it."""
     plane = np.array([0.1, 0.03, 0.0])
-    mirrored = fitter_of().fit(correlations(plane), STILL, slopes=-plane[1:])
+    mirrored = fit(fitter_of(), correlations(plane), STILL, slopes=-plane[1:])
     np.testing.assert_allclose(mirrored.coefficients, -plane, atol=1e-3)
 
 
@@ -370,7 +373,7 @@ def test_a_wrong_guess_of_the_distance_does_no_harm(plane, start_mm):
     fitter = fitter_of()
     for seed in range(5):
         noisy = drawn(rho, np.random.default_rng(seed))
-        one, other = fitter.fit(noisy, STILL), fitter.fit(noisy, STILL, start_mm=start_mm)
+        one, other = fit(fitter, noisy, STILL), fit(fitter, noisy, STILL, start_mm=start_mm)
         # Steps end within a deviation, of 1.5 % of the distance, from the minimum.
         assert abs(one.offset_mm - other.offset_mm) < 0.015 * plane[0] + 1e-3
 
@@ -380,15 +383,15 @@ def test_a_guess_does_not_make_frames_cross(start_mm):
     fitter = fitter_of()
     for plane in PARALLEL[:4]:
         rng = np.random.default_rng(7)
-        found = [fitter.fit(drawn(correlations(plane), rng), STILL, start_mm=start_mm) for _ in range(20)]
+        found = [fit(fitter, drawn(correlations(plane), rng), STILL, start_mm=start_mm) for _ in range(20)]
         assert not any(crosses(f) and abs(f.slope_x) > 0.003 for f in found)
 
 
 def test_a_side_that_is_settled_is_held():
     """The offset starts on the slopes' own side alone; a mirror image that fits better is not looked for."""
     plane, fitter = np.array([0.3, 0.006, 0.0]), fitter_of()
-    turned = fitter.fit(correlations(plane), STILL, slopes=-plane[1:])
-    held = fitter.fit(correlations(plane), STILL, slopes=-plane[1:], either_side=False)
+    turned = fit(fitter, correlations(plane), STILL, slopes=-plane[1:])
+    held = fit(fitter, correlations(plane), STILL, slopes=-plane[1:], either_side=False)
     np.testing.assert_allclose(turned.coefficients, -plane, atol=1e-3)
     assert held.offset_mm > 0.25
 
@@ -397,9 +400,9 @@ def test_patches_beyond_the_last_distance_of_the_curves_take_no_part():
     made = speckle.curves(sigma_mm=SIGMA_MM, cells=CELLS, largest_mm=0.5)
     fitter = PlaneFitter(DistanceEstimator(made, PATCHES), AT, PlaneSettings())
     plane = (0.45, 0.02, 0.0)
-    found = fitter.fit(correlations(plane, None), STILL)
+    found = fit(fitter, correlations(plane, None), STILL)
     far = patch_distances(plane, None) > 0.5
     assert 0.3 < far.mean() < 0.7
     np.testing.assert_array_equal(found.used, ~far)
     np.testing.assert_allclose(found.coefficients, plane, atol=5e-3)
-    assert fitter.fit(correlations((0.9, 0.0, 0.0), None), STILL) is None
+    assert fit(fitter, correlations((0.9, 0.0, 0.0), None), STILL) is None

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from speckle3d.motion.planes import PairPlane
-from speckle3d.motion.signs import OPEN_FRAMES, SignResolver, pair_signs
+from speckle3d.motion.signs import OPEN_FRAMES, PLAIN_ERROR, Strangers, pair_signs, settled_path
 
 REACH_MM, KEY_MM, TURNED_MM = 0.85, 0.2, 8.0
 """Pairs share speckle up to the first; the second apart, a key frame is kept; a slope's worth in travel."""
-NOTHING = np.zeros(1)
 ADAPTED = 0.1
 """Relative error of distances where coherence has been adapted to."""
 
@@ -88,18 +86,19 @@ class Sweep:
         self.z, self.b = z, b
         self.read, self.wrong, self.relative, self.slope_noise = read, wrong, relative, slope_noise
         self.rng = np.random.default_rng(seed)
-        self.first, self.second, self.planes, self.is_wrong = [], [], [], []
+        self.first, self.second, self.is_wrong = [], [], []
+        self.moved, self.covariance = [], []
+        self._pair_up()
 
-    def pairs(self):
-        """Earlier frames of each frame in turn, with the planes against them."""
+    def _pair_up(self):
+        """Measure each frame in turn against earlier ones."""
         keys = []
         for frame in range(len(self.z)):
             near = [k for k in keys[-8:] if self._apart(k, frame) < REACH_MM]
             references = sorted({*range(max(0, frame - 2), frame), *near})
             self._left = len(references) // 3
-            planes = [self._measure(k, frame) for k in references]
-            if frame:
-                yield frame, references, planes
+            for k in references:
+                self._measure(k, frame)
             if not keys or self._apart(keys[-1], frame) > KEY_MM:
                 keys.append(frame)
 
@@ -117,26 +116,26 @@ class Sweep:
             self._left -= 1
             a, b = self.rng.uniform(-0.8, 0.8), 0.01 * self.rng.normal()
         side = 1.0 if a >= 0 else -1.0
-        variance = [(self.relative * a) ** 2 + 0.02**2, self.slope_noise**2, 1.0]
-        plane = PairPlane(side * a, side * b, 0.0, np.diag(variance), NOTHING > 0, NOTHING, NOTHING)
-        for column, value in zip(
-            (self.first, self.second, self.planes, self.is_wrong), (i, j, plane, false), strict=True
-        ):
-            column.append(value)
-        return plane
+        variance = [(self.relative * a) ** 2 + 0.02**2, self.slope_noise**2]
+        self.first.append(i)
+        self.second.append(j)
+        self.is_wrong.append(false)
+        self.moved.append([side * a, side * b])
+        self.covariance.append(np.diag(variance))
 
-    def resolve(self, *relative_error):
-        resolver = SignResolver(len(self.z), *relative_error)
-        for frame, references, planes in self.pairs():
-            resolver.place(frame, references, planes)
-        return resolver.path
+    @property
+    def signless(self):
+        """Frames, offsets and slopes, and covariances of all pairs."""
+        return tuple(np.array(x) for x in (self.first, self.second, self.moved, self.covariance))
+
+    def resolve(self, relative_error=PLAIN_ERROR):
+        return settled_path(len(self.z), *self.signless, relative_error)
 
     def wrong_signs(self, path, clear_mm=0.07, after=0):
         """Pairs with a clear sign that got the other, up to the mirror image of the whole."""
         first, second = np.array(self.first), np.array(self.second)
         z, b = self.z[second] - self.z[first], self.b[second] - self.b[first]
-        sign = pair_signs(path, first, second, self.planes)
-        moved = np.array([p.coefficients[:2] for p in self.planes])
+        sign, moved = pair_signs(path, *self.signless), np.array(self.moved)
         # Below three deviations either sign is as good.
         by_offset, by_slope = np.abs(z) > clear_mm, np.abs(b) > 0.006
         truth = np.where(by_offset, z * moved[:, 0], b * moved[:, 1])
@@ -231,29 +230,28 @@ def test_the_path_holds_position_and_slope():
 def test_what_comes_later_settles_what_was_open():
     """After a stop two paths lie open; the frame that sees one from before the stop decides, backwards."""
     z = np.array([0.0, 0.2, 0.4, 0.42, 0.3, 0.1])
-    resolver = SignResolver(z.size, ADAPTED)
-
-    def plane(i, j):
-        d = abs(z[j] - z[i])
-        return PairPlane(d, 0.0, 0.0, np.diag([0.02**2, 1e-8, 1.0]), NOTHING > 0, NOTHING, NOTHING)
-
     # Frame 4 is measured against the last two alone, which a turn and going on suit nearly alike.
     seen = {1: [0], 2: [0, 1], 3: [1, 2], 4: [3], 5: [0, 1, 4]}
-    turned_early = []
-    for frame, first in seen.items():
-        resolver.place(frame, first, [plane(i, frame) for i in first])
-        turned_early.append(bool(resolver.path[4, 0] < 0.42) if frame >= 4 else False)
+    first, second = np.array([(i, frame) for frame, earlier in seen.items() for i in earlier]).T
+    moved = np.column_stack([np.abs(z[second] - z[first]), np.zeros(first.size)])
+    covariance = np.tile(np.diag([0.02**2, 1e-8]), (first.size, 1, 1))
+
+    def path(frames):
+        some = second < frames
+        return settled_path(frames, first[some], second[some], moved[some], covariance[some], ADAPTED)
+
     # Hands turn back rarely: at frame 4 going on is the better guess, at frame 5 it no longer is.
-    assert turned_early == [False, False, False, False, True]
-    np.testing.assert_allclose(resolver.path[:, 0], z, atol=0.02)
+    assert path(5)[4, 0] > 0.42
+    np.testing.assert_allclose(path(6)[:, 0], z, atol=0.02)
 
 
 def test_a_pair_has_the_sign_with_which_offset_and_slope_together_agree():
     """The offset is within its error of none; the slope tells."""
     path = np.array([[0.0, 0.0], [0.01, -0.02], [0.3, 0.0]])
-    cross = PairPlane(0.01, 0.02, 0.0, np.diag([4e-4, 4e-8, 1.0]), NOTHING > 0, NOTHING, NOTHING)
-    ahead = PairPlane(0.31, -0.001, 0.0, np.diag([4e-4, 4e-6, 1.0]), NOTHING > 0, NOTHING, NOTHING)
-    signs = pair_signs(path, np.array([0, 0, 2]), np.array([1, 2, 0]), [cross, ahead, ahead])
+    cross, ahead = ([0.01, 0.02], [4e-4, 4e-8]), ([0.31, -0.001], [4e-4, 4e-6])
+    moved, variance = zip(cross, ahead, ahead, strict=True)
+    covariance = np.array([np.diag(v) for v in variance])
+    signs = pair_signs(path, np.array([0, 0, 2]), np.array([1, 2, 0]), np.array(moved), covariance)
     assert signs.tolist() == [-1.0, 1.0, -1.0]
 
 
@@ -263,16 +261,20 @@ def wobbled(seed, told):
     time_s = np.arange(60) / 25.0
     z = 0.5 * np.sin(2.0 * np.pi * 3.0 * time_s + rng.uniform(0.0, 2.0 * np.pi)) + 2.5 * time_s
     z = (z - z[0]) * np.sign(z[1] - z[0])
-    resolver = SignResolver(z.size, ADAPTED)
+    pairs, strangers = [], []
     for frame in range(1, z.size):
         before = np.arange(max(0, frame - 8), frame)
         apart = np.abs(z[frame] - z[before])
         near = sorted({frame - 1, *before[apart < 0.35]})
         read = np.abs(z[frame] - z[near]) * (1.0 + 0.05 * rng.standard_normal(len(near))) + 0.005
-        known = np.diag([0.03**2, 1e-8, 1.0])
-        planes = [PairPlane(d, 0.0, 0.0, known, NOTHING > 0, NOTHING, NOTHING) for d in read]
-        resolver.place(frame, near, planes, before[apart > 0.6] if told else None, 0.3)
-    step, true = np.diff(resolver.path[:, 0]), np.diff(z)
+        pairs += [(i, frame, d) for i, d in zip(near, read, strict=True)]
+        strangers += [(i, frame) for i in before[apart > 0.6]]
+    first, second, read = np.array(pairs).T
+    moved = np.column_stack([read, np.zeros(read.size)])
+    known = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
+    unlike = Strangers(*np.array(strangers).T, 0.3) if told else None
+    path = settled_path(z.size, first.astype(int), second.astype(int), moved, known, ADAPTED, unlike)
+    step, true = np.diff(path[:, 0]), np.diff(z)
     return int(((np.sign(step) != np.sign(true)) & (np.abs(true) > 0.05)).sum())
 
 

@@ -1,5 +1,6 @@
 import numpy as np
 import oracles
+import pair_planes
 import pytest
 import speckle
 from hypothesis import given, settings
@@ -29,6 +30,12 @@ def measured(estimator, distance_mm):
     return PatchDistances(np.asarray(distance_mm), estimator.sigma(distance_mm))
 
 
+def agreeing(distances, raised_mm, support_sigma=1.0, either_side=True):
+    """Consistent subset of one pair."""
+    alone = PatchDistances(distances.distance_mm[None], distances.sigma_mm[None])
+    return consistent_subset(alone, raised_mm[None], support_sigma, np.array([either_side]))[0]
+
+
 def read(estimator, z_mm, rng):
     """Distances as images give them: from noisy correlations."""
     rho = speckle.gaussian_correlation(np.abs(z_mm), SIGMA_MM)
@@ -45,7 +52,7 @@ def test_subset_is_that_of_trying_every_plane(seed, patches, support):
     sigma = rng.uniform(0.02, 0.08, patches)
     d = np.abs(z + sigma * rng.normal(size=patches)) * rng.choice([1.0, 0.6], patches)
     d[rng.uniform(size=patches) < 0.1] = np.nan
-    got = consistent_subset(PatchDistances(d, sigma), at @ slopes, support)
+    got = agreeing(PatchDistances(d, sigma), at @ slopes, support)
     expected = oracles.consistent_patches(d, sigma, at, slopes, support)
     assert any(np.array_equal(got, each) for each in expected)
 
@@ -63,7 +70,7 @@ def test_patches_that_under_read_are_left_out_where_the_orientation_gives_them_a
         d = np.abs(on_plane(truth))
         d = np.abs(d + 0.5 * estimator.sigma(d) * rng.normal(size=d.size))
         d[bottom] *= 0.6
-        subset = consistent_subset(measured(estimator, d), AT @ truth[1:])
+        subset = agreeing(measured(estimator, d), AT @ truth[1:])
         kept_good.append(subset[~bottom].mean())
         kept_bad.append(subset[bottom].mean())
         free, held = (np.linalg.lstsq(design[s], d[s])[0] for s in (slice(None), subset))
@@ -90,9 +97,9 @@ def test_the_subset_gives_the_plane_that_biased_patches_hide(estimator):
     for _ in range(25):
         rho = speckle.gaussian_correlation(z, SIGMA_MM)
         rho = rho + (1 - rho**2) / np.sqrt(CELLS) * rng.normal(size=rho.size)
-        agreed = consistent_subset(estimator.distances(rho), np.zeros(len(AT)))
-        free.append(fitter.fit(rho, np.zeros(2)).coefficients)
-        held.append(fitter.fit(rho, np.zeros(2), subset=agreed, slopes=np.zeros(2)).coefficients)
+        agreed = agreeing(estimator.distances(rho), np.zeros(len(AT)))
+        free.append(pair_planes.fit(fitter, rho, np.zeros(2)).coefficients)
+        held.append(pair_planes.fit(fitter, rho, np.zeros(2), subset=agreed, slopes=np.zeros(2)).coefficients)
     free, held = np.mean(free, axis=0), np.mean(held, axis=0)
     assert abs(free[0] / 0.35 - 1) > 0.1
     # A third of the slow patches lies within one deviation of the plane by chance.
@@ -109,7 +116,7 @@ def test_where_nothing_is_wrong_as_many_are_left_out_as_the_deviations_say(estim
         d = on_plane(plane)
         d = np.abs(d + estimator.sigma(d) * rng.normal(size=d.size))
         distances = PatchDistances(d, estimator.sigma(on_plane(plane)))
-        shares.append(consistent_subset(distances, AT @ plane[1:], sigmas).mean())
+        shares.append(agreeing(distances, AT @ plane[1:], sigmas).mean())
     # The best-supported placement keeps a few more than the true one would.
     assert kept - 0.03 < np.mean(shares) < kept + 0.08
 
@@ -120,22 +127,22 @@ def test_frames_that_cross_are_placed_on_both_sides(truth):
     truth = np.array(truth)
     z = on_plane(truth)
     assert 0.1 < (z < 0).mean() < 0.9
-    subset = consistent_subset(PatchDistances(np.abs(z), np.full(z.size, 0.02)), AT @ truth[1:])
+    subset = agreeing(PatchDistances(np.abs(z), np.full(z.size, 0.02)), AT @ truth[1:])
     assert subset.all()
 
 
 def test_a_side_that_is_settled_is_held():
     truth = np.array([-0.1, 0.03, 0.01])
     distances = PatchDistances(np.abs(on_plane(truth)), np.full(len(AT), 0.02))
-    held = consistent_subset(distances, AT @ truth[1:], either_side=False)
+    held = agreeing(distances, AT @ truth[1:], either_side=False)
     # Placed through +d alone, the plane still finds its supporters beyond the crossing, none before it.
     assert held.mean() > 0.3
-    wrong = consistent_subset(distances, -AT @ truth[1:], either_side=False)
-    either = consistent_subset(distances, -AT @ truth[1:])
+    wrong = agreeing(distances, -AT @ truth[1:], either_side=False)
+    either = agreeing(distances, -AT @ truth[1:])
     np.testing.assert_array_equal(either, np.ones(len(AT), bool))
     assert wrong.sum() <= either.sum()
 
 
 def test_nothing_known_is_nothing_consistent():
     nothing = np.full(len(AT), np.nan)
-    assert not consistent_subset(PatchDistances(nothing, nothing), np.zeros(len(AT))).any()
+    assert not agreeing(PatchDistances(nothing, nothing), np.zeros(len(AT))).any()

@@ -194,17 +194,15 @@ def read_lengths(learnt, tilt_deg, step_mm):
     depth = (5.0, 15.0, 35.0)
     still = replace(speckle.curves(sigma_mm=widths(depth), depth_mm=depth, cells=CELLS), key=ECHO)
     without, with_it = (PlaneFitter(DistanceEstimator(made, PATCHES), AT) for made in (still, learnt))
-    slopes, still_image = np.array([0.0, np.deg2rad(tilt_deg)]), np.zeros(2)
-    pairs = [tilt_sweep(tilt_deg, step_mm, seed) for seed in range(40)]
-    read = [
-        [
-            without.fit(rho, still_image),
-            with_it.fit(rho, still_image),
-            with_it.fit(rho, still_image, slopes=slopes),
-        ]
-        for rho in pairs
-    ]
-    return np.mean([[plane.offset_mm for plane in row] for row in read], axis=0) / step_mm - 1
+    pairs = np.array([tilt_sweep(tilt_deg, step_mm, seed) for seed in range(40)], np.float32)
+    still_image = np.zeros((40, 2))
+    slopes = np.tile([0.0, np.deg2rad(tilt_deg)], (40, 1))
+    read = (
+        without.fit(pairs, still_image),
+        with_it.fit(pairs, still_image),
+        with_it.fit(pairs, still_image, slopes=slopes),
+    )
+    return np.array([planes.offset_mm.mean() for planes in read]) / step_mm - 1
 
 
 @pytest.mark.parametrize("step_mm", [0.2, 0.3])

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pair_planes
 import pytest
 from scipy.linalg import logm
 from scipy.optimize import least_squares
@@ -14,8 +15,7 @@ from speckle3d.core.relative import RelativePoses
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import PairSchedule, TrajectorySettings
 from speckle3d.motion import trajectory
-from speckle3d.motion.planes import PairPlane
-from speckle3d.motion.signs import SignResolver, pair_signs
+from speckle3d.motion.signs import pair_signs, settled_path
 from speckle3d.motion.trajectory import held, joined, relative_poses_of, solve_trajectory
 
 CENTRE_MM = np.array([19.0, 20.0, 0.0])
@@ -35,8 +35,17 @@ def hand(z_mm, seed=0, turn_deg=0.4):
     return poses[0].inv() * poses
 
 
-def plane_of(a, b, c, covariance):
-    return PairPlane(a, b, c, np.asarray(covariance), NOTHING == 0, NOTHING, NOTHING + 1)
+def edges_from(first, second, motions, planes, signs):
+    """Relative poses of pairs, from motions and planes as (coefficients, covariance) of each."""
+    coefficients, covariance = zip(*planes, strict=True)
+    return relative_poses_of(
+        np.array(first),
+        np.array(second),
+        np.array([(m.x_mm, m.y_mm, m.roll_rad) for m in motions]),
+        np.array([np.eye(3) if m.covariance is None else m.covariance for m in motions]),
+        pair_planes.made(coefficients, covariance),
+        np.array(signs),
+    )
 
 
 def measure(poses, first, second, rng, relative_noise=0.03, noise_mm=0.004):
@@ -48,30 +57,31 @@ def measure(poses, first, second, rng, relative_noise=0.03, noise_mm=0.004):
     slopes = np.array([-np.sin(yaw), np.cos(yaw) * np.sin(tilt)]) + 2e-4 * rng.normal(size=2)
     side = 1.0 if a >= 0 else -1.0
     variance = [(relative_noise * z) ** 2 + noise_mm**2 + 0.02**2, 4e-8, 4e-8]
-    plane = plane_of(side * a, *(side * slopes), np.diag(variance))
+    plane = np.array([side * a, *(side * slopes)]), np.diag(variance)
     return InPlaneMotion(x, y, roll, np.diag([1e-5, 1e-6, 1e-8])), plane
 
 
 def correlation(plane):
-    return float(np.exp(-(plane.offset_mm**2) / (2 * SIGMA_MM**2)))
+    return float(np.exp(-(plane[0][0] ** 2) / (2 * SIGMA_MM**2)))
 
 
 def follow(poses, seed=1, settings=None, **noise):
     """Read the sweep as it comes: schedule, measure; then settle the signs; returns the edges."""
     rng = np.random.default_rng(seed)
     settings = settings or TrajectorySettings()
-    schedule, resolver, read = PairSchedule(settings), SignResolver(len(poses), 0.1), []
+    schedule, read = PairSchedule(settings), []
     for frame in range(len(poses)):
         every = {first: measure(poses, first, frame, rng, **noise) for first in schedule.references(frame)}
         usable = {k: v for k, v in every.items() if correlation(v[1]) >= settings.least_correlation}
         schedule.settle(frame, {k: correlation(plane) for k, (_, plane) in every.items()})
         if frame:
             assert usable, f"frame {frame} is out of reach"
-            resolver.place(frame, list(usable), [plane for _, plane in usable.values()])
         read += [(first, frame, *usable[first]) for first in usable]
     first, second, motions, planes = zip(*read, strict=True)
-    signs = pair_signs(resolver.path, np.array(first), np.array(second), planes)
-    return relative_poses_of(first, second, motions, planes, signs)
+    moved = np.array([coefficients[:2] for coefficients, _ in planes])
+    signless = np.array(first), np.array(second), moved, np.array([c[:2, :2] for _, c in planes])
+    path = settled_path(len(poses), *signless, 0.1)
+    return edges_from(first, second, motions, planes, pair_signs(path, *signless))
 
 
 def solved(pairs, frames, centre_mm=CENTRE_MM, settings=None):
@@ -178,8 +188,8 @@ def test_the_graph_jitters_less_than_the_chain(heavy):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_signed_pair_lies_on_its_plane(sign):
-    plane = plane_of(0.3, 0.011, -0.017, np.diag([1e-4, 1e-8, 2e-8]))
-    pairs = relative_poses_of([3], [5], [InPlaneMotion(0.2, -0.1, 0.03, np.eye(3) * 1e-6)], [plane], [sign])
+    plane = (0.3, 0.011, -0.017), np.diag([1e-4, 1e-8, 2e-8])
+    pairs = edges_from([3], [5], [InPlaneMotion(0.2, -0.1, 0.03, np.eye(3) * 1e-6)], [plane], [sign])
     assert (pairs.first.tolist(), pairs.second.tolist()) == ([3], [5])
     pose = pairs.poses[0]
     for x, y in ((0, 0), (10, -5), (-15, 15)):
@@ -190,8 +200,8 @@ def test_a_signed_pair_lies_on_its_plane(sign):
 
 
 def test_the_other_sign_is_the_mirror_image_in_the_first_frames_plane():
-    plane, motion = plane_of(0.3, 0.011, -0.017, np.eye(3)), InPlaneMotion(0.2, -0.1, 0.03)
-    pairs = relative_poses_of([0, 0], [1, 1], [motion] * 2, [plane] * 2, [1.0, -1.0])
+    plane, motion = ((0.3, 0.011, -0.017), np.eye(3)), InPlaneMotion(0.2, -0.1, 0.03)
+    pairs = edges_from([0, 0], [1, 1], [motion] * 2, [plane] * 2, [1.0, -1.0])
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     plus, minus = pairs.poses.as_matrix()
     np.testing.assert_allclose(mirror @ plus @ mirror, minus, atol=1e-12)
@@ -200,8 +210,8 @@ def test_the_other_sign_is_the_mirror_image_in_the_first_frames_plane():
 def test_covariance_is_in_the_order_x_y_z_tilt_yaw_roll():
     inplane = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]) * 1e-4
     plane_cov = np.array([[4.0, 0.4, 0.5], [0.4, 5.0, 0.6], [0.5, 0.6, 6.0]]) * 1e-6
-    motion, plane = InPlaneMotion(0, 0, 0, inplane), plane_of(0.3, 0.0, 0.0, plane_cov)
-    (c,) = relative_poses_of([0], [1], [motion], [plane], [1.0]).covariance
+    motion, plane = InPlaneMotion(0, 0, 0, inplane), ((0.3, 0.0, 0.0), plane_cov)
+    (c,) = edges_from([0], [1], [motion], [plane], [1.0]).covariance
     x, y, z, tilt, yaw, roll = range(6)
     np.testing.assert_allclose(c, c.T)
     # In-plane variances carry a floor of a micrometre and a few hundredths of a milliradian.

@@ -9,6 +9,7 @@ patient are never loaded.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from speckle3d.io.formats.dicom_elements import read_header, reading_dicom, text
 from speckle3d.io.formats.recordings import Recording
 from speckle3d.io.found import Found, differs
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import LazyFrames, OpenFrames
+from speckle3d.io.lazy import LazyFrames, OpenFrames, Unpack
 from speckle3d.io.readers import Reader, Row
 
 FORMAT = "DICOM"
@@ -81,7 +82,10 @@ class _OpenImages:
     def __init__(self, frames: DicomFrames) -> None:
         self._frames = frames
 
-    def read(self, i: int) -> npt.NDArray[Any]:
+    def read(self, i: int) -> Unpack:
+        return partial(self._frame, i)
+
+    def _frame(self, i: int) -> npt.NDArray[Any]:
         from pydicom.pixels.utils import pixel_array
 
         path, region = self._frames.path, self._frames.region

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import h5py
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.io.headers import SequenceHeader
-from speckle3d.io.lazy import LazyFrames, OpenFrames
+from speckle3d.io.lazy import LazyFrames, OpenFrames, Unpack
 from speckle3d.io.pixel_pieces import PixelPieces
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.record import SequenceRecord, write_record
@@ -56,9 +57,12 @@ class _OpenSequence:
         self._frames = frames
         self._pieces = PixelPieces(frames.pixels, frames.size[0] * frames.size[1])
 
-    def read(self, i: int) -> npt.NDArray[Any]:
+    def read(self, i: int) -> Unpack:
+        return partial(self._frame, self._pieces[self._frames.chosen[i]])
+
+    def _frame(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         frames = self._frames
-        image = self._pieces[frames.chosen[i]].reshape(frames.size[::-1])
+        image = pixels.reshape(frames.size[::-1])
         with np.errstate(over="ignore"):  # of what float32 does not hold, found as not finite
             frame = frames.layout.frame(image).astype(frames.dtype, copy=False)
         return np.conj(frame) if frames.record.conjugated else frame

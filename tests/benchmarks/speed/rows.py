@@ -1,0 +1,91 @@
+"""One row of the table: what was timed, beside a peer or a limit of the same process."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure.
+
+    Attributes
+    ----------
+    value, peer_value : float
+        In `unit`.
+    peer : str
+        What `value` is beside; empty if there is no peer in the process.
+    target : float or None
+        At least this, or for seconds and shares, for which `falling` is set, at most.
+    cores : float or None
+        How many the work kept busy: processor time over time.
+    """
+
+    what: str
+    value: float
+    unit: str
+    peer: str = ""
+    peer_value: float = float("nan")
+    target: float | None = None
+    falling: bool = False
+    cores: float | None = None
+
+    @property
+    def times_peer(self) -> float:
+        """How many times as fast as the peer."""
+        return self.peer_value / self.value if self.falling else self.value / self.peer_value
+
+    @property
+    def missed(self) -> bool:
+        """Whether the target is."""
+        if self.target is None:
+            return False
+        return self.value > self.target if self.falling else self.value < self.target
+
+    def cells(self) -> tuple[str, ...]:
+        """Text of the table's columns."""
+        bound = "" if self.target is None else f"{'<=' if self.falling else '>='} {self.target:g}"
+        return (
+            self.what,
+            f"{self.value:.3g} {self.unit}" + (" !" if self.missed else ""),
+            bound,
+            "" if self.cores is None else f"{self.cores:.2f}",
+            f"{self.peer}: {self.peer_value:.3g}" if self.peer else "",
+            f"{self.times_peer:.3g}" if self.peer else "",
+        )
+
+
+HEADINGS = ("", "measured", "target", "cores busy", "peer or limit", "times as fast")
+
+
+def print_table(rows: list[Row]) -> None:
+    """Print rows as a table in Markdown, so that it can be put on a page."""
+    cells = [HEADINGS, *(row.cells() for row in rows)]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(HEADINGS))]
+    lines = [
+        "| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in cells
+    ]
+    lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    print("\n".join(lines), flush=True)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Median seconds of several runs and the processors they kept busy; `spread` is least and most."""
+
+    seconds: float
+    cores: float
+    spread: tuple[float, float]
+
+
+def timed(function: Callable[[], object], runs: int) -> Timing:
+    """Time a function, after one run in which kernels are loaded."""
+    function()
+    walls, busy = [], []
+    for _ in range(runs):
+        began, spent = time.perf_counter(), time.process_time()
+        function()
+        walls.append(time.perf_counter() - began)
+        busy.append((time.process_time() - spent) / walls[-1])
+    return Timing(statistics.median(walls), statistics.median(busy), (min(walls), max(walls)))

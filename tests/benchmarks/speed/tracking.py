@@ -1,0 +1,93 @@
+"""Tracking a sweep: frames per second beside the transforms alone, shares of the stages, cores kept busy."""
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+from scipy import fft
+
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.sweep import Sweep
+from speckle3d.core.threads import cores, on_one_thread
+from speckle3d.io.load import load_sweep
+from speckle3d.matching.blocks import StageTimes
+from speckle3d.matching.intensity import IntensityExtractor
+from speckle3d.pipeline import track
+from speed.rows import Row, timed
+
+TARGETS = {1: 80.0, 2: 150.0}
+LEAST_RATIO, BUSY = 5.0, 0.8
+
+
+def rows(paths: list[Path], curves: DecorrelationCurves, runs: int) -> list[Row]:
+    """One row for each sweep on all cores, and for the first on one; prints the stages of the last."""
+    made, stages = [], None
+    for number, path in enumerate([paths[0], *paths]):
+        alone = number == 0
+        sweep, threads = load_sweep(path), 1 if alone else cores()
+        with on_one_thread() if alone else nullcontext():
+            ours = timed(lambda sweep=sweep: track(sweep, curves), runs)
+            times = track(sweep, curves).times
+        limit = transforms_per_second(sweep, threads, runs)
+        made.append(
+            Row(
+                f"track, {len(sweep)} frames of {sweep.grid.vectors} x {sweep.grid.samples}, "
+                f"{threads} core{'s' * (threads > 1)}",
+                len(sweep) / ours.seconds,
+                "frames/s",
+                "the transforms alone",
+                limit,
+                TARGETS.get(threads),
+                cores=ours.cores,
+            )
+        )
+        stages = times, len(sweep), ours.seconds
+        slowest, fastest = (len(sweep) / s for s in reversed(ours.spread))
+        print(f"{made[-1].what}: {slowest:.0f} to {fastest:.0f} frames/s in {runs} runs")
+    print_stages(*stages)
+    made += [ratio(row) for row in made[1:]]
+    return made
+
+
+def ratio(row: Row) -> Row:
+    """Time over that of the transforms."""
+    return Row(
+        f"{row.what}: time over the transforms'",
+        row.peer_value / row.value,
+        "",
+        target=LEAST_RATIO,
+        falling=True,
+    )
+
+
+def transforms_per_second(sweep: Sweep, threads: int, runs: int) -> float:
+    """Frames whose samples go to the band's spectrum and back in a second, single precision, nothing else."""
+    plan = IntensityExtractor.for_sweep(sweep).plan
+    frame = np.asarray(sweep.frames[0], dtype=np.float32)
+    band = np.zeros((frame.shape[0], plan.out_length), dtype=np.complex64)
+    frames = 20 * threads
+
+    def one(_: int) -> None:
+        fft.rfft(frame, plan.length, axis=1)
+        fft.ifft(band, axis=1)
+
+    with ThreadPoolExecutor(threads) as pool:
+        return frames / timed(lambda: list(pool.map(one, range(frames))), runs).seconds
+
+
+def print_stages(times: StageTimes, frames: int, seconds: float) -> None:
+    """Print what each stage takes of a frame, its share of all processor time, and the cores it kept busy."""
+    whole = sum(times.processor_seconds.values())
+    print(f"\n{'ms of processor a frame':>24} {'share':>7} {'cores busy':>11}  stage")
+    for stage, spent in sorted(times.processor_seconds.items(), key=lambda item: -item[1]):
+        busy = spent / times.seconds[stage]
+        print(f"{1e3 * spent / frames:24.2f} {100 * spent / whole:6.1f} % {busy:10.2f}   {stage}")
+    print(f"{1e3 * whole / frames:24.2f}  in {1e3 * seconds / frames:.2f} ms a frame\n")
+
+
+def memory_bandwidth(runs: int) -> float:
+    """GB/s that NumPy copies, read and written, on one core."""
+    source = np.ones(2**26, dtype=np.float32)
+    target = np.empty_like(source)
+    return 2e-9 * source.nbytes / timed(lambda: np.copyto(target, source), runs).seconds

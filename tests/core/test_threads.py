@@ -1,0 +1,104 @@
+"""Work shared out to threads: every item once, errors told, nesting without a deadlock."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from speckle3d.core import threads
+from speckle3d.core.threads import ahead, cores, counting_seconds, in_parallel, on_one_thread
+
+
+@pytest.fixture(autouse=True)
+def four_cores(monkeypatch):
+    monkeypatch.setattr(threads, "cores", lambda: 4)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
+def test_does_every_item_once(count):
+    done = np.zeros(count, dtype=int)
+
+    def one(first, stop):
+        done[first:stop] += 1
+
+    in_parallel(one, count)
+    assert (done == 1).all()
+
+
+def test_small_work_stays_on_the_calling_thread():
+    used = set()
+    in_parallel(lambda first, stop: used.add(threading.get_ident()), 10, grain=10)
+    assert used == {threading.get_ident()}
+
+
+def test_an_error_of_any_thread_reaches_the_caller():
+    def bad(first, stop):
+        if first <= 37 < stop:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        in_parallel(bad, 64)
+
+
+def test_calls_may_be_nested_deeper_than_there_are_threads():
+    done = []
+
+    def nested(first, stop, depth=4):
+        if depth:
+            in_parallel(lambda f, s: nested(f, s, depth - 1), 8)
+        else:
+            done.append(1)
+
+    in_parallel(nested, 8)
+    assert len(done) >= 8
+
+
+def test_workers_of_a_cluster_and_the_environment_limit_the_threads(monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert cores() == 1
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    with on_one_thread():
+        assert cores() == 1
+    assert cores() >= 1
+
+
+def test_results_made_ahead_come_in_order_and_not_too_many_of_them():
+    begun = []
+
+    def slowest_first(item):
+        begun.append(item)
+        threading.Event().wait(0.002 * (8 - item))
+        return 10 * item
+
+    results = ahead(slowest_first, range(8), most=3)
+    assert next(results) == 0
+    assert max(begun) <= 4
+    assert list(results) == [10 * item for item in range(1, 8)]
+
+
+def test_an_error_made_ahead_is_raised_in_its_turn():
+    results = ahead(lambda item: 1 / (item - 2), range(5))
+    assert [next(results), next(results)] == [-0.5, -1.0]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_work_ahead_stops_where_no_more_is_asked_for():
+    made = []
+    results = ahead(made.append, range(100), most=2)
+    next(results)
+    results.close()
+    assert len(made) <= 4
+
+
+def test_seconds_of_helping_threads_count():
+    def busy(first, stop):
+        for _ in range(first, stop):
+            np.sort(np.random.default_rng(0).random(100_000))
+
+    with counting_seconds() as alone:
+        busy(0, 8)
+    with counting_seconds() as shared:
+        in_parallel(busy, 8)
+    assert sum(shared) > 0.5 * sum(alone)

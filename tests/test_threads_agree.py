@@ -1,0 +1,39 @@
+"""Poses are the same to the last bit whatever the number of threads."""
+
+import numpy as np
+import pytest
+
+from speckle3d.core import threads
+from speckle3d.corrections import correct
+from speckle3d.pipeline import Tracked, track
+
+THREADS = 5
+"""More than these machines have: slices then end in other places, and their order is another each time."""
+
+
+def poses_of(tracked: Tracked, sweep) -> dict[str, np.ndarray]:
+    corrected = correct(tracked, sweep, ["orientation", "pose"])
+    return {
+        "image": tracked.image.as_matrix(),
+        "covariance": tracked.covariance,
+        "subset": tracked.subset.as_matrix(),
+        "flags": tracked.flags,
+    } | {mode: each.poses.as_matrix() for mode, each in corrected.items()}
+
+
+@pytest.fixture
+def many_threads(monkeypatch):
+    monkeypatch.setattr(threads, "_pool", None)
+    monkeypatch.setattr(threads, "cores", lambda: THREADS)
+    yield
+    threads._pool.shutdown()
+
+
+def test_poses_do_not_depend_on_threads(sweep, curves, many_threads):
+    part = sweep.part(0, 40)
+    shared = poses_of(track(part, curves), part)
+    with pytest.MonkeyPatch.context() as one:
+        one.setattr(threads, "cores", lambda: 1)
+        alone = poses_of(track(part, curves), part)
+    for name, values in alone.items():
+        np.testing.assert_array_equal(shared[name], values, err_msg=name)
