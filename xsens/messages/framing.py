@@ -244,9 +244,9 @@ def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> t
     counts = _clear(start, end, unfinished)
     rest = np.flatnonzero(~counts)
     if rest.size:
-        chosen = _choose(
-            start[rest].tolist(), end[rest].tolist(), np.isin(end[rest], start).tolist(), unfinished.tolist()
-        )
+        next_ = np.minimum(np.searchsorted(start, end[rest]), start.size - 1)
+        followed = start[next_] == end[rest]
+        chosen = _choose(start[rest].tolist(), end[rest].tolist(), followed.tolist(), unfinished.tolist())
         counts[rest[chosen]] = True
     start, end = start[counts], end[counts]
     waiting = unfinished[unfinished >= (end[-1] if end.size else 0)]
