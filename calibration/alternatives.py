@@ -130,7 +130,7 @@ def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bo
     angle = _angle(step)
     if phantom.seen_as == "direction":
         # Half a turn about the image's z axis is the same to directions.
-        return min(angle, _angle(step * [-1.0, -1.0, 1.0])) > _APART_RAD
+        return bool(min(angle, _angle(step * [-1.0, -1.0, 1.0])) > _APART_RAD)
     right_down = points.pixels.max(axis=0)
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * right_down
     ours, theirs = (

@@ -23,6 +23,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.wander import COMPONENTS, LANES, attribute, innovations
 
 WANDER = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -289,6 +290,6 @@ def _innovations(
     def some(first: int, stop: int) -> None:
         innovations(*given, first, stop, normal, log_determinant)
 
-    some(0, blocks)
+    in_parallel(some, blocks)
     normal = np.moveaxis(normal, 3, 1).reshape(blocks * LANES, wide, wide)[:count]
     return normal, log_determinant.ravel()[:count]

@@ -86,7 +86,7 @@ def _solve(sums: FloatArray, prior: float, room: FloatArray, iron: FloatArray) -
         rooms += room[i] * room[i]
         irons += iron[i] * iron[i]
         across += room[i] * turned
-    return max(sums[SQUARE] / weight - rooms - irons - 2.0 * across, 0.0)
+    return float(max(sums[SQUARE] / weight - rooms - irons - 2.0 * across, 0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -102,7 +102,7 @@ def _room_with(sums: FloatArray, iron: FloatArray, room: FloatArray) -> float:
         room[i] = sums[WORLD + i] / weight - turned
         square += iron[i] * iron[i] - 2.0 * iron[i] * sums[BODY + i] / weight
         rooms += room[i] * room[i]
-    return max(square - rooms, 0.0)
+    return float(max(square - rooms, 0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

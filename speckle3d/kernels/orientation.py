@@ -155,7 +155,7 @@ class _Work(NamedTuple):
     clean: FloatArray
     restart: FloatArray
     field: FloatArray
-    count: IntArray
+    rows_and_mask: IntArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -400,7 +400,7 @@ def _advance(
     for i in range(3):
         work.shows[i, 6 + i] = 1.0
         work.residual[i] = -s[SPEED + i]
-    work.count[0], work.count[1] = 3, 0
+    work.rows_and_mask[0], work.rows_and_mask[1] = 3, 0
     _update(variance, filt, limits, work)
     if s[RESTING] > 0.0:
         _correct_bias(n, filt, limits, steps, work)
@@ -531,17 +531,17 @@ def _correct_bias(n: int, filt: FilterState, limits: FilterLimits, steps: Filter
         work.shows[i, 3 + i] = 1.0
         work.residual[i] = steps.rate_rad_s[n, i] - s[BIAS + i]
     if not limits.magnetic:
-        work.count[0], work.count[1] = 3, 0
+        work.rows_and_mask[0], work.rows_and_mask[1] = 3, 0
         _update(variance, filt, limits, work)
         return
-    work.count[0], work.count[1] = 3, 1
+    work.rows_and_mask[0], work.rows_and_mask[1] = 3, 1
     _update(variance, filt, limits, work)
     work.shows[:] = 0.0
     for i in range(3):
         north[i] = steps.rate_rad_s[n, i] - s[NORTH_BIAS + i]
         work.shows[i, 9 + i] = 1.0
         work.residual[i] = north[i]
-    work.count[0], work.count[1] = 3, 2
+    work.rows_and_mask[0], work.rows_and_mask[1] = 3, 2
     _update(variance, filt, limits, work)
 
 
@@ -577,7 +577,7 @@ def _correct_heading(
             work.shows[0] = 0.0
             work.shows[0, 2] = work.shows[0, 12] = 1.0
             work.residual[0] = residual
-            work.count[0], work.count[1] = 1, 2
+            work.rows_and_mask[0], work.rows_and_mask[1] = 1, 2
             _update(place, filt, limits, work)
     x, y, z = work.clean
     horizontal = x * x + y * y
@@ -588,7 +588,7 @@ def _correct_heading(
     work.shows[0, 12] = 1.0
     work.residual[0] = _wrapped(-math.atan2(y, x) - s[HEADING] - s[STRAY])
     noise = limits.field_noise * limits.field_noise + 2.0 * limits.field_off_s * variance
-    work.count[0], work.count[1] = 1, 2
+    work.rows_and_mask[0], work.rows_and_mask[1] = 1, 2
     _update(noise / duration, filt, limits, work)
 
 
@@ -602,11 +602,11 @@ def _wrapped(angle: float) -> float:
 def _update(variance: float, filt: FilterState, limits: FilterLimits, work: _Work) -> None:
     """Kalman's correction (Joseph's form) by `work.residual`, of which `work.shows` are the derivatives.
 
-    `work.count` holds the number of rows and a mask: 1 leaves the states of the heading alone, 2 all others
-    (Schmidt), whose errors count as noise.
+    `work.rows_and_mask` holds the number of rows and a mask: 1 leaves the states of the heading alone, 2 all
+    others (Schmidt), whose errors count as noise.
     """
     p, shows, cross, wide = filt.covariance, work.shows, work.cross, work.wide
-    rows, mask = work.count[0], work.count[1]
+    rows, mask = work.rows_and_mask[0], work.rows_and_mask[1]
     gain = work.gain[:rows]
     for r in range(rows):
         cross[r] = 0.0
@@ -656,7 +656,7 @@ def _inject(filt: FilterState, limits: FilterLimits, work: _Work) -> None:
     s = filt.state
     error = np.zeros(SIZE)
     for j in range(SIZE):
-        for r in range(work.count[0]):
+        for r in range(work.rows_and_mask[0]):
             error[j] += work.gain[r, j] * work.residual[r]
     if limits.magnetic:
         s[HEADING] = _wrapped(s[HEADING] + error[2])

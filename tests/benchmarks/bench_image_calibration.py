@@ -39,6 +39,21 @@ def opened(path):
     return TrackedImages(held, images.grid, sweep.frame_time_s, tracker.readings, tracker.time_offset_s)
 
 
+def prepared(seed):
+    """A simulated pair of sweeps, read."""
+    settings = SimulationSettings(
+        preset="crossed",
+        seed=seed,
+        fan_deg=50.0,
+        length_mm=20.0,
+        frames=160,
+        vectors=96,
+        samples=3000,
+        uncalibrated=True,
+    )
+    return prepare(*map(opened, simulated_pair(settings)))
+
+
 def displaced(rng):
     turn = Rotation.from_euler("xyz", rng.uniform(-20.0, 20.0, 3), degrees=True)
     return TRUTH * RigidTransform.from_components(rng.uniform(-20.0, 20.0, 3), turn)
@@ -81,17 +96,7 @@ def main():
     parser.add_argument("--seeds", type=int, nargs="+", default=[601])
     given = parser.parse_args()
     for seed in given.seeds:
-        settings = SimulationSettings(
-            preset="crossed",
-            seed=seed,
-            fan_deg=50.0,
-            length_mm=20.0,
-            frames=160,
-            vectors=96,
-            samples=3000,
-            uncalibrated=True,
-        )
-        crossing = prepare(*map(opened, simulated_pair(settings)))
+        crossing = prepared(seed)
         for method in ("gauss-newton", "nelder-mead"):  # compiled, and images blurred, before any clock runs
             study(crossing, method, 1)
         fast = study(crossing, "gauss-newton", given.starts)

@@ -21,6 +21,8 @@ UNKNOWN_PAUSE_S = 1.0
 
 _TICK_SPAN = 1 << 32
 _RARE = 0.01
+_FEW = 1 << 20
+"""Largest step of a counter up to which steps are counted one by one."""
 _LONGER = 1.6
 """A clock step of more periods is a gap, unless the clock is irregular."""
 
@@ -197,7 +199,12 @@ def _samples(counts: IntArray | None, others: IntArray | None, anew: BoolArray) 
 
 def _stride(steps: IntArray) -> int:
     """Greatest common divisor of all steps but rare ones, such as those where the counter wraps round."""
-    values, often = np.unique(steps, return_counts=True)
+    if steps.size and steps.max() < _FEW:
+        often = np.bincount(steps)  # a tenth of the time of `unique`
+        values = np.flatnonzero(often)
+        often = often[values]
+    else:
+        values, often = np.unique(steps, return_counts=True)
     return int(np.gcd.reduce(values[often >= _RARE * steps.size])) or 1
 
 

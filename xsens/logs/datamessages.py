@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,7 +13,16 @@ import numpy as np
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
-from xsens.logs.parts import Hints, Orientations, Parts, from_quaternions, on_clock, only, orientations_of
+from xsens.logs.parts import (
+    Hints,
+    Orientations,
+    Parts,
+    from_quaternions,
+    nwu_from,
+    on_clock,
+    only,
+    orientations_of,
+)
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.messages.control import Configuration, MessageId, UnitConfiguration
 from xsens.messages.framing import Frames, Message
@@ -26,6 +36,9 @@ _Read = TypeVar("_Read")
 
 _RAW = OutputMode.RAW | OutputMode.MT9
 _RAW_WITH_COUNTER = 22
+_SOME = 1 << 15
+"""Messages decoded at a time: as numbers they take several times their memory."""
+
 _ENOUGH = 10_000
 """Messages that show where the counter is."""
 
@@ -38,9 +51,21 @@ class _Slice:
     size: int
     columns: IntArray | None = None
 
-    def of(self, frames: Frames) -> Values:
-        payloads = frames.payloads()
-        return self.layout.decode(payloads if self.columns is None else payloads[:, self.columns])
+    def of(self, frames: Frames) -> Iterator[tuple[slice, Values]]:
+        """Values of some thousand messages at a time, with their places among all."""
+        for first in range(0, len(frames), _SOME):
+            some = slice(first, first + _SOME)
+            payloads = frames[some].payloads()
+            yield some, self.layout.decode(payloads if self.columns is None else payloads[:, self.columns])
+
+    def all_of(self, frames: Frames, names: tuple[str, ...]) -> Values:
+        """Values of those fields that are there, of all messages."""
+        counts = {field.name: field.count for field in self.layout.fields if field.name in names}
+        values = {name: np.empty((len(frames), count)) for name, count in counts.items()}
+        for some, decoded in self.of(frames):
+            for name, column in values.items():
+                column[some] = decoded[name]
+        return values
 
 
 def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hints: Hints) -> ImuLog:
@@ -61,16 +86,23 @@ def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hi
         raise InvalidInputError(f"expected data messages of {part.size} bytes, as configured, got none")
     if not fits.all():
         parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
-    values = part.of(only(data, fits))
+    data = only(data, fits)
     raw = part.layout.mode & _RAW
-    parts = _in_units(values, calibration, parts) if raw else _as_sent(values, parts, part.layout, hints)
-    counter = values["counter"][:, 0].astype(np.int64) if "counter" in values else None
+    counts = part.all_of(data, ("counter",))
+    counter = counts["counter"][:, 0].astype(np.int64) if counts else None
     stamps = replace(
         stamps, counter=counter, starts=only(stamps.starts, fits), computer_s=only(stamps.computer_s, fits)
     )
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
-    return on_clock(stamps, int(fits.sum()), parts, replace(hints, rate_hz=rate_hz))
+    if raw:
+        if calibration is None:
+            raise InvalidInputError("expected a calibration block before raw counts, got none")
+        read = partial(_in_units, part, data, calibration, parts)
+    else:
+        nwu_from(hints.world or part.layout.frame)
+        read = partial(_as_sent, part, data, parts, hints)
+    return on_clock(stamps, len(data), read, replace(hints, rate_hz=rate_hz))
 
 
 def _last(frames: Frames, which: BoolArray, read: Callable[[Message], _Read]) -> _Read | None:
@@ -128,18 +160,19 @@ def _share_counting(frames: Frames, at: IntArray) -> float:
     return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
 
 
-def _in_units(values: Values, calibration: RawCalibration | None, parts: Parts) -> Parts:
-    if calibration is None:
-        raise InvalidInputError("expected a calibration block before raw counts, got none")
+def _in_units(part: _Slice, data: Frames, calibration: RawCalibration, parts: Parts) -> Parts:
     names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
-    vectors = calibration.to_units(np.stack([values[name] for name in names], axis=1))
+    vectors = np.empty((3, len(data), 3))
+    for some, values in part.of(data):
+        vectors[:, some] = calibration.to_units(np.stack([values[name] for name in names], axis=1))
     return replace(parts.noting(NOT_COMPENSATED), vectors=tuple(vectors))
 
 
-def _as_sent(values: Values, parts: Parts, layout: DataLayout, hints: Hints) -> Parts:
+def _as_sent(part: _Slice, data: Frames, parts: Parts, hints: Hints) -> Parts:
+    values = part.all_of(data, (*VECTORS, "quaternion_wxyz", "matrix", "euler_deg"))
     vectors = tuple(map(values.get, VECTORS))
     orientations, notes = orientations_of(
-        hints.world or layout.frame,
+        hints.world or part.layout.frame,
         vectors[0],
         values.get("quaternion_wxyz"),
         values.get("matrix"),
@@ -184,8 +217,9 @@ def mtdata2_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, h
         )
     if not rows.all():
         parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
-    parts = _measured(table, rows, parts, hints)
-    return _per_second(on_clock(_stamped(table, rows, stamps), int(rows.sum()), parts, hints), table)
+    measured = _measured(table, rows, parts, hints)
+    stamps = _stamped(table, rows, stamps)
+    return _per_second(on_clock(stamps, int(rows.sum()), lambda: measured, hints), table)
 
 
 def _sample_rows(table: Table, size: int) -> BoolArray:

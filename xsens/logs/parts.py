@@ -6,6 +6,7 @@ sensor's axes to the world's; angles are roll, pitch, yaw with R = Rz(yaw) Ry(pi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -116,8 +117,14 @@ def only(values: Any, kept: BoolArray) -> Any:
 # -- from parts to a log
 
 
-def on_clock(stamps: Stamps, samples: int, parts: Parts, hints: Hints) -> ImuLog:
+def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hints) -> ImuLog:
     """Build the log of samples that have a clock, or a counter and a rate, or a rate alone.
+
+    Parameters
+    ----------
+    parts : callable
+        Returns the samples' parts. It is called once their times are known: finding those takes as much
+        memory meanwhile as the parts do.
 
     Raises
     ------
@@ -127,12 +134,13 @@ def on_clock(stamps: Stamps, samples: int, parts: Parts, hints: Hints) -> ImuLog
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
     if stamps.counter is not None or stamps.ticks is not None:
-        return assembled(timeline(stamps), parts)
+        line = timeline(stamps)
+        return assembled(line, parts())
     if hints.rate_hz is None:
         raise InvalidInputError("expected samples with a clock or a counter, or a sampling rate, got neither")
-    uncounted = replace(stamps, counter=np.arange(samples))
+    line = timeline(replace(stamps, counter=np.arange(samples)))
     note = "samples have no counter: losses cannot be found"
-    return replace(assembled(timeline(uncounted), parts.noting(note)), counter=None)
+    return replace(assembled(line, parts().noting(note)), counter=None)
 
 
 def assembled(line: Timeline, parts: Parts) -> ImuLog:
@@ -160,7 +168,9 @@ def _out_of_range(parts: Parts, kept: BoolArray) -> tuple[str, ...]:
     """Notes of readings that `_sane` leaves out although they are numbers."""
     notes = []
     for name, vectors in zip(("accelerometer", "gyroscope", "magnetometer"), parts.vectors, strict=True):
-        if vectors is not None and (count := int((np.abs(vectors[kept]) >= _ABSURD).any(axis=1).sum())):
+        if vectors is None or _within(vectors):
+            continue
+        if count := int((np.abs(vectors[kept]) >= _ABSURD).any(axis=1).sum()):
             notes.append(f"{count} {name} readings out of range were left out")
     return tuple(notes)
 
@@ -168,10 +178,15 @@ def _out_of_range(parts: Parts, kept: BoolArray) -> tuple[str, ...]:
 def _sane(vectors: FloatArray | None, kept: BoolArray) -> FloatArray | None:
     """Kept rows, NaN where they cannot be a measurement; None if none can."""
     rows: FloatArray | None = only(vectors, kept)
-    if rows is None or np.abs(rows).max() < _ABSURD:  # a NaN makes this false
+    if rows is None or _within(rows):
         return rows
     good = np.asarray((np.abs(rows) < _ABSURD).all(axis=1))
     return np.where(good[:, None], rows, np.nan) if good.any() else None
+
+
+def _within(rows: FloatArray) -> bool:
+    """Whether all are numbers that may be a measurement; without a copy of them."""
+    return bool(rows.max() < _ABSURD and rows.min() > -_ABSURD)  # a NaN makes this false
 
 
 # -- the sensor's own orientation

@@ -122,7 +122,7 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
     ticks = _whole(table.column(_TICKS))
     stamps = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
-    return on_clock(stamps, len(table.values), parts, hints)
+    return on_clock(stamps, len(table.values), lambda: parts, hints)
 
 
 def _timed(table: TextTable) -> tuple[TextTable, int]:

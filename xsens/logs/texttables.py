@@ -17,6 +17,9 @@ SEPARATORS = ("\t", ";", ",", " ")
 _LONGEST_HEADER = 64
 """Lines, not counting comments, among which the names of the columns or the first numbers must be."""
 
+_PIECE = 1 << 20
+"""Characters read at a time: as lines, and then as numbers, they take several times their memory."""
+
 _COMMENT = "#"
 _LONGEST_LINE = 1 << 16
 _MOST_COLUMNS = 256
@@ -80,7 +83,7 @@ def read_table(text: str, known: frozenset[str]) -> TextTable:
         found = _begins_table(line, known)
         if found is not None:
             separator, names, count = found
-            return _table(text[end if names else start :], separator, tuple(header), names, count)
+            return _table(text, end if names else start, separator, tuple(header), names, count)
         header.append(line)
         seen += not line.startswith(_COMMENT)
         if seen > _LONGEST_HEADER:
@@ -125,21 +128,38 @@ def _is_number(cell: str) -> bool:
 
 
 def _table(
-    body: str, separator: str, header: tuple[str, ...], names: tuple[str, ...], count: int
+    text: str, start: int, separator: str, header: tuple[str, ...], names: tuple[str, ...], count: int
 ) -> TextTable:
     if count > _MOST_COLUMNS:
         raise InvalidInputError(f"expected a table of at most {_MOST_COLUMNS} columns, got {count}")
-    body = body.replace("\r", "").strip("\n")
-    if separator != "," and "," in body:
-        body = body.replace(",", ".")
-    lines = body.split("\n")
-    if separator == " ":
-        even = [line for line in lines if len(line.split()) == count]
-    else:
-        even = [line for line in lines if line.count(separator) == count - 1]
-    if not even:
+    values, left_out = [], 0
+    for lines in _pieces(text, start):
+        if separator == " ":
+            even = [line for line in lines if len(line.split()) == count]
+        else:
+            even = [line for line in lines if line.count(separator) == count - 1]
+        left_out += len(lines) - len(even)
+        if even:
+            decimal = separator != "," and any("," in line for line in even)
+            points = [line.replace(",", ".") for line in even] if decimal else even
+            values.append(_numbers(points, separator, count))
+    if not values:
         raise InvalidInputError(f"expected lines of {count} numbers, got none")
-    return TextTable(header, names, _numbers(even, separator, count), len(lines) - len(even))
+    return TextTable(header, names, np.concatenate(values), left_out)
+
+
+def _pieces(text: str, start: int) -> Iterator[list[str]]:
+    """Lines from `start` on, some thousand at a time, without blank ones at either end of the text."""
+    last = len(text)
+    while start < last and text[start] in "\r\n":
+        start += 1
+    while last > start and text[last - 1] in "\r\n":
+        last -= 1
+    while start <= last:
+        end = text.find("\n", min(start + _PIECE, last), last)
+        piece = text[start : end if end >= 0 else last]
+        yield piece.replace("\r", "").split("\n")
+        start = end + 1 if end >= 0 else last + 1
 
 
 def _numbers(lines: list[str], separator: str, count: int) -> FloatArray:

@@ -119,7 +119,8 @@ class Frames:
     @cached_property
     def payload_start(self) -> IntArray:
         """First bytes of the payloads, shape (n,)."""
-        return np.asarray(self.start + 4 + 2 * (self.data[self.start + 3] == _EXTENDED))
+        head = np.where(self.data[self.start + 3] == _EXTENDED, 6, 4)
+        return np.asarray(self.start + head.astype(self.start.dtype))
 
     @cached_property
     def payload_size(self) -> IntArray:
@@ -163,7 +164,10 @@ def find_frames(data: bytes | ByteArray) -> Frames:
         starts.append(start + at)
         ends.append(end + at)
         at += used
-    return Frames(array, np.concatenate(starts), np.concatenate(ends))
+    # Positions take as much memory as short messages: half of it where they fit.
+    place = np.int32 if array.size < np.iinfo(np.int32).max else np.int64
+    start, end = (np.concatenate([part.astype(place) for part in parts]) for parts in (starts, ends))
+    return Frames(array, start, end)
 
 
 class Framer:
@@ -240,9 +244,9 @@ def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> t
     counts = _clear(start, end, unfinished)
     rest = np.flatnonzero(~counts)
     if rest.size:
-        chosen = _choose(
-            start[rest].tolist(), end[rest].tolist(), np.isin(end[rest], start).tolist(), unfinished.tolist()
-        )
+        next_ = np.minimum(np.searchsorted(start, end[rest]), start.size - 1)
+        followed = start[next_] == end[rest]
+        chosen = _choose(start[rest].tolist(), end[rest].tolist(), followed.tolist(), unfinished.tolist())
         counts[rest[chosen]] = True
     start, end = start[counts], end[counts]
     waiting = unfinished[unfinished >= (end[-1] if end.size else 0)]

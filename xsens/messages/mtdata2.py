@@ -66,6 +66,9 @@ def world_of(identifier: int) -> str:
 Arrangement = tuple[tuple[int, int, int], ...]
 """Identifier, and first byte and size of the data, of each item of a payload."""
 
+_SOME = 1 << 15
+"""Messages taken apart at a time, so that their bytes are not held in memory twice."""
+
 _MOST_ARRANGEMENTS = 32
 """Arrangements that messages of one length may have before they are taken apart one by one."""
 
@@ -89,17 +92,20 @@ def columns(frames: Frames) -> tuple[dict[int, Column], int]:
     """Numbers of the items of MTData2 messages by identifier, and how many messages are damaged."""
     found: dict[int, list[Column]] = defaultdict(list)
     damaged = 0
-    for size in np.unique(frames.payload_size):
-        rows = np.flatnonzero(frames.payload_size == size)
-        payloads = frames[rows].payloads()
-        for items, same in _by_arrangement(payloads):
-            damaged += same.size if items is None else 0
-            some = payloads if same.size == len(payloads) else payloads[same]
-            for identifier, at, length in items or ():
-                values = _numbers(identifier, some[:, at : at + length])
-                if values is not None:
-                    found[identifier].append(Column(rows[same], values))
-    return {identifier: _joined(pieces) for identifier, pieces in found.items()}, damaged
+    for first in range(0, len(frames), _SOME):
+        some = frames[first : first + _SOME]
+        sizes = some.payload_size
+        for size in np.unique(sizes):
+            rows = np.flatnonzero(sizes == size)
+            payloads = some[rows].payloads()
+            for items, same in _by_arrangement(payloads):
+                damaged += same.size if items is None else 0
+                alike = payloads if same.size == len(payloads) else payloads[same]
+                for identifier, at, length in items or ():
+                    values = _numbers(identifier, alike[:, at : at + length])
+                    if values is not None:
+                        found[identifier].append(Column(first + rows[same], values))
+    return {identifier: _joined(found.pop(identifier)) for identifier in list(found)}, damaged
 
 
 def _by_arrangement(payloads: ByteArray) -> Iterator[tuple[Arrangement | None, IntArray]]:
@@ -153,5 +159,8 @@ def _numbers(identifier: int, data: ByteArray) -> FloatArray | None:
 
 def _joined(pieces: list[Column]) -> Column:
     rows = np.concatenate([piece.rows for piece in pieces])
+    values = np.concatenate([piece.values for piece in pieces])
+    if (np.diff(rows) >= 0).all():
+        return Column(rows, values)
     order = np.argsort(rows, kind="stable")
-    return Column(rows[order], np.concatenate([piece.values for piece in pieces])[order])
+    return Column(rows[order], values[order])

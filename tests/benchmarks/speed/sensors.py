@@ -1,0 +1,103 @@
+"""Calibrations and the orientation sensor: lines of a plane, two sweeps, logs, the filter of recordings."""
+
+import tempfile
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+from bench_calibration import LINES, by_scipy, by_us_once
+from bench_image_calibration import displaced, prepared
+from bench_imu_reading import LOGS
+from calibration_examples import scan_plane
+from imu_logs import samples
+from vqf import VQF
+
+from calibration.images.solver import ImageSettings, calibrate_from_sweeps
+from calibration.plane import _three_stages, calibrate_plane
+from speed.rows import Row, timed
+from xsens.fusion.orient import orient
+from xsens.logs.read import read_log
+from xsens.logs.samples import ImuLog
+
+RATE_HZ, READ_S, FILTERED_S = 256.0, 3600.0, 600.0
+PLANE_MS, IMAGES_S, READ_MB_S, READ_TIMES, FILTERED = 50.0, 3.0, 50.0, 3.0, 250e3
+
+
+def plane(runs: int) -> list[Row]:
+    """All of a plane's calibration, and its least squares beside SciPy's with finite differences."""
+    lines = scan_plane(np.random.default_rng(0), LINES, line_noise_mm=0.2).lines
+    (start, *_) = _three_stages(lines, None)
+    whole = timed(lambda: calibrate_plane(lines), runs)
+    ours = timed(lambda: by_us_once(lines, start), runs).seconds
+    theirs = timed(lambda: by_scipy(lines, start), runs).seconds
+    what = f"calibrate_plane, {LINES} lines"
+    return [
+        Row(what, 1e3 * whole.seconds, "ms", target=PLANE_MS, falling=True, cores=whole.cores),
+        Row(
+            "its least squares once",
+            1e3 * ours,
+            "ms",
+            "SciPy least_squares, finite differences",
+            1e3 * theirs,
+            falling=True,
+        ),
+    ]
+
+
+def images(runs: int, seed: int = 601) -> list[Row]:
+    """A calibration from two crossing sweeps, 20 mm and 20 degrees off at most."""
+    crossing, start = prepared(seed), displaced(np.random.default_rng(183))
+    taken = timed(lambda: calibrate_from_sweeps(crossing, start, ImageSettings()), runs)
+    what = "calibration from two sweeps, 160 frames each"
+    return [Row(what, taken.seconds, "s", target=IMAGES_S, falling=True, cores=taken.cores)]
+
+
+def logs(runs: int) -> list[Row]:
+    """Reading each kind of log: megabytes per second, and memory at most over the file's size."""
+    made = samples(int(RATE_HZ * READ_S), RATE_HZ)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for kind, write in LOGS.items():
+            path = Path(folder, "log")
+            path.write_bytes(write(made))
+            size = path.stat().st_size
+            taken = timed(lambda path=path: read_log(path), runs)
+            rows.append(
+                Row(f"read {kind}, {size / 1e6:.0f} MB", size / 1e6 / taken.seconds, "MB/s", target=READ_MB_S)
+            )
+            tracemalloc.start()
+            log = read_log(path)
+            most, held = tracemalloc.get_traced_memory()[1] / size, _bytes(log) / size
+            tracemalloc.stop()
+            what = f"memory of reading {kind} over the file's size, beside the samples' own"
+            rows.append(Row(what, most, "x", "samples", held, READ_TIMES, falling=True))
+    return rows
+
+
+def _bytes(log: ImuLog) -> int:
+    arrays = (log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au, log.counter)
+    quaternions = 0 if log.world_from_sensor is None else 32 * len(log)
+    return sum(array.nbytes for array in arrays if array is not None) + quaternions
+
+
+def filtering(runs: int) -> list[Row]:
+    """Orientation of a recording, forward alone and smoothed, beside VQF forward and off line."""
+    made = samples(int(RATE_HZ * FILTERED_S), RATE_HZ)
+    vectors = [made[name] for name in ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")]
+    log = ImuLog(made["time_s"], vectors[1], vectors[0], vectors[2])
+
+    def forward() -> None:
+        VQF(1.0 / RATE_HZ).updateBatch(*vectors)
+
+    rows = []
+    for what, smooth in (("orientation filter", False), ("orientation smoother", True)):
+        ours = timed(lambda smooth=smooth: orient(log, smooth=smooth), runs).seconds
+        theirs = timed(forward, runs).seconds
+        rates = (len(log) / ours, "samples/s", "VQF, forward", len(log) / theirs)
+        rows.append(Row(f"{what}, {RATE_HZ:g} Hz", *rates, target=FILTERED))
+    return rows
+
+
+def rows(runs: int) -> list[Row]:
+    """All of them."""
+    return [*plane(runs), *logs(runs), *filtering(runs), *images(min(runs, 3))]
