@@ -11,7 +11,13 @@ import speckle
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.correlation import patch_correlations
-from speckle3d.matching.inplane import CoarseMatcher, InPlaneMotion, InPlaneSettings, match_patches
+from speckle3d.matching.inplane import (
+    CoarseMatcher,
+    InPlaneMotion,
+    InPlaneSettings,
+    match_patches,
+    match_with_each,
+)
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchSettings, lay_patches
 
@@ -386,3 +392,18 @@ def test_speckle_finer_than_most_is_found_to_the_sample_the_matching_needs():
 def test_search_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         InPlaneSettings(**bad)
+
+
+def test_a_frame_matched_with_many_at_once_is_matched_as_with_each_alone():
+    """More than one call of the kernel takes, one of them flat."""
+    moving = pair(0, (0.1, 0.0, 0.0), 0.8)[1]
+    fixed = [pair(0)[0], np.ones_like(moving), *[pair(0, (0.05 * k, 0.0, 0.0))[1] for k in range(8)]]
+    starts = [InPlaneMotion(0.05, 0.01 * k) for k in range(len(fixed))]
+    together = match_with_each(fixed, moving, PATCHES, starts, GRID.centre_mm)
+    for image, start, found in zip(fixed, starts, together, strict=True):
+        alone = match_patches(image, moving, PATCHES, start, GRID.centre_mm)
+        np.testing.assert_array_equal(found.correlation, alone.correlation)
+        np.testing.assert_array_equal(found.shift_mm, alone.shift_mm)
+        assert (found.motion.x_mm, found.motion.y_mm) == (alone.motion.x_mm, alone.motion.y_mm)
+        known = found.correlation[np.isfinite(found.correlation)]
+        assert found.median == (np.median(known) if known.size else 0.0)
