@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
@@ -106,6 +106,39 @@ class Coherence:
         )
         staying = share * np.exp(-np.abs(distance_mm)[:, None] * decay)
         return EchoModel(staying, 1 - share, gain, stretch)
+
+
+@dataclass(frozen=True)
+class PairEchoes:
+    """Echo models of frame pairs, made when they are asked for: for all pairs of a long sweep they are large.
+
+    Attributes
+    ----------
+    frame : ndarray, shape (e,)
+        About which each pair's echoes are taken.
+    distance_mm : ndarray, shape (e,)
+        How far apart its frames are.
+    """
+
+    coherence: Coherence
+    frame: FloatArray
+    distance_mm: FloatArray
+
+    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> PairEchoes:
+        """Those of some of the pairs."""
+        return PairEchoes(self.coherence, self.frame[pairs], self.distance_mm[pairs])
+
+    def followed_by(self, others: PairEchoes) -> PairEchoes:
+        """Those of these pairs and of others, by one coherence."""
+        return PairEchoes(
+            self.coherence,
+            np.concatenate([self.frame, others.frame]),
+            np.concatenate([self.distance_mm, others.distance_mm]),
+        )
+
+    def models(self) -> EchoModel:
+        """Models of all of these pairs."""
+        return self.coherence.models(self.frame, self.distance_mm)
 
 
 def scale_sigma(coherence: Coherence | None) -> float:

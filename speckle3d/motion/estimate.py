@@ -15,7 +15,13 @@ from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence, CoherenceSettings, estimate_coherence, scale_sigma
+from speckle3d.motion.coherence import (
+    Coherence,
+    CoherenceSettings,
+    PairEchoes,
+    estimate_coherence,
+    scale_sigma,
+)
 from speckle3d.motion.curve_doubts import FLAT, DepthFactors, depth_factors, sum_ratios
 from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, PatchDistances
 from speckle3d.motion.planes import PairPlanes, PlaneFitter, PlaneSettings, consistent_subset
@@ -117,11 +123,11 @@ class PairReader:
         chosen = self._choose(table, path[:, 0], sound)
         first, second = table.first[chosen], table.second[chosen]
         apart = path[second, 0] - path[first, 0]
-        model = None if coherence is None else coherence.models((first + second) / 2, apart)
+        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2, apart)
         planes = self.fitter.fit(
-            table.correlation[chosen], table.inplane[chosen, :2], model, start_mm=np.abs(apart)
+            table.correlation[chosen], table.inplane[chosen, :2], echoes, start_mm=np.abs(apart)
         )
-        pairs = SignedPairs(chosen, first, second, model, planes, np.ones(chosen.size))[planes.determined]
+        pairs = SignedPairs(chosen, first, second, echoes, planes, np.ones(chosen.size))[planes.determined]
         if not len(pairs):
             patches = table.correlation.shape[1]
             raise InsufficientDataError(
@@ -228,7 +234,7 @@ class PairReader:
             open_side[some] = offset[some] < np.ptp(raised, axis=1)
             distances = self._distances(table, pairs[some])
             agreed[some] = consistent_subset(distances, raised, self._planes.support_sigma, open_side[some])
-        planes = self.fitter.fit(correlation, moved, pairs.model, agreed, slopes, offset, open_side)
+        planes = self.fitter.fit(correlation, moved, pairs.echoes, agreed, slopes, offset, open_side)
         return planes.where(planes.determined, pairs.planes)
 
     def rows(
@@ -291,7 +297,8 @@ class PairReader:
         return Strangers(table.first[far], table.second[far], half)
 
     def _distances(self, table: CorrelationTable, pairs: SignedPairs) -> PatchDistances:
-        return self._estimator.distances(table.correlation[pairs.row].astype(float), pairs.model)
+        model = None if pairs.echoes is None else pairs.echoes.models()
+        return self._estimator.distances(table.correlation[pairs.row].astype(float), model)
 
 
 def _slices(rows: IntArray, most: int) -> Iterator[IntArray]:

@@ -12,7 +12,9 @@ with depth as y does. The fit keeps what is seen; `speckle3d.motion.uncertainty`
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -21,6 +23,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.planes import FitRules, FittedPlanes, Levers, agreeing_patches, fit_planes
 from speckle3d.kernels.statistics import PatchCurves
+from speckle3d.motion.coherence import PairEchoes
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
 
 CROSSING_EVIDENCE = 6.0
@@ -39,6 +42,8 @@ LEAST_PATCHES = 6
 NEAR_MM = 0.15
 """Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
 tilt."""
+PAIRS_AT_ONCE = 2048
+"""Pairs that are fitted at once: what a fit needs of a long sweep's pairs is larger than its results."""
 GRAIN = 32
 """Pairs that are worth another thread's while."""
 
@@ -78,7 +83,7 @@ class PairPlanes:
         Of (a, b, c).
     used : ndarray of bool, shape (e, p)
         Patches that took part.
-    excess_mm, sigma_mm : ndarray, shape (e, p)
+    excess_mm, sigma_mm : ndarray of float32, shape (e, p)
         How much farther each patch is than the plane has it, and the standard deviation of that, both to
         first order in the correlation; NaN for patches that took no part.
     determined : ndarray of bool, shape (e,)
@@ -88,8 +93,8 @@ class PairPlanes:
     coefficients: FloatArray
     covariance: FloatArray
     used: BoolArray
-    excess_mm: FloatArray
-    sigma_mm: FloatArray
+    excess_mm: Float32Array
+    sigma_mm: Float32Array
     determined: BoolArray
 
     def __len__(self) -> int:
@@ -99,11 +104,14 @@ class PairPlanes:
         """Planes of some of the pairs."""
         return PairPlanes(*(getattr(self, each.name)[pairs] for each in fields(self)))
 
+    @classmethod
+    def concatenate(cls, planes: Sequence[PairPlanes]) -> PairPlanes:
+        """Return the planes of several sets of pairs, one after the other."""
+        return cls(*(np.concatenate([getattr(p, each.name) for p in planes]) for each in fields(cls)))
+
     def followed_by(self, others: PairPlanes) -> PairPlanes:
         """Return these planes and others."""
-        return PairPlanes(
-            *(np.concatenate([getattr(p, each.name) for p in (self, others)]) for each in fields(self))
-        )
+        return PairPlanes.concatenate([self, others])
 
     @property
     def offset_mm(self) -> FloatArray:
@@ -117,6 +125,15 @@ class PairPlanes:
             mine, theirs = getattr(self, each.name), getattr(others, each.name)
             chosen.append(np.where(mask.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs))
         return PairPlanes(*chosen)
+
+
+class _Problem(NamedTuple):
+    """Some pairs' correlations, the models they are read with, patches that take part, and starts."""
+
+    correlation: Float32Array
+    model: EchoModel
+    used: BoolArray
+    middle_mm: FloatArray
 
 
 class PlaneFitter:
@@ -165,7 +182,7 @@ class PlaneFitter:
         self,
         correlation: Float32Array,
         moved_mm: FloatArray,
-        model: EchoModel | None = None,
+        echoes: PairEchoes | None = None,
         subset: BoolArray | None = None,
         slopes: FloatArray | None = None,
         start_mm: FloatArray | None = None,
@@ -181,8 +198,8 @@ class PlaneFitter:
         correlation : ndarray of float32, shape (e, p)
         moved_mm : ndarray, shape (e, 2)
             In-plane displacement of the second frame.
-        model : EchoModel, optional
-            Of each pair, shape (e, p), or of all, shape (1, p).
+        echoes : PairEchoes, optional
+            With which the correlations are read; a phantom's, if not given.
         subset : ndarray of bool, shape (e, p), optional
             Patches allowed to take part.
         slopes : ndarray, shape (e, 2), optional
@@ -192,19 +209,40 @@ class PlaneFitter:
         either_side : ndarray of bool, shape (e,), optional
             Whether a plane of known slopes may have a < 0; all may, if not given.
         """
-        pairs, patches = correlation.shape
-        model = model or EchoModel.fully_developed(patches)
-        used = np.isfinite(correlation) & self._measured(correlation, model)
-        used = used if subset is None else used & subset
-        determined = used.sum(axis=1) >= LEAST_PATCHES
-        used &= determined[:, None]
-        middle = self._middle(correlation, used, model) if start_mm is None else start_mm
-        if start_mm is not None:
-            middle = np.maximum(start_mm, NEAR_MM)
+        pairs = len(correlation)
         told = np.zeros((pairs, 2)) if slopes is None else np.ascontiguousarray(slopes)
         side = np.ones(pairs, dtype=bool) if either_side is None else either_side
-        rules = self._rules(slopes is not None)
-        lost = self._lost(moved_mm)
+        rules, fitted = self._rules(slopes is not None), []
+        for first in range(0, max(pairs, 1), PAIRS_AT_ONCE):
+            some = slice(first, first + PAIRS_AT_ONCE)
+            problem = self._problem(
+                correlation[some],
+                None if echoes is None else echoes[some].models(),
+                None if subset is None else subset[some],
+                None if start_mm is None else start_mm[some],
+            )
+            fitted.append(self._fit_some(problem, self._lost(moved_mm[some]), told[some], side[some], rules))
+        return PairPlanes.concatenate(fitted)
+
+    def _problem(
+        self,
+        correlation: Float32Array,
+        model: EchoModel | None,
+        subset: BoolArray | None,
+        start_mm: FloatArray | None,
+    ) -> _Problem:
+        """Which patches take part, and about how far apart frames are."""
+        model = model or EchoModel.fully_developed(correlation.shape[1])
+        used = np.isfinite(correlation) & self._measured(correlation, model)
+        used = used if subset is None else used & subset
+        used &= (used.sum(axis=1) >= LEAST_PATCHES)[:, None]
+        middle = self._middle(correlation, used, model) if start_mm is None else np.maximum(start_mm, NEAR_MM)
+        return _Problem(correlation, model, used, middle)
+
+    def _fit_some(
+        self, problem: _Problem, lost: FloatArray, told: FloatArray, side: BoolArray, rules: FitRules
+    ) -> PairPlanes:
+        pairs, patches = problem.correlation.shape
         fitted = FittedPlanes(
             np.full((pairs, 3), np.nan),
             np.tile(np.eye(3), (pairs, 1, 1)),
@@ -216,13 +254,13 @@ class PlaneFitter:
         def work(first: int, stop: int) -> None:
             some = slice(first, stop)
             fit_planes(
-                correlation[some],
-                used[some],
+                problem.correlation[some],
+                problem.used[some],
                 lost[some],
-                model[some].for_kernels(),
+                problem.model[some].for_kernels(),
                 self._levers,
                 self._curves,
-                middle[some],
+                problem.middle_mm[some],
                 told[some],
                 side[some],
                 rules,
@@ -230,7 +268,7 @@ class PlaneFitter:
             )
 
         in_parallel(work, pairs, GRAIN)
-        return self._concluded(fitted, used, model, turned=slopes is None)
+        return self._concluded(fitted, problem.used, problem.model, turned=not rules.sensed)
 
     def _rules(self, sensed: bool) -> FitRules:
         return FitRules(
@@ -246,7 +284,7 @@ class PlaneFitter:
 
     def _concluded(self, fitted: FittedPlanes, used: BoolArray, model: EchoModel, turned: bool) -> PairPlanes:
         """Planes with their covariances; those with a < 0 turned over if `turned`."""
-        coefficients, information, cost, excess, sigma = fitted
+        coefficients, information, cost, *residuals = fitted
         patches = used.sum(axis=1)
         scatter = np.maximum(1.0, cost / np.maximum(patches - 3, 1))
         covariance = np.linalg.inv(information) * scatter[:, None, None]
@@ -256,6 +294,7 @@ class PlaneFitter:
         determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
         if turned:
             coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
+        excess, sigma = (each.astype(np.float32) for each in residuals)
         return PairPlanes(coefficients, covariance, used, excess, sigma, determined)
 
     def _measured(self, correlation: Float32Array, model: EchoModel) -> BoolArray:

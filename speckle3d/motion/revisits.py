@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence
+from speckle3d.motion.coherence import Coherence, PairEchoes
 from speckle3d.motion.planes import PairPlanes, PlaneFitter
 from speckle3d.motion.signs import SignedPairs
 
@@ -136,12 +136,12 @@ def _read(
 ) -> SignedPairs:
     """Planes of some pairs, as far as they are determined; their signs are not."""
     first, second = table.first[rows], table.second[rows]
-    model = None
+    echoes = None
     if coherence is not None:
         # Structure is what the earlier visit saw of it.
-        model = coherence.models(first.astype(float), position_mm[second] - position_mm[first])
-    planes = fitter.fit(table.correlation[rows], table.inplane[rows, :2], model)
-    return SignedPairs(rows, first, second, model, planes, np.ones(rows.size))[planes.determined]
+        echoes = PairEchoes(coherence, first.astype(float), position_mm[second] - position_mm[first])
+    planes = fitter.fit(table.correlation[rows], table.inplane[rows, :2], echoes)
+    return SignedPairs(rows, first, second, echoes, planes, np.ones(rows.size))[planes.determined]
 
 
 def _agreed(

@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.kernels.signs import PathRules, follow_paths
-from speckle3d.motion.distances import EchoModel
+from speckle3d.motion.coherence import PairEchoes
 from speckle3d.motion.planes import PairPlanes
 
 HYPOTHESES = 8
@@ -49,8 +49,8 @@ class SignedPairs:
         Of each pair in its `CorrelationTable`.
     first, second : ndarray of int, shape (e,)
         Its frames.
-    model : EchoModel or None
-        With which correlations are read, shape (e, p); None for a phantom's curves as they are.
+    echoes : PairEchoes or None
+        With which correlations are read; None for a phantom's curves as they are.
     planes : PairPlanes
     sign : ndarray, shape (e,)
         +1 or -1.
@@ -59,7 +59,7 @@ class SignedPairs:
     row: IntArray
     first: IntArray
     second: IntArray
-    model: EchoModel | None
+    echoes: PairEchoes | None
     planes: PairPlanes
     sign: FloatArray
 
@@ -72,7 +72,7 @@ class SignedPairs:
             self.row[pairs],
             self.first[pairs],
             self.second[pairs],
-            None if self.model is None else self.model[pairs],
+            None if self.echoes is None else self.echoes[pairs],
             self.planes[pairs],
             self.sign[pairs],
         )
@@ -89,7 +89,7 @@ class SignedPairs:
             np.concatenate([self.row, others.row]),
             np.concatenate([self.first, others.first]),
             np.concatenate([self.second, others.second]),
-            None if self.model is None or others.model is None else self.model.followed_by(others.model),
+            None if self.echoes is None or others.echoes is None else self.echoes.followed_by(others.echoes),
             self.planes.followed_by(others.planes),
             np.concatenate([self.sign, others.sign]),
         )

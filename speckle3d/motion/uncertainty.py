@@ -129,7 +129,7 @@ def weigh_slopes(
         Slope per distance that sweeps have, standard deviation, rad/mm.
     """
     coefficients = planes.coefficients
-    weight = np.nansum(planes.sigma_mm**-2.0, axis=0)
+    weight = np.nansum(planes.sigma_mm**-2.0, axis=0, dtype=float)
     lever = np.array([_deviation(design[:, k], weight) for k in (1, 2)])
     false = UNEVENNESS * scale_sigma / np.maximum(lever, 1e-6)
     travelled = np.maximum((coefficients[:, 0] ** 2).sum(), 1e-12)
