@@ -101,7 +101,7 @@ def _fit(sums: FloatArray, prior: float, work: FloatArray) -> None:
             system[i, j] = 1.0 + prior if i == j else 0.0
             for k in range(3):
                 system[i, j] -= turn[k, i] * turn[k, j]
-    solve_into(system, right, 3, 1)
+    solve_into(system, right)
     rooms = irons = across = 0.0
     for i in range(3):
         iron = right[i, 0]

@@ -224,9 +224,9 @@ def _set_up(
 ) -> None:
     """Begin before the first increment of a stretch: anew, or after a pause with the bias found so far."""
     walk = limits[BIAS_WALK] * limits[BIAS_WALK] * pause_s
-    for i in range(SIZE):
+    for i in range(p.shape[0]):
         of_bias = 3 <= i < 6 or 9 <= i < 12
-        for j in range(SIZE):
+        for j in range(p.shape[0]):
             if s[RUNNING] == 0.0 or not (of_bias and (3 <= j < 6 or 9 <= j < 12)):
                 p[i, j] = fresh[i, j]
         if of_bias and s[RUNNING] > 0.0:
@@ -284,8 +284,8 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
     _rest(s, p, limits, step)
     f, level = work[TRANSITION : TRANSITION + SIZE], s[LEVEL : LEVEL + 9]
     duration, resting, magnetic = step[DURATION], s[RESTING] > 0.0, limits[MAGNETIC] > 0.0
-    for i in range(SIZE):
-        for j in range(SIZE):
+    for i in range(p.shape[0]):
+        for j in range(p.shape[0]):
             f[i, j] = 1.0 if i == j else 0.0
     if not resting:
         f[12, 12] = 1.0 - duration / limits[FIELD_PLACE_S]
@@ -323,7 +323,7 @@ def _predict_covariance(
     p: FloatArray, rate: float, resting: bool, limits: FloatArray, duration: float, work: FloatArray
 ) -> None:
     f, wide = work[TRANSITION : TRANSITION + SIZE], work[WIDE : WIDE + SIZE]
-    q = work[NOISES : NOISES + SIZE]
+    q, size = work[NOISES : NOISES + SIZE], p.shape[0]  # not unrolled
     turning = limits[GYRO_NOISE] * limits[GYRO_NOISE] + (limits[GYRO_SCALE_NOISE] * rate) ** 2
     if resting:
         turning = (limits[REST_NOISE] * limits[GYRO_NOISE]) ** 2
@@ -337,22 +337,22 @@ def _predict_covariance(
     q[12, 12] = 0.0
     if limits[MAGNETIC] > 0.0 and not resting:
         q[12, 12] = 2.0 * limits[FIELD_SD] * limits[FIELD_SD] / limits[FIELD_PLACE_S] * duration
-    for i in range(SIZE):
-        for j in range(SIZE):
+    for i in range(size):
+        for j in range(size):
             wide[i, j] = f[i, i] * p[i, j]
-        for k in range(SIZE):
+        for k in range(size):
             factor = f[i, k]
             if k != i and factor != 0.0:
-                for j in range(SIZE):
+                for j in range(size):
                     wide[i, j] += factor * p[k, j]
-    for i in range(SIZE):
-        for j in range(SIZE):
+    for i in range(size):
+        for j in range(size):
             p[i, j] = q[i, j] + f[j, j] * wide[i, j]
-    for j in range(SIZE):
-        for k in range(SIZE):
+    for j in range(size):
+        for k in range(size):
             factor = f[j, k]
             if k != j and factor != 0.0:
-                for i in range(SIZE):
+                for i in range(size):
                     p[i, j] += factor * wide[i, k]
 
 
@@ -470,7 +470,7 @@ def _update(
     Where there is a magnetometer, the field corrects the states of the heading alone, and the first copy of
     the bias the others (Schmidt): errors of states left alone count as noise.
     """
-    rows, corrected = 1 if kind >= _NEW_NORTH else 3, _ALL
+    rows, size, corrected = 1 if kind >= _NEW_NORTH else 3, p.shape[0], _ALL  # size: not unrolled
     if kind >= _NORTH_BIAS_SEEN:
         corrected = _HEADING_ONLY
     elif kind == _BIAS_SEEN and magnetic:
@@ -478,41 +478,41 @@ def _update(
     shows, cross, gain = work[SHOWS : SHOWS + 3], work[CROSS : CROSS + 3], work[GAIN : GAIN + 3]
     wide, innovation = work[WIDE : WIDE + SIZE], work[INNOVATION : INNOVATION + 3]
     for r in range(rows):
-        for j in range(SIZE):
+        for j in range(size):
             cross[r, j] = 0.0
-        for k in range(SIZE):
+        for k in range(size):
             factor = shows[r, k]
             if factor != 0.0:
-                for j in range(SIZE):
+                for j in range(size):
                     cross[r, j] += factor * p[k, j]
     for r in range(rows):
         for t in range(rows):
             total = variance if r == t else 0.0
-            for k in range(SIZE):
+            for k in range(size):
                 total += cross[r, k] * shows[t, k]
             innovation[r, t] = total
-        for j in range(SIZE):
+        for j in range(size):
             gain[r, j] = cross[r, j]
-    solve_into(innovation, gain, rows, SIZE)
-    for j in range(SIZE):
+    solve_into(innovation, gain[:rows])
+    for j in range(size):
         north = j == 2 or j >= 9
         if corrected != _ALL and north != (corrected == _HEADING_ONLY):
             for r in range(rows):
                 gain[r, j] = 0.0
-    for i in range(SIZE):
-        for j in range(SIZE):
+    for i in range(size):
+        for j in range(size):
             total = p[i, j]
             for r in range(rows):
                 total -= gain[r, i] * cross[r, j]
             wide[i, j] = total
-    for i in range(SIZE):
+    for i in range(size):
         for r in range(rows):
             total = -variance * gain[r, i]
-            for k in range(SIZE):
+            for k in range(size):
                 total += wide[i, k] * shows[r, k]
             cross[r, i] = total
-    for i in range(SIZE):
-        for j in range(SIZE):
+    for i in range(size):
+        for j in range(size):
             total = wide[i, j]
             for r in range(rows):
                 total -= cross[r, i] * gain[r, j]

@@ -79,7 +79,7 @@ def _rauch(
     for i in range(size):
         for j in range(size):
             wide[i, j] = predicted[i, j]
-    solve_into(wide, gain, size, size)  # the covariance is symmetric
+    solve_into(wide, gain)  # the covariance is symmetric
     for i in range(size):
         for j in range(size):
             total = 0.0

@@ -110,11 +110,12 @@ def vector_of(q: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def solve_into(matrix: FloatArray, right: FloatArray, n: int, across: int) -> None:
+def solve_into(matrix: FloatArray, right: FloatArray) -> None:
     """Solve ``matrix @ x = right`` by elimination with pivots; `right` becomes x.
 
-    Of `matrix`, which is destroyed, n rows and columns count, of `right` n rows and `across` columns.
+    `right`, shape (n, k), tells the size; of `matrix`, which is destroyed, n rows and columns count.
     """
+    n, across = right.shape
     for i in range(n):
         pivot = i
         for j in range(i + 1, n):
