@@ -427,7 +427,7 @@ def _observe(
     if kind == _SPEED_ZERO:  # a velocity of zero, whose error is a hand's, or smaller at rest, and persists
         for i in range(3):
             shows[i, 6 + i], residual[i] = 1.0, -s[SPEED + i]
-        return (limits[REST_SPEED_VARIANCE] if resting else limits[SPEED_VARIANCE]) / duration
+        return float((limits[REST_SPEED_VARIANCE] if resting else limits[SPEED_VARIANCE]) / duration)
     if kind <= _NORTH_BIAS_SEEN:  # both copies of the bias, one by one, by the gyroscope's reading at rest
         of_north = kind == _NORTH_BIAS_SEEN
         if not resting or (of_north and not magnetic):
@@ -435,7 +435,7 @@ def _observe(
         for i in range(3):
             shows[i, (9 if of_north else 3) + i] = 1.0
             residual[i] = step[RATE + i] - s[(NORTH_BIAS if of_north else BIAS) + i]
-        return limits[REST_BIAS_VARIANCE] / duration
+        return float(limits[REST_BIAS_VARIANCE] / duration)
     shows[0, 2] = shows[0, 12] = 1.0
     x, y, z = reading[CLEAN], reading[CLEAN + 1], reading[CLEAN + 2]
     if kind == _NEW_NORTH:  # a heading found beside iron, if it is far from that of the room's field
@@ -445,20 +445,20 @@ def _observe(
         if reading[RESTARTED] == 0.0 or not square > 9.0 * (p[2, 2] + place):
             return -1.0
         p[2, 2] += square
-        return place
+        return float(place)
     horizontal = x * x + y * y
     if reading[DISTURBS] > 0.0 or horizontal == 0.0:
         return -1.0
     shows[0, 0], shows[0, 1] = -z * x / horizontal, -z * y / horizontal
     residual[0] = _wrapped(-math.atan2(y, x) - s[HEADING] - s[STRAY])
     noise = limits[FIELD_NOISE] * limits[FIELD_NOISE] + 2.0 * limits[FIELD_OFF_S] * reading[VARIANCE]
-    return noise / duration
+    return float(noise / duration)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _wrapped(angle: float) -> float:
     """Angle brought into [-pi, pi], as `math.remainder` does."""
-    return angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))
+    return float(angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi)))
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
