@@ -190,7 +190,7 @@ def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
     if t.ndim != 1:
         raise InvalidInputError(f"{where}: expected shape (m,), got {t.shape}")
     require_finite(t, where)
-    bad = np.flatnonzero(np.diff(t) <= 0)
+    bad = np.flatnonzero(t[1:] <= t[:-1])
     if bad.size:
         i = int(bad[0]) + 1
         raise InvalidInputError(

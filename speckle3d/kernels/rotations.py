@@ -1,46 +1,56 @@
-"""Rotations and small matrices for kernels: matrices of shape (3, 3), quaternions with the scalar last."""
+"""Rotations and small systems for kernels: matrices by rows, shape (9,), quaternions scalar last."""
 
 import math
 
-import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def turn_into(x: float, y: float, z: float, out: FloatArray) -> None:
     """Fill the matrix of a rotation vector, rad."""
     square = x * x + y * y + z * z
     angle = math.sqrt(square)
+    s, c = 1.0, 0.5
     if angle > 1e-6:
         s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
-    else:
-        s, c = 1.0, 0.5
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
-    out[1, 0], out[1, 1], out[1, 2] = c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x
-    out[2, 0], out[2, 1], out[2, 2] = c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)
+    out[0], out[1], out[2] = 1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
+    out[3], out[4], out[5] = c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x
+    out[6], out[7], out[8] = c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def product_into(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Fill ``a @ b``, which may be either of them."""
-    held = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            held[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-    out[:] = held
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8]
+    for i in range(0, 9, 3):
+        x, y, z = a[i], a[i + 1], a[i + 2]
+        out[i] = x * b0 + y * b3 + z * b6
+        out[i + 1] = x * b1 + y * b4 + z * b7
+        out[i + 2] = x * b2 + y * b5 + z * b8
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def back_product_into(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Fill ``a @ b.T``, which may be either of them."""
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8]
+    for i in range(0, 9, 3):
+        x, y, z = a[i], a[i + 1], a[i + 2]
+        out[i] = x * b0 + y * b1 + z * b2
+        out[i + 1] = x * b3 + y * b4 + z * b5
+        out[i + 2] = x * b6 + y * b7 + z * b8
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def apply_into(a: FloatArray, v: FloatArray, out: FloatArray) -> None:
-    """Fill ``a @ v``; `v` and `out` may be the same."""
+    """Fill ``a @ v``; `v` and `out`, shape (3,), may be the same."""
     x, y, z = v[0], v[1], v[2]
     for i in range(3):
-        out[i] = a[i, 0] * x + a[i, 1] * y + a[i, 2] * z
+        out[i] = a[3 * i] * x + a[3 * i + 1] * y + a[3 * i + 2] * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def quaternion_of(x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Quaternion of a rotation vector, rad."""
     square = x * x + y * y + z * z
@@ -49,7 +59,7 @@ def quaternion_of(x: float, y: float, z: float) -> tuple[float, float, float, fl
     return s * x, s * y, s * z, math.cos(0.5 * angle)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def multiplied(p: tuple[float, ...], q: tuple[float, ...]) -> tuple[float, float, float, float]:
     """Quaternion of the rotation by `q`, then by `p`."""
     px, py, pz, pw = p
@@ -62,57 +72,50 @@ def multiplied(p: tuple[float, ...], q: tuple[float, ...]) -> tuple[float, float
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def matrix_into(q: tuple[float, ...], out: FloatArray) -> None:
     """Fill the matrix of a unit quaternion."""
     x, y, z, w = q
-    out[0, 0], out[0, 1], out[0, 2] = w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)
-    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)
-    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z
+    out[0], out[1], out[2] = w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)
+    out[3], out[4], out[5] = 2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)
+    out[6], out[7], out[8] = 2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def quaternion_from(m: FloatArray) -> tuple[float, float, float, float]:
     """Unit quaternion of a rotation matrix (Shepperd's method)."""
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    k = 3
-    most = trace
-    for i in range(3):
-        if m[i, i] > most:
-            k, most = i, m[i, i]
-    q = np.empty(4)
-    if k == 3:
-        q[0], q[1], q[2] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-        q[3] = 1.0 + trace
+    trace = m[0] + m[4] + m[8]
+    most = max(trace, m[0], m[4], m[8])
+    if most == trace:
+        x, y, z, w = m[7] - m[5], m[2] - m[6], m[3] - m[1], 1.0 + trace
+    elif most == m[0]:
+        x, y, z, w = 1.0 - trace + 2.0 * m[0], m[3] + m[1], m[6] + m[2], m[7] - m[5]
+    elif most == m[4]:
+        x, y, z, w = m[3] + m[1], 1.0 - trace + 2.0 * m[4], m[7] + m[5], m[2] - m[6]
     else:
-        i, j, l = k, (k + 1) % 3, (k + 2) % 3  # noqa: E741
-        q[i] = 1.0 - trace + 2.0 * m[i, i]
-        q[j] = m[j, i] + m[i, j]
-        q[l] = m[l, i] + m[i, l]
-        q[3] = m[l, j] - m[j, l]
-    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm
+        x, y, z, w = m[6] + m[2], m[7] + m[5], 1.0 - trace + 2.0 * m[8], m[3] - m[1]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return x / norm, y / norm, z / norm, w / norm
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def vector_of(q: tuple[float, ...]) -> tuple[float, float, float]:
     """Rotation vector, rad, of a unit quaternion; the shorter one."""
     x, y, z, w = q
-    if w < 0.0:
-        x, y, z, w = -x, -y, -z, -w
     sine = math.sqrt(x * x + y * y + z * z)
-    angle = 2.0 * math.atan2(sine, w)
+    angle = 2.0 * math.atan2(sine, abs(w))
     s = angle / sine if sine > 1e-8 else 2.0
+    s = -s if w < 0.0 else s
     return s * x, s * y, s * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def solve_into(matrix: FloatArray, right: FloatArray) -> None:
-    """Solve ``matrix @ x = right`` by elimination with pivots; `right`, shape (n, k), becomes x.
+    """Solve ``matrix @ x = right`` by elimination with pivots; `right` becomes x.
 
-    `matrix`, of which the first n rows and columns count, is destroyed.
+    `right`, shape (n, k), tells the size; of `matrix`, which is destroyed, n rows and columns count.
     """
-    n = right.shape[0]
+    n, across = right.shape
     for i in range(n):
         pivot = i
         for j in range(i + 1, n):
@@ -121,19 +124,19 @@ def solve_into(matrix: FloatArray, right: FloatArray) -> None:
         if pivot != i:
             for k in range(n):
                 matrix[i, k], matrix[pivot, k] = matrix[pivot, k], matrix[i, k]
-            for k in range(right.shape[1]):
+            for k in range(across):
                 right[i, k], right[pivot, k] = right[pivot, k], right[i, k]
         for j in range(i + 1, n):
             factor = matrix[j, i] / matrix[i, i]
             if factor != 0.0:
                 for k in range(i + 1, n):
                     matrix[j, k] -= factor * matrix[i, k]
-                for k in range(right.shape[1]):
+                for k in range(across):
                     right[j, k] -= factor * right[i, k]
     for i in range(n - 1, -1, -1):
         for j in range(i + 1, n):
             factor = matrix[i, j]
-            for k in range(right.shape[1]):
+            for k in range(across):
                 right[i, k] -= factor * right[j, k]
-        for k in range(right.shape[1]):
+        for k in range(across):
             right[i, k] /= matrix[i, i]

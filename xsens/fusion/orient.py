@@ -163,8 +163,7 @@ def _stretches(
 
 
 def _from_filter(steps: FilterSteps, xyzw: FloatArray) -> _Result:
-    disturbed, resting = steps.disturbed > 0.0, steps.resting > 0.0
-    return _each_sample(steps, xyzw, steps.sd_rad, steps.bias, disturbed, resting)
+    return _each_sample(steps, xyzw, steps.sd_rad, steps.bias, steps.disturbed, steps.resting)
 
 
 def _from_smoother(steps: FilterSteps, found: Smoothed, xyzw: FloatArray) -> _Result:

@@ -15,17 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.kernels.magnetism import CANDIDATE, FITTING, MONITOR, FieldLimits, judge_fields
-from speckle3d.kernels.orientation import (
-    SMOOTHED,
-    STATE,
-    FilterLimits,
-    FilterState,
-    run_filter,
-)
-from speckle3d.kernels.orientation import FilterSteps as FilterSteps
-from speckle3d.kernels.orientation_smoothing import middles_of, orient_samples, smooth_heading, smooth_steps
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.kernels import orientation_arrays as places
+from speckle3d.kernels.increments import orient_samples
+from speckle3d.kernels.magnetism import judge_fields
+from speckle3d.kernels.orientation import run_filter
+from speckle3d.kernels.orientation_smoothing import middles_of, smooth_heading, smooth_steps
 from xsens.fusion import detectors, errorstate
 from xsens.fusion.increments import Samples
 from xsens.fusion.settings import FusionSettings
@@ -40,21 +35,102 @@ _FIRST_S = 1.0
 # -- forward
 
 
+@dataclass(frozen=True)
+class FilterState:
+    """What the filter keeps from one stretch to the next, changed in place.
+
+    Attributes
+    ----------
+    state : ndarray, shape (STATE,)
+    covariance, fresh : ndarray, shape (13, 13)
+        Now, and at a start.
+    """
+
+    state: FloatArray
+    covariance: FloatArray
+    fresh: FloatArray
+
+
 def fresh_filter(settings: FusionSettings) -> FilterState:
     """The filter before the first stretch."""
-    monitor = np.zeros(MONITOR)
-    monitor[FITTING] = detectors.UNDISTURBED_AFTER_S
+    state = np.zeros(places.STATE)
+    state[places.FIELD_MONITOR + places.FITTING] = detectors.UNDISTURBED_AFTER_S
     fresh = errorstate.start_covariance(settings)
-    return FilterState(
-        fresh.copy(),
-        fresh,
-        np.eye(3),
-        np.eye(3),
-        np.zeros(STATE),
-        monitor,
-        np.zeros(CANDIDATE),
-        np.zeros(CANDIDATE),
-    )
+    return FilterState(state, fresh.copy(), fresh)
+
+
+@dataclass(frozen=True)
+class FilterSteps:
+    """What the filter leaves behind: a row for each of n increments, or for each of m samples.
+
+    Attributes
+    ----------
+    last : ndarray of int, shape (n,)
+        Sample after each increment's last.
+    rows : ndarray, shape (n, STEP)
+        Laid out in `orientation_arrays`; the properties are views.
+    within : ndarray, shape (m, SAMPLE)
+    covariance, transition : ndarray, shape (n, 9, 9), or (0, 9, 9) if they are not wanted
+    """
+
+    last: IntArray
+    rows: FloatArray
+    within: FloatArray
+    covariance: FloatArray
+    transition: FloatArray
+
+    @property
+    def duration_s(self) -> FloatArray:
+        """Shape (n,)."""
+        return self.rows[:, places.DURATION]
+
+    @property
+    def field_au(self) -> FloatArray:
+        """Mean field, shape (n, 3); NaN where there is none."""
+        return self._three(places.FIELD)
+
+    @property
+    def start(self) -> FloatArray:
+        """World from sensor before each increment, shape (n, 3, 3)."""
+        return self.rows[:, places.STEP_START : places.STEP_START + 9].reshape(-1, 3, 3)
+
+    @property
+    def start_bias(self) -> FloatArray:
+        """Shape (n, 3)."""
+        return self._three(places.STEP_START_BIAS)
+
+    @property
+    def matrix(self) -> FloatArray:
+        """World from sensor after each increment's correction, shape (n, 3, 3)."""
+        return self.rows[:, places.MATRIX : places.MATRIX + 9].reshape(-1, 3, 3)
+
+    @property
+    def bias(self) -> FloatArray:
+        """Shape (n, 3)."""
+        return self._three(places.STEP_BIAS)
+
+    @property
+    def sd_rad(self) -> FloatArray:
+        """About the world's axes, shape (n, 3)."""
+        return self._three(places.SD)
+
+    @property
+    def resting(self) -> BoolArray:
+        """Shape (n,)."""
+        return np.asarray(self.rows[:, places.RESTED] > 0.0)
+
+    @property
+    def disturbed(self) -> BoolArray:
+        """Shape (n,)."""
+        return np.asarray(self.rows[:, places.STRAYED] > 0.0)
+
+    @property
+    def started(self) -> BoolArray:
+        """Shape (n,)."""
+        return np.asarray(self.rows[:, places.STARTED] > 0.0)
+
+    def _three(self, first: int) -> FloatArray:
+        return self.rows[:, first : first + 3]
 
 
 def forward(
@@ -83,75 +159,78 @@ def forward(
     last = per_block * np.arange(1, whole + 1)
     if whole * per_block < len(samples):
         last = np.append(last, len(samples))
-    steps = _room(last, len(samples), covariances)
+    n = len(last)
+    wide = (n if covariances else 0, places.SMOOTHED, places.SMOOTHED)
+    shapes = ((n, places.STEP), (len(samples), places.SAMPLE), wide, wide)
+    steps = FilterSteps(last.astype(np.int64), *map(np.empty, shapes))
     run_filter(
         np.ascontiguousarray(samples.step_s, dtype=float),
         np.ascontiguousarray(samples.rate_rad_s, dtype=float),
         np.ascontiguousarray(samples.force_m_s2, dtype=float),
         np.ascontiguousarray(samples.field_au, dtype=float),
+        steps.last,
         _CHUNK,
         pause_s,
-        kept,
+        kept.state,
+        kept.covariance,
+        kept.fresh,
         _limits(settings),
-        _field_limits(settings),
-        steps,
+        steps.rows,
+        steps.within,
+        steps.covariance,
+        steps.transition,
+        _work(),
     )
     return steps
 
 
-def _room(last: np.ndarray, samples: int, covariances: bool) -> FilterSteps:
-    n = len(last)
-    one, three, square = (n,), (n, 3), (n, 3, 3)
-    wide = (n if covariances else 0, SMOOTHED, SMOOTHED)
-    shapes = (one, three, three, three, square, square, square, square, three, three, three, three)
-    more = (wide, wide, (n, SMOOTHED), three, one, one, one, (samples, 4), (samples,))
-    return FilterSteps(last.astype(np.int64), *map(np.empty, (*shapes, *more)))
+def _work() -> FloatArray:
+    return np.zeros((places.WORK, places.SIZE))
 
 
-def _limits(s: FusionSettings) -> FilterLimits:
-    return FilterLimits(
-        s.gravity_m_s2,
-        s.gyro_noise_rad_sqrt_s,
-        s.gyro_scale_noise_sqrt_s,
-        s.bias_walk_rad_s_sqrt_s,
-        2.0 * s.speed_m_s**2 * s.speed_time_s,
-        2.0 * errorstate.REST_SPEED_M_S**2 * errorstate.REST_TIME_S,
-        s.force_noise_m_s_sqrt_s,
-        s.field_sd_rad,
-        s.field_place_s,
-        s.field_noise_rad_sqrt_s,
-        s.field_off_s,
-        errorstate.REST_NOISE,
-        errorstate.REST_BIAS_RAD**2,
-        errorstate.START_S,
-        s.rest_rate_rad_s,
-        s.rest_force_m_s2,
-        s.rest_after_s,
-        s.rest_bias_rad_s,
-        detectors.REST_MEMORY_S,
-        s.use_magnetometer,
-    )
-
-
-def _field_limits(s: FusionSettings) -> FieldLimits:
-    return FieldLimits(
-        detectors.SMOOTHING_S,
-        detectors.UNDISTURBED_AFTER_S,
-        detectors.TURNING_RAD_S,
-        detectors.LEARNT_AFTER_S,
-        detectors.STARTING_S,
-        detectors.IRON_MEMORY_S,
-        detectors.PROVED_AFTER_S,
-        detectors.IRON_PRIOR,
-        detectors.UNEVEN,
-        detectors.FIRST_AFTER_S,
-        detectors.FIRST_UNEVEN,
-        detectors.STEEPEST,
-        detectors.BETTER,
-        s.norm_tolerance,
-        s.dip_tolerance_rad,
-        s.field_memory_s,
-    )
+def _limits(s: FusionSettings) -> FloatArray:
+    """Limits of filter and field monitor in their places."""
+    limits = np.full(places.LIMITS, np.nan)
+    for place, value in (
+        (places.GRAVITY, s.gravity_m_s2),
+        (places.GYRO_NOISE, s.gyro_noise_rad_sqrt_s),
+        (places.GYRO_SCALE_NOISE, s.gyro_scale_noise_sqrt_s),
+        (places.BIAS_WALK, s.bias_walk_rad_s_sqrt_s),
+        (places.SPEED_VARIANCE, 2.0 * s.speed_m_s**2 * s.speed_time_s),
+        (places.REST_SPEED_VARIANCE, 2.0 * errorstate.REST_SPEED_M_S**2 * errorstate.REST_TIME_S),
+        (places.FORCE_NOISE, s.force_noise_m_s_sqrt_s),
+        (places.FIELD_SD, s.field_sd_rad),
+        (places.FIELD_PLACE_S, s.field_place_s),
+        (places.FIELD_NOISE, s.field_noise_rad_sqrt_s),
+        (places.FIELD_OFF_S, s.field_off_s),
+        (places.REST_NOISE, errorstate.REST_NOISE),
+        (places.REST_BIAS_VARIANCE, errorstate.REST_BIAS_RAD**2),
+        (places.FIRST_S, errorstate.START_S),
+        (places.STILL_RATE, s.rest_rate_rad_s),
+        (places.STILL_FORCE, s.rest_force_m_s2),
+        (places.STILL_S, s.rest_after_s),
+        (places.STILL_BIAS, s.rest_bias_rad_s),
+        (places.REST_MEMORY_S, detectors.REST_MEMORY_S),
+        (places.MAGNETIC, float(s.use_magnetometer)),
+        (places.SMOOTHING_S, detectors.SMOOTHING_S),
+        (places.UNDISTURBED_S, detectors.UNDISTURBED_AFTER_S),
+        (places.TURNING, detectors.TURNING_RAD_S),
+        (places.LEARNT_S, detectors.LEARNT_AFTER_S),
+        (places.STARTING_S, detectors.STARTING_S),
+        (places.IRON_MEMORY_S, detectors.IRON_MEMORY_S),
+        (places.PROVED_S, detectors.PROVED_AFTER_S),
+        (places.IRON_PRIOR, detectors.IRON_PRIOR),
+        (places.UNEVEN, detectors.UNEVEN),
+        (places.FIRST_LEARNT_S, detectors.FIRST_AFTER_S),
+        (places.FIRST_UNEVEN, detectors.FIRST_UNEVEN),
+        (places.STEEPEST, detectors.STEEPEST),
+        (places.BETTER, detectors.BETTER),
+        (places.NORM_TOLERANCE, s.norm_tolerance),
+        (places.DIP_TOLERANCE, s.dip_tolerance_rad),
+        (places.MEMORY_S, s.field_memory_s),
+    ):
+        limits[place] = value
+    return limits
 
 
 def within_steps(
@@ -166,9 +245,16 @@ def within_steps(
     ends : ndarray, shape (n, 3, 3), optional
         At the end of each step; the gyroscope's error there is spread over the step.
     """
-    xyzw = np.empty((len(steps.time_s), 4))
-    orient_samples(steps, starts, biases_rad_s, np.empty((0, 3, 3)) if ends is None else ends, xyzw)
+    xyzw = np.empty((len(steps.within), 4))
+    biases = np.ascontiguousarray(biases_rad_s)
+    there = np.empty((0, 9)) if ends is None else _flat(ends)
+    orient_samples(steps.last, steps.rows, steps.within, _flat(starts), biases, there, xyzw)
     return xyzw
+
+
+def _flat(matrices: FloatArray) -> FloatArray:
+    """Rows of nine numbers."""
+    return np.ascontiguousarray(matrices).reshape(-1, 9)
 
 
 # -- backward
@@ -201,9 +287,11 @@ def smooth(samples: Samples, settings: FusionSettings) -> tuple[FilterSteps, Smo
     steps = forward(samples, alone, fresh_filter(alone), covariances=True)
     n = len(steps.duration_s)
     bias_variance = np.diag(steps.covariance[-1])[errorstate.BIAS].copy()  # at the end of the stretch
-    matrices, biases, sd = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3)), np.empty((n + 1, 3))
-    smooth_steps(steps, int(np.argmax(steps.started)), matrices, biases, sd)
-    level = Smoothed(matrices, biases, sd, np.zeros(n, dtype=bool), steps.resting > 0.0)
+    matrices, biases, sd = np.empty((n + 1, 9)), np.empty((n + 1, 3)), np.empty((n + 1, 3))
+    first = int(np.argmax(steps.started))
+    work = np.empty((31, 9))
+    smooth_steps(steps.rows, steps.covariance, steps.transition, first, matrices, biases, sd, work)
+    level = Smoothed(matrices.reshape(-1, 3, 3), biases, sd, np.zeros(n, dtype=bool), steps.resting)
     if not settings.use_magnetometer:
         return steps, level
     return steps, _pointed_north(steps, level, bias_variance, settings)
@@ -221,21 +309,23 @@ def _pointed_north(
     world, disturbed, variance = _readings(steps, level, settings)
     trusted = disturbed == 0.0
     north = np.where(trusted, -np.arctan2(world[:, 1], world[:, 0]), np.nan)
-    angle, angle_variance = np.empty(len(level.matrices)), np.empty(len(level.matrices))
+    nodes = len(level.matrices)
+    states, covariances = np.empty((nodes, 5)), np.empty((nodes, 5, 5))
     smooth_heading(
-        steps,
-        level.matrices,
+        steps.rows,
+        _flat(level.matrices),
         north,
         _heading_variance(steps, world, variance, level.sd_rad[1:], settings),
         _first_angle(steps, north),
         np.array([math.pi**2, *bias_variance, settings.field_sd_rad**2]),
         settings.field_place_s,
         settings.field_sd_rad,
-        angle,
-        angle_variance,
+        states,
+        covariances,
+        np.empty((23, 5)),
     )
-    turns = Rotation.from_euler("z", angle[:, None]).as_matrix()
-    sd = np.column_stack([level.sd_rad[:, :2], np.sqrt(np.maximum(angle_variance, 0.0))])
+    turns = Rotation.from_euler("z", states[:, :1]).as_matrix()
+    sd = np.column_stack([level.sd_rad[:, :2], np.sqrt(np.maximum(covariances[:, 0, 0], 0.0))])
     return replace(level, matrices=turns @ level.matrices, sd_rad=sd, disturbed=disturbed == 1.0)
 
 
@@ -253,25 +343,18 @@ def _readings(
     ndarray, shape (n,)
         Variance of its heading; see `FieldReading`.
     """
-    n = len(steps.duration_s)
-    middles, rates = np.empty((n, 3, 3)), np.empty(n)
-    middles_of(steps, level.matrices, level.bias_rad_s, middles, rates)
+    n = len(steps.last)
+    middles, rates, poses = np.empty((n, 9)), np.empty(n), _flat(level.matrices)
+    middles_of(steps.rows, poses, level.bias_rad_s, middles, rates)
     judged = []
     for backward in (False, True):
-        world, disturbed, variance = np.empty((n, 3)), np.empty(n), np.empty(n)
-        judge_fields(
-            level.matrices,
-            middles,
-            steps.field_au,
-            rates,
-            steps.duration_s,
-            backward,
-            _field_limits(settings),
-            world,
-            disturbed,
-            variance,
-        )
-        judged.append((world, disturbed, variance))
+        readings = np.empty((n, places.READING))
+        monitor = np.zeros(places.MONITOR)
+        monitor[places.FITTING] = detectors.UNDISTURBED_AFTER_S
+        limits = _limits(settings)
+        judge_fields(poses, middles, steps.rows, rates, backward, monitor, limits, readings, _work())
+        world = readings[:, places.CLEAN : places.CLEAN + 3]
+        judged.append((world, readings[:, places.DISTURBS], readings[:, places.VARIANCE]))
     (world, disturbed, variance), (other, bad, uncertain) = judged
     better = (bad < disturbed) | ((bad == disturbed) & (uncertain < variance))
     return (

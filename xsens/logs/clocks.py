@@ -95,7 +95,7 @@ def timeline(stamps: Stamps) -> Timeline:
         what = "neither" if stamps.counter is None else "a counter, but no sampling rate"
         raise InvalidInputError(f"expected samples with a clock, or with a counter and a rate, got {what}")
     kept = _first_of_repeats(stamps)
-    steps = _steps(_only(stamps, kept))
+    steps = _steps(stamps if kept.all() else _only(stamps, kept))
     origin = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
     time_s = origin + np.concatenate(([0.0], np.cumsum(steps.seconds)))
     notes = _notes(int((~kept).sum()), steps)

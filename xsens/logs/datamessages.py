@@ -76,8 +76,11 @@ def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hi
     InvalidInputError
         If layout, rate or calibration is neither in the log nor in the hints.
     """
-    configuration = _last(frames, frames.mid == MessageId.CONFIGURATION, Configuration.from_message)
-    blocks = (frames.mid == MessageId.EMTS) & (frames.payload_size == BLOCK_SIZE)
+    configuration = _last(
+        frames, np.flatnonzero(frames.mid == MessageId.CONFIGURATION), Configuration.from_message
+    )
+    blocks = np.flatnonzero(frames.mid == MessageId.EMTS)
+    blocks = blocks[frames[blocks].payload_size == BLOCK_SIZE]
     calibration = hints.calibration or _last(frames, blocks, RawCalibration.from_message)
     data = frames[which]
     part = _slice(data, configuration, hints)
@@ -88,11 +91,6 @@ def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hi
         parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
     data = only(data, fits)
     raw = part.layout.mode & _RAW
-    counts = part.all_of(data, ("counter",))
-    counter = counts["counter"][:, 0].astype(np.int64) if counts else None
-    stamps = replace(
-        stamps, counter=counter, starts=only(stamps.starts, fits), computer_s=only(stamps.computer_s, fits)
-    )
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
     if raw:
@@ -102,12 +100,24 @@ def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hi
     else:
         nwu_from(hints.world or part.layout.frame)
         read = partial(_as_sent, part, data, parts, hints)
-    return on_clock(stamps, len(data), read, replace(hints, rate_hz=rate_hz))
+    starts, computer_s = only(stamps.starts, fits), only(stamps.computer_s, fits)
+    # Made in the call, so that nothing holds the counter once the times are known.
+    return on_clock(
+        replace(stamps, counter=_counter(part, data), starts=starts, computer_s=computer_s),
+        len(data),
+        read,
+        replace(hints, rate_hz=rate_hz),
+    )
 
 
-def _last(frames: Frames, which: BoolArray, read: Callable[[Message], _Read]) -> _Read | None:
+def _counter(part: _Slice, data: Frames) -> IntArray | None:
+    counts = part.all_of(data, ("counter",))
+    return counts["counter"][:, 0].astype(np.int64) if counts else None
+
+
+def _last(frames: Frames, which: IntArray, read: Callable[[Message], _Read]) -> _Read | None:
     """The last of some messages that can be read."""
-    for i in np.flatnonzero(which)[::-1].tolist():
+    for i in which[::-1].tolist():
         with suppress(InvalidInputError):
             return read(frames.message(i))
     return None
@@ -257,13 +267,16 @@ def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
     counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
     # A new start before a message that is no sample is one before the next sample.
     at = np.flatnonzero(rows)
-    starts, computer_s = np.zeros(at.size, dtype=bool), np.full(at.size, np.nan)
-    if stamps.starts is not None and stamps.computer_s is not None:
+    starts = np.zeros(at.size, dtype=bool)
+    computer_s = None if stamps.computer_s is None else np.full(at.size, np.nan)
+    if stamps.starts is not None:
         for i in np.flatnonzero(stamps.starts):
             after = int(np.searchsorted(at, i))
             if after < at.size:
-                starts[after], computer_s[after] = True, stamps.computer_s[i]
-    others = np.cumsum(~rows, dtype=np.int64)[rows]
+                starts[after] = True
+                if computer_s is not None and stamps.computer_s is not None:
+                    computer_s[after] = stamps.computer_s[i]
+    others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
     return Stamps(counter, ticks, tick_s=_TICK_S, others=others, starts=starts, computer_s=computer_s)
 
 

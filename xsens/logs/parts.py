@@ -135,6 +135,7 @@ def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hi
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
     if stamps.counter is not None or stamps.ticks is not None:
         line = timeline(stamps)
+        del stamps
         return assembled(line, parts())
     if hints.rate_hz is None:
         raise InvalidInputError("expected samples with a clock or a counter, or a sampling rate, got neither")

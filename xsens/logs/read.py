@@ -21,7 +21,7 @@ from xsens.messages.framing import Frames, find_frames
 PathLike = str | os.PathLike[str]
 
 MOST_BYTES = 1 << 27
-"""Of a log: five hours of raw counts at 256 Hz. Reading takes up to seven times the memory, damage more."""
+"""Of a log: five hours of raw counts at 256 Hz. Reading takes up to six times the memory, damage more."""
 
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _SNIFFED = 1 << 16
@@ -169,8 +169,8 @@ def _of_one_kind(frames: Frames) -> IntArray:
         raise InvalidInputError(
             f"expected messages with data, got {len(frames)} others in {frames.data.size} bytes"
         )
-    kinds = frames.mid[data].astype(np.int64) * 256 + frames.bid[data]
-    return np.asarray(data[kinds == np.bincount(kinds).argmax()])
+    kinds = frames.mid[data].astype(np.uint16) * 256 + frames.bid[data]
+    return np.asarray(data[kinds == np.bincount(kinds).argmax()].astype(frames.start.dtype))
 
 
 def _passed_over(frames: Frames, which: IntArray) -> Iterator[str]:
@@ -185,10 +185,12 @@ def _passed_over(frames: Frames, which: IntArray) -> Iterator[str]:
 def _stretches(frames: Frames, which: IntArray) -> Stamps:
     """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
     starts = np.zeros(which.size, dtype=bool)
-    computer_s = np.full(which.size, np.nan)
+    utc = np.flatnonzero(frames.mid == MessageId.UTC_TIME)
+    computer_s = np.full(which.size, np.nan) if utc.size else None
     starts[_next_data(np.flatnonzero(np.isin(frames.mid, _STARTS)), which)[0]] = True
-    for after, i in zip(*_next_data(np.flatnonzero(frames.mid == MessageId.UTC_TIME), which), strict=True):
-        computer_s[after] = utc_time_s(frames.message(int(i)))
+    if computer_s is not None:
+        for after, i in zip(*_next_data(utc, which), strict=True):
+            computer_s[after] = utc_time_s(frames.message(int(i)))
     return Stamps(starts=starts, computer_s=computer_s)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -104,6 +105,8 @@ class Frames:
         return int(self.start.size)
 
     def __getitem__(self, which: BoolArray | npt.NDArray[np.integer] | slice) -> Frames:
+        if isinstance(which, np.ndarray) and which.dtype != bool and which.size and _without_a_hole(which):
+            which = slice(int(which[0]), int(which[-1]) + 1)  # of which NumPy makes no copy
         return Frames(self.data, self.start[which], self.end[which])
 
     @cached_property
@@ -149,6 +152,13 @@ class Frames:
         size = np.concatenate((self.start, [self.data.size])) - before
         there = size > 0
         return list(zip(before[there].tolist(), size[there].tolist(), strict=True))
+
+
+def _without_a_hole(indices: npt.NDArray[Any]) -> bool:
+    """Whether indices rise by one: for those that rise at all, their ends show it."""
+    if int(indices[-1]) - int(indices[0]) + 1 != indices.size:
+        return False
+    return bool((indices[1:] > indices[:-1]).all())
 
 
 def find_frames(data: bytes | ByteArray) -> Frames:

@@ -104,7 +104,7 @@ def columns(frames: Frames) -> tuple[dict[int, Column], int]:
                 for identifier, at, length in items or ():
                     values = _numbers(identifier, alike[:, at : at + length])
                     if values is not None:
-                        found[identifier].append(Column(first + rows[same], values))
+                        found[identifier].append(Column((first + rows[same]).astype(np.int32), values))
     return {identifier: _joined(found.pop(identifier)) for identifier in list(found)}, damaged
 
 
