@@ -40,7 +40,7 @@ class BareChain(NamedTuple):
     @property
     def chain(self) -> Chain:
         """Put the chain together."""
-        probe, target = (RigidTransform.from_matrix(matrix) for matrix in (self.probe, self.target))
+        probe, target = (RigidTransform(matrix, normalize=False) for matrix in (self.probe, self.target))
         return Chain(self.pixel_mm, probe, target)
 
     @property
