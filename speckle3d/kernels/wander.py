@@ -7,7 +7,7 @@ from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
 
-LANES = 32
+LANES = 56
 """Points of the grid that pass through the recording together."""
 
 COMPONENTS = 6
