@@ -1,0 +1,347 @@
+"""Least squares of a calibration's chain: Levenberg and Marquardt's method, all steps in one call."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.kernels.chain import PARAMETERS, turned
+
+_SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
+
+_FARTHEST = 100.0
+"""Length of the first step at most, in lengths of the scaled parameters."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def fit_chain(
+    chain: FloatArray,
+    pixels: FloatArray,
+    turns: FloatArray,
+    shifts: FloatArray,
+    rows: FloatArray,
+    offsets: FloatArray,
+    weights: FloatArray,
+    columns: IntArray,
+    known: FloatArray,
+    tolerance: float,
+    most: int,
+    found: FloatArray,
+) -> tuple[int, bool]:
+    """Find the parameters of least squares, in frames that lie on the image and on the phantom.
+
+    The steps and their ends are those of MINPACK's ``lmder``. Its matrix is made of the normal equations,
+    which is several times as fast; parameters are scaled, and derivatives that determine them have condition
+    numbers far below the 1e7 at which that would tell.
+
+    Parameters
+    ----------
+    chain : ndarray, shape (2, 4, 4)
+        Where the image and the phantom lie: ``sensor_from_image`` and ``target_from_world``.
+    pixels, turns, shifts, rows, offsets : ndarray
+        As in `chain_residuals`.
+    weights : ndarray, shape (n, r)
+        Factor on each equation.
+    columns : ndarray of int, shape (p,)
+        Which of the parameters are free.
+    known : ndarray, shape (4,)
+        A pixel size, the weight of relative deviations from it as further residuals (zero: none), and
+        whether all others then are in the unit of the pixels' rows, not of the phantom (one or zero).
+    tolerance : float
+        Relative change of the sum of squares and of the scaled parameters at which to stop.
+    most : int
+        Steps at most.
+    found : ndarray, shape (14,)
+        Parameters at which to start: pixel sizes, else zero. Replaced by the answer.
+
+    Returns
+    -------
+    steps : int
+        Steps tried; -1 where residuals at the start are not finite.
+    converged : bool
+
+    References
+    ----------
+    .. [1] J. J. More, "The Levenberg-Marquardt algorithm: implementation and theory", 1977.
+    """
+    free = columns.shape[0]
+    points = _placed(chain, pixels, turns, shifts)
+    count = offsets.size
+    slopes = np.empty((PARAMETERS + 1, count))
+    now, trial = np.empty((free + 1, free + 1)), np.empty((free + 1, free + 1))
+    scale, step, root = np.empty(free), np.empty(free), np.empty((free, free))
+    full, row_mm = found.copy(), found[1]
+    norm = _normal(found, row_mm, points, rows, offsets, weights, columns, known, slopes, now)
+    if not norm < math.inf:
+        return -1, False
+    longest, damping = 0.0, 0.0
+    for number in range(most):
+        steep = 0.0
+        for j in range(free):
+            length = math.sqrt(now[j, j])
+            if number == 0:
+                scale[j] = length if length > 0.0 else 1.0
+            scale[j] = max(scale[j], length)
+            if length > 0.0 and norm > 0.0:
+                steep = max(steep, abs(now[free, j]) / (norm * length))
+        size = 0.0
+        for j in range(free):
+            size += (scale[j] * found[columns[j]]) ** 2
+        size = math.sqrt(size)
+        if number == 0:
+            longest = _FARTHEST * size if size > 0.0 else _FARTHEST
+        if steep <= tolerance:
+            return number + 1, True
+        damping, moved = _step(now, scale, longest, damping, root, step)
+        if number == 0:
+            longest = min(longest, moved)
+        full[:] = found
+        for j in range(free):
+            full[columns[j]] -= step[j]
+        there = _normal(full, row_mm, points, rows, offsets, weights, columns, known, slopes, trial)
+        fallen = 1.0 - (there / norm) ** 2 if 0.1 * there < norm else -1.0
+        linear = 0.0
+        for i in range(free):
+            for j in range(free):
+                linear += step[i] * now[max(i, j), min(i, j)] * step[j]
+        linear /= norm * norm
+        damped = damping * (moved / norm) ** 2
+        promised = linear + 2.0 * damped
+        ratio = fallen / promised if promised != 0.0 else 0.0
+        if ratio <= 0.25:
+            share = 0.5
+            if fallen < 0.0:
+                share = 0.5 * (linear + damped) / (linear + damped - 0.5 * fallen)
+            if 0.1 * there >= norm or share < 0.1:
+                share = 0.1
+            longest = share * min(longest, 10.0 * moved)
+            damping /= share
+        elif damping == 0.0 or ratio >= 0.75:
+            longest = 2.0 * moved
+            damping *= 0.5
+        if ratio >= 1e-4:
+            found[:] = full
+            now, trial = trial, now
+            norm = there
+            size = 0.0
+            for j in range(free):
+                size += (scale[j] * found[columns[j]]) ** 2
+            size = math.sqrt(size)
+        if abs(fallen) <= tolerance and promised <= tolerance and ratio <= 2.0:
+            return number + 2, True
+        if longest <= tolerance * size:
+            return number + 2, True
+    return most, False
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _placed(chain: FloatArray, pixels: FloatArray, turns: FloatArray, shifts: FloatArray) -> FloatArray:
+    """Pixels, and poses between the phantom and the image, each component in a row, shape (14, n)."""
+    probe, target = chain[0], chain[1]
+    placed, half = np.empty((14, pixels.shape[0])), np.empty((3, 3))
+    for k in range(pixels.shape[0]):
+        placed[0, k], placed[1, k] = pixels[k, 0], pixels[k, 1]
+        for i in range(3):
+            shift = target[i, 3]
+            for j in range(3):
+                half[i, j] = (
+                    target[i, 0] * turns[k, 0, j]
+                    + target[i, 1] * turns[k, 1, j]
+                    + target[i, 2] * turns[k, 2, j]
+                )
+                shift += target[i, j] * shifts[k, j] + half[i, j] * probe[j, 3]
+            for j in range(3):
+                placed[2 + 3 * i + j, k] = (
+                    half[i, 0] * probe[0, j] + half[i, 1] * probe[1, j] + half[i, 2] * probe[2, j]
+                )
+            placed[11 + i, k] = shift
+    return placed
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _normal(
+    parameters: FloatArray,
+    row_mm: float,
+    points: FloatArray,
+    rows: FloatArray,
+    offsets: FloatArray,
+    weights: FloatArray,
+    columns: IntArray,
+    known: FloatArray,
+    slopes: FloatArray,
+    normal: FloatArray,
+) -> float:
+    """Fill products of the derivatives with each other and, last, with the residuals; return these' norm."""
+    probe, by_probe = np.empty((3, 3)), np.empty((3, 3, 3))
+    target, by_target = np.empty((3, 3)), np.empty((3, 3, 3))
+    turned(parameters[5:8], probe, by_probe)
+    turned(parameters[11:14], target, by_target)
+    sx_mm, sy_mm, shift_x, shift_y, shift_z = parameters[:5]
+    in_rows = known[3] != 0.0 and known[2] != 0.0
+    shrunk = row_mm / sy_mm if in_rows else 1.0
+    by_rows = 1.0 / sy_mm if in_rows else 0.0
+    n, several = points.shape[1], rows.shape[1]
+    for r in range(several):
+        for k in range(n):
+            x, y = points[0, k] * sx_mm, points[1, k] * sy_mm
+            a = probe[0, 0] * x + probe[0, 1] * y + shift_x
+            b = probe[1, 0] * x + probe[1, 1] * y + shift_y
+            c = probe[2, 0] * x + probe[2, 1] * y + shift_z
+            wx = points[2, k] * a + points[3, k] * b + points[4, k] * c + points[11, k]
+            wy = points[5, k] * a + points[6, k] * b + points[7, k] * c + points[12, k]
+            wz = points[8, k] * a + points[9, k] * b + points[10, k] * c + points[13, k]
+            weight = weights[k, r] * shrunk
+            rx, ry, rz = weight * rows[k, r, 0], weight * rows[k, r, 1], weight * rows[k, r, 2]
+            # The row in the world's axes, then in the sensor's.
+            ux = rx * target[0, 0] + ry * target[1, 0] + rz * target[2, 0]
+            uy = rx * target[0, 1] + ry * target[1, 1] + rz * target[2, 1]
+            uz = rx * target[0, 2] + ry * target[1, 2] + rz * target[2, 2]
+            sx = ux * points[2, k] + uy * points[5, k] + uz * points[8, k]
+            sy = ux * points[3, k] + uy * points[6, k] + uz * points[9, k]
+            sz = ux * points[4, k] + uy * points[7, k] + uz * points[10, k]
+            value = (
+                ux * wx
+                + uy * wy
+                + uz * wz
+                + rx * parameters[8]
+                + ry * parameters[9]
+                + rz * parameters[10]
+                - weight * offsets[k, r]
+            )
+            at = r * n + k
+            slopes[14, at] = value
+            slopes[0, at] = (sx * probe[0, 0] + sy * probe[1, 0] + sz * probe[2, 0]) * points[0, k]
+            slopes[1, at] = (
+                sx * probe[0, 1] + sy * probe[1, 1] + sz * probe[2, 1]
+            ) * points[1, k] - value * by_rows
+            slopes[2, at], slopes[3, at], slopes[4, at] = sx, sy, sz
+            slopes[8, at], slopes[9, at], slopes[10, at] = rx, ry, rz
+            for i in range(3):
+                slopes[5 + i, at] = (
+                    sx * (by_probe[i, 0, 0] * x + by_probe[i, 0, 1] * y)
+                    + sy * (by_probe[i, 1, 0] * x + by_probe[i, 1, 1] * y)
+                    + sz * (by_probe[i, 2, 0] * x + by_probe[i, 2, 1] * y)
+                )
+                slopes[11 + i, at] = (
+                    rx * (by_target[i, 0, 0] * wx + by_target[i, 0, 1] * wy + by_target[i, 0, 2] * wz)
+                    + ry * (by_target[i, 1, 0] * wx + by_target[i, 1, 1] * wy + by_target[i, 1, 2] * wz)
+                    + rz * (by_target[i, 2, 0] * wx + by_target[i, 2, 1] * wy + by_target[i, 2, 2] * wz)
+                )
+    free = columns.shape[0]
+    for i in range(free + 1):
+        first = slopes[columns[i]] if i < free else slopes[14]
+        for j in range(i + 1):
+            second = slopes[columns[j]] if j < free else slopes[14]
+            total = 0.0
+            for k in range(first.shape[0]):
+                total += first[k] * second[k]
+            normal[i, j] = total
+    if known[2] != 0.0:
+        for i in range(2):
+            value = known[2] * (parameters[i] / known[i] - 1.0)
+            normal[free, free] += value * value
+            for j in range(free):
+                if columns[j] == i:
+                    normal[j, j] += (known[2] / known[i]) ** 2
+                    normal[free, j] += value * known[2] / known[i]
+    return math.sqrt(normal[free, free])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _step(
+    normal: FloatArray, scale: FloatArray, longest: float, damping: float, root: FloatArray, step: FloatArray
+) -> tuple[float, float]:
+    """Fill the step, to be subtracted, of about the longest length or less; return damping and length."""
+    free = scale.shape[0]
+    whole = _solved(normal, scale, 0.0, root, step)
+    moved, least = math.inf, 0.0
+    if whole:
+        moved = _length(step, scale)
+        if moved - longest <= 0.1 * longest:
+            return 0.0, moved
+        least = (moved - longest) / (longest * _steepness(root, scale, step, moved))
+    pull = 0.0
+    for j in range(free):
+        pull += (normal[free, j] / scale[j]) ** 2
+    pull = math.sqrt(pull)
+    greatest = pull / longest
+    if greatest == 0.0:
+        greatest = 1e-300 / min(longest, 0.1)
+    damping = min(max(damping, least), greatest)
+    if damping == 0.0:
+        damping = pull / moved if whole else 1e-3 * greatest
+    excess = moved - longest
+    for number in range(10):
+        if damping == 0.0:
+            damping = max(1e-300, 1e-3 * greatest)
+        if not _solved(normal, scale, damping, root, step):
+            least = max(least, damping)
+            damping *= 10.0
+            continue
+        moved = _length(step, scale)
+        before, excess = excess, moved - longest
+        ended = least == 0.0 and excess <= before and before < 0.0
+        if abs(excess) <= 0.1 * longest or ended or number == 9:
+            break
+        change = excess / (longest * _steepness(root, scale, step, moved))
+        if excess > 0.0:
+            least = max(least, damping)
+        elif excess < 0.0:
+            greatest = min(greatest, damping)
+        damping = max(least, damping + change)
+    return damping, moved
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _solved(normal: FloatArray, scale: FloatArray, damping: float, root: FloatArray, step: FloatArray) -> bool:
+    """Fill the root of the damped normal equations (Cholesky) and their solution; False if singular."""
+    free = scale.shape[0]
+    for i in range(free):
+        for j in range(i + 1):
+            total = normal[i, j]
+            if i == j:
+                total += damping * scale[i] * scale[i]
+            whole = total
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if i > j:
+                root[i, j] = total / root[j, j]
+            elif total > 1e-14 * whole:
+                root[i, i] = math.sqrt(total)
+            else:
+                return False
+    for i in range(free):
+        total = normal[free, i]
+        for k in range(i):
+            total -= root[i, k] * step[k]
+        step[i] = total / root[i, i]
+    for i in range(free - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, free):
+            total -= root[k, i] * step[k]
+        step[i] = total / root[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _length(step: FloatArray, scale: FloatArray) -> float:
+    """Length of a step in scaled parameters."""
+    total = 0.0
+    for j in range(scale.shape[0]):
+        total += (scale[j] * step[j]) ** 2
+    return math.sqrt(total)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _steepness(root: FloatArray, scale: FloatArray, step: FloatArray, moved: float) -> float:
+    """By how much the step shortens with damping, relative to its length."""
+    free = scale.shape[0]
+    solved, total = np.empty(free), 0.0
+    for i in range(free):
+        value = scale[i] * scale[i] * step[i] / moved
+        for k in range(i):
+            value -= root[i, k] * solved[k]
+        solved[i] = value / root[i, i]
+        total += solved[i] * solved[i]
+    return total
