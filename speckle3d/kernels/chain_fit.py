@@ -212,9 +212,9 @@ def _normal(
             at = r * n + k
             slopes[14, at] = value
             slopes[0, at] = (sx * probe[0, 0] + sy * probe[1, 0] + sz * probe[2, 0]) * points[0, k]
-            slopes[1, at] = (
-                sx * probe[0, 1] + sy * probe[1, 1] + sz * probe[2, 1]
-            ) * points[1, k] - value * by_rows
+            slopes[1, at] = (sx * probe[0, 1] + sy * probe[1, 1] + sz * probe[2, 1]) * points[
+                1, k
+            ] - value * by_rows
             slopes[2, at], slopes[3, at], slopes[4, at] = sx, sy, sz
             slopes[8, at], slopes[9, at], slopes[10, at] = rx, ry, rz
             for i in range(3):
@@ -294,7 +294,9 @@ def _step(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _solved(normal: FloatArray, scale: FloatArray, damping: float, root: FloatArray, step: FloatArray) -> bool:
+def _solved(
+    normal: FloatArray, scale: FloatArray, damping: float, root: FloatArray, step: FloatArray
+) -> bool:
     """Fill the root of the damped normal equations (Cholesky) and their solution; False if singular."""
     free = scale.shape[0]
     for i in range(free):
