@@ -67,12 +67,12 @@ def fit_chain(
     """
     free = columns.shape[0]
     points = _placed(chain, pixels, turns, shifts)
-    count = offsets.size
-    slopes = np.empty((PARAMETERS + 1, count))
+    equations = _weighted(rows, offsets, weights)
+    slopes = np.empty((PARAMETERS + 4, offsets.size))
     now, trial = np.empty((free + 1, free + 1)), np.empty((free + 1, free + 1))
     scale, step, root = np.empty(free), np.empty(free), np.empty((free, free))
     full, row_mm = found.copy(), found[1]
-    norm = _normal(found, row_mm, points, rows, offsets, weights, columns, known, slopes, now)
+    norm = _normal(found, row_mm, points, equations, columns, known, slopes, now)
     if not norm < math.inf:
         return -1, False
     longest, damping = 0.0, 0.0
@@ -99,7 +99,7 @@ def fit_chain(
         full[:] = found
         for j in range(free):
             full[columns[j]] -= step[j]
-        there = _normal(full, row_mm, points, rows, offsets, weights, columns, known, slopes, trial)
+        there = _normal(full, row_mm, points, equations, columns, known, slopes, trial)
         fallen = 1.0 - (there / norm) ** 2 if 0.1 * there < norm else -1.0
         linear = 0.0
         for i in range(free):
@@ -159,20 +159,33 @@ def _placed(chain: FloatArray, pixels: FloatArray, turns: FloatArray, shifts: Fl
     return placed
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _weighted(rows: FloatArray, offsets: FloatArray, weights: FloatArray) -> FloatArray:
+    """Rows and offsets times their weights, each component in a row, shape (r, 4, n)."""
+    equations = np.empty((rows.shape[1], 4, rows.shape[0]))
+    for r in range(rows.shape[1]):
+        for k in range(rows.shape[0]):
+            for i in range(3):
+                equations[r, i, k] = weights[k, r] * rows[k, r, i]
+            equations[r, 3, k] = weights[k, r] * offsets[k, r]
+    return equations
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
 def _normal(
     parameters: FloatArray,
     row_mm: float,
     points: FloatArray,
-    rows: FloatArray,
-    offsets: FloatArray,
-    weights: FloatArray,
+    equations: FloatArray,
     columns: IntArray,
     known: FloatArray,
     slopes: FloatArray,
     normal: FloatArray,
 ) -> float:
-    """Fill products of the derivatives with each other and, last, with the residuals; return these' norm."""
+    """Fill products of the derivatives with each other and, last, with the residuals; return these' norm.
+
+    Rows of `slopes`, (18, n r), are filled: derivatives by all parameters, residuals, places in the world.
+    """
     probe, by_probe = np.empty((3, 3)), np.empty((3, 3, 3))
     target, by_target = np.empty((3, 3)), np.empty((3, 3, 3))
     turned(parameters[5:8], probe, by_probe)
@@ -181,52 +194,62 @@ def _normal(
     in_rows = known[3] != 0.0 and known[2] != 0.0
     shrunk = row_mm / sy_mm if in_rows else 1.0
     by_rows = 1.0 / sy_mm if in_rows else 0.0
-    n, several = points.shape[1], rows.shape[1]
-    for r in range(several):
+    tx, ty, tz = parameters[8:11]
+    p00, p01, p10, p11, p20, p21 = (
+        probe[0, 0],
+        probe[0, 1],
+        probe[1, 0],
+        probe[1, 1],
+        probe[2, 0],
+        probe[2, 1],
+    )
+    n = points.shape[1]
+    # Several short loops over all points, each of which the compiler makes several points at a time of.
+    for r in range(equations.shape[0]):
+        out, rows = slopes[:, r * n : (r + 1) * n], equations[r]
         for k in range(n):
             x, y = points[0, k] * sx_mm, points[1, k] * sy_mm
-            a = probe[0, 0] * x + probe[0, 1] * y + shift_x
-            b = probe[1, 0] * x + probe[1, 1] * y + shift_y
-            c = probe[2, 0] * x + probe[2, 1] * y + shift_z
-            wx = points[2, k] * a + points[3, k] * b + points[4, k] * c + points[11, k]
-            wy = points[5, k] * a + points[6, k] * b + points[7, k] * c + points[12, k]
-            wz = points[8, k] * a + points[9, k] * b + points[10, k] * c + points[13, k]
-            weight = weights[k, r] * shrunk
-            rx, ry, rz = weight * rows[k, r, 0], weight * rows[k, r, 1], weight * rows[k, r, 2]
+            a = p00 * x + p01 * y + shift_x
+            b = p10 * x + p11 * y + shift_y
+            c = p20 * x + p21 * y + shift_z
+            out[15, k] = points[2, k] * a + points[3, k] * b + points[4, k] * c + points[11, k]
+            out[16, k] = points[5, k] * a + points[6, k] * b + points[7, k] * c + points[12, k]
+            out[17, k] = points[8, k] * a + points[9, k] * b + points[10, k] * c + points[13, k]
+        for k in range(n):
+            rx, ry, rz = shrunk * rows[0, k], shrunk * rows[1, k], shrunk * rows[2, k]
             # The row in the world's axes, then in the sensor's.
             ux = rx * target[0, 0] + ry * target[1, 0] + rz * target[2, 0]
             uy = rx * target[0, 1] + ry * target[1, 1] + rz * target[2, 1]
             uz = rx * target[0, 2] + ry * target[1, 2] + rz * target[2, 2]
-            sx = ux * points[2, k] + uy * points[5, k] + uz * points[8, k]
-            sy = ux * points[3, k] + uy * points[6, k] + uz * points[9, k]
-            sz = ux * points[4, k] + uy * points[7, k] + uz * points[10, k]
-            value = (
-                ux * wx
-                + uy * wy
-                + uz * wz
-                + rx * parameters[8]
-                + ry * parameters[9]
-                + rz * parameters[10]
-                - weight * offsets[k, r]
-            )
-            at = r * n + k
-            slopes[14, at] = value
-            slopes[0, at] = (sx * probe[0, 0] + sy * probe[1, 0] + sz * probe[2, 0]) * points[0, k]
-            slopes[1, at] = (sx * probe[0, 1] + sy * probe[1, 1] + sz * probe[2, 1]) * points[
-                1, k
-            ] - value * by_rows
-            slopes[2, at], slopes[3, at], slopes[4, at] = sx, sy, sz
-            slopes[8, at], slopes[9, at], slopes[10, at] = rx, ry, rz
-            for i in range(3):
-                slopes[5 + i, at] = (
-                    sx * (by_probe[i, 0, 0] * x + by_probe[i, 0, 1] * y)
-                    + sy * (by_probe[i, 1, 0] * x + by_probe[i, 1, 1] * y)
-                    + sz * (by_probe[i, 2, 0] * x + by_probe[i, 2, 1] * y)
+            value = ux * out[15, k] + uy * out[16, k] + uz * out[17, k] - shrunk * rows[3, k]
+            out[14, k] = value + rx * tx + ry * ty + rz * tz
+            out[8, k], out[9, k], out[10, k] = rx, ry, rz
+            out[2, k] = ux * points[2, k] + uy * points[5, k] + uz * points[8, k]
+            out[3, k] = ux * points[3, k] + uy * points[6, k] + uz * points[9, k]
+            out[4, k] = ux * points[4, k] + uy * points[7, k] + uz * points[10, k]
+        for k in range(n):
+            sx, sy, sz = out[2, k], out[3, k], out[4, k]
+            out[0, k] = (sx * p00 + sy * p10 + sz * p20) * points[0, k]
+            out[1, k] = (sx * p01 + sy * p11 + sz * p21) * points[1, k] - out[14, k] * by_rows
+        for i in range(3):
+            d = by_probe[i]
+            d00, d01, d10, d11, d20, d21 = d[0, 0], d[0, 1], d[1, 0], d[1, 1], d[2, 0], d[2, 1]
+            for k in range(n):
+                x, y = points[0, k] * sx_mm, points[1, k] * sy_mm
+                out[5 + i, k] = (
+                    out[2, k] * (d00 * x + d01 * y)
+                    + out[3, k] * (d10 * x + d11 * y)
+                    + out[4, k] * (d20 * x + d21 * y)
                 )
-                slopes[11 + i, at] = (
-                    rx * (by_target[i, 0, 0] * wx + by_target[i, 0, 1] * wy + by_target[i, 0, 2] * wz)
-                    + ry * (by_target[i, 1, 0] * wx + by_target[i, 1, 1] * wy + by_target[i, 1, 2] * wz)
-                    + rz * (by_target[i, 2, 0] * wx + by_target[i, 2, 1] * wy + by_target[i, 2, 2] * wz)
+            d = by_target[i]
+            e00, e01, e02, e10, e11, e12 = d[0, 0], d[0, 1], d[0, 2], d[1, 0], d[1, 1], d[1, 2]
+            e20, e21, e22 = d[2, 0], d[2, 1], d[2, 2]
+            for k in range(n):
+                wx, wy, wz = out[15, k], out[16, k], out[17, k]
+                out[11 + i, k] = (
+                    out[8, k] * (e00 * wx + e01 * wy + e02 * wz)
+                    + out[9, k] * (e10 * wx + e11 * wy + e12 * wz)
+                    + out[10, k] * (e20 * wx + e21 * wy + e22 * wz)
                 )
     free = columns.shape[0]
     for i in range(free + 1):
