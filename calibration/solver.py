@@ -95,12 +95,12 @@ def solve_chain(
         chain = settled
     if phantom.determined:
         # Where the phantom is, as the readings say on average: what wanders is not in its place.
-        chain, _ = refined(points[used], phantom, chain, phantom.determined)
+        chain = refined(points[used], phantom, chain, phantom.determined)
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
+    fit = fitted(points[used], phantom, chain, free, prior=prior, sigma=sigma)
     return ChainSolution(
         chain,
         phantom,
@@ -201,25 +201,31 @@ def residuals_of(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatAr
     return Equations.of(points, phantom).residuals(BareChain.of(chain))
 
 
-def refined(
+def refined(points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]) -> Chain:
+    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
+
+    There all angles start at zero: far from where fixed angles become singular, and well scaled.
+    """
+    return _refined(Equations.of(points, phantom), BareChain.of(chain), free).chain
+
+
+def fitted(
     points: ImagePoints,
     phantom: Phantom,
     chain: Chain,
     free: tuple[str, ...],
     prior: PixelPrior | None = None,
     sigma: float = 1.0,
-) -> tuple[Chain, Fit]:
-    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
+) -> Fit:
+    """The solution of `refined` with its residuals and derivatives, in the frames where it began.
 
-    There all angles start at zero: far from where fixed angles become singular, and well scaled. The prior's
-    deviations are weighed against residuals of standard deviation `sigma`, and follow them in the fit.
+    The prior's deviations are weighed against residuals of standard deviation `sigma`, and follow them.
     """
-    equations, in_rows = Equations.of(points, phantom), phantom.seen_as == "line"
+    equations, columns, in_rows = Equations.of(points, phantom), columns_of(free), phantom.seen_as == "line"
     begun = BareChain.of(chain)
     known = equations.known(prior, sigma, in_rows)
-    found, steps, converged = equations.least_squares(begun, columns_of(free), None, known, _TOLERANCE)
-    near, columns = equations.near(begun), columns_of(free)
-    values, jacobian = near.derivatives(found, columns)
+    found, steps, converged = equations.least_squares(begun, columns, None, known, _TOLERANCE)
+    values, jacobian = equations.near(begun).derivatives(found, columns)
     if prior is not None:
         if in_rows:
             # Lines err by rows: in millimetres, an image that shrinks to nothing would leave no residual.
@@ -228,8 +234,7 @@ def refined(
             jacobian[:, free.index("s_y")] -= values / found[1]
         extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
         values, jacobian = np.append(values, sigma * prior.deviation(found[:2])), np.vstack([jacobian, extra])
-    fit = Fit(found[columns], free, values, jacobian, steps, converged)
-    return begun.moved_to(found).chain, fit
+    return Fit(found[columns], free, values, jacobian, steps, converged)
 
 
 def _refined(
