@@ -10,6 +10,10 @@ from speckle3d.kernels.chain import PARAMETERS, turned
 
 _SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 
+_BLOCK = 64
+"""Points worked on together. Components of a block lie so many places apart, which the compiler knows: so it
+makes several points at a time of each loop without asking whether arrays overlap."""
+
 _FARTHEST = 100.0
 """Length of the first step at most, in lengths of the scaled parameters."""
 
@@ -68,7 +72,7 @@ def fit_chain(
     free = columns.shape[0]
     points = _placed(chain, pixels, turns, shifts)
     equations = _weighted(rows, offsets, weights)
-    slopes = np.empty((PARAMETERS + 4, offsets.size))
+    slopes = np.empty((PARAMETERS + 4) * _BLOCK)
     now, trial = np.empty((free + 1, free + 1)), np.empty((free + 1, free + 1))
     scale, step, root = np.empty(free), np.empty(free), np.empty((free, free))
     full, row_mm = found.copy(), found[1]
@@ -137,11 +141,13 @@ def fit_chain(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
 def _placed(chain: FloatArray, pixels: FloatArray, turns: FloatArray, shifts: FloatArray) -> FloatArray:
-    """Pixels, and poses between the phantom and the image, each component in a row, shape (14, n)."""
+    """Pixels, and poses between the phantom and the image: 14 components, one after another in each block."""
     probe, target = chain[0], chain[1]
-    placed, half = np.empty((14, pixels.shape[0])), np.empty((3, 3))
+    blocks = -(-pixels.shape[0] // _BLOCK)
+    placed, half = np.zeros(blocks * 14 * _BLOCK), np.empty((3, 3))
     for k in range(pixels.shape[0]):
-        placed[0, k], placed[1, k] = pixels[k, 0], pixels[k, 1]
+        at = k // _BLOCK * 14 * _BLOCK + k % _BLOCK
+        placed[at], placed[at + _BLOCK] = pixels[k, 0], pixels[k, 1]
         for i in range(3):
             shift = target[i, 3]
             for j in range(3):
@@ -152,22 +158,24 @@ def _placed(chain: FloatArray, pixels: FloatArray, turns: FloatArray, shifts: Fl
                 )
                 shift += target[i, j] * shifts[k, j] + half[i, j] * probe[j, 3]
             for j in range(3):
-                placed[2 + 3 * i + j, k] = (
+                placed[at + (2 + 3 * i + j) * _BLOCK] = (
                     half[i, 0] * probe[0, j] + half[i, 1] * probe[1, j] + half[i, 2] * probe[2, j]
                 )
-            placed[11 + i, k] = shift
+            placed[at + (11 + i) * _BLOCK] = shift
     return placed
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _weighted(rows: FloatArray, offsets: FloatArray, weights: FloatArray) -> FloatArray:
-    """Rows and offsets times their weights, each component in a row, shape (r, 4, n)."""
-    equations = np.empty((rows.shape[1], 4, rows.shape[0]))
+    """Rows and offsets times their weights, four components in each block, shape (r, blocks * 4 * _BLOCK)."""
+    blocks = -(-rows.shape[0] // _BLOCK)
+    equations = np.zeros((rows.shape[1], blocks * 4 * _BLOCK))
     for r in range(rows.shape[1]):
         for k in range(rows.shape[0]):
+            at = k // _BLOCK * 4 * _BLOCK + k % _BLOCK
             for i in range(3):
-                equations[r, i, k] = weights[k, r] * rows[k, r, i]
-            equations[r, 3, k] = weights[k, r] * offsets[k, r]
+                equations[r, at + i * _BLOCK] = weights[k, r] * rows[k, r, i]
+            equations[r, at + 3 * _BLOCK] = weights[k, r] * offsets[k, r]
     return equations
 
 
@@ -184,7 +192,7 @@ def _normal(
 ) -> float:
     """Fill products of the derivatives with each other and, last, with the residuals; return these' norm.
 
-    Rows of `slopes`, (18, n r), are filled: derivatives by all parameters, residuals, places in the world.
+    `slopes`, shape (18 * _BLOCK,), is room for a block's derivatives, residuals and places in the world.
     """
     probe, by_probe = np.empty((3, 3)), np.empty((3, 3, 3))
     target, by_target = np.empty((3, 3)), np.empty((3, 3, 3))
@@ -203,63 +211,95 @@ def _normal(
         probe[2, 0],
         probe[2, 1],
     )
-    n = points.shape[1]
-    # Several short loops over all points, each of which the compiler makes several points at a time of.
-    for r in range(equations.shape[0]):
-        out, rows = slopes[:, r * n : (r + 1) * n], equations[r]
-        for k in range(n):
-            x, y = points[0, k] * sx_mm, points[1, k] * sy_mm
-            a = p00 * x + p01 * y + shift_x
-            b = p10 * x + p11 * y + shift_y
-            c = p20 * x + p21 * y + shift_z
-            out[15, k] = points[2, k] * a + points[3, k] * b + points[4, k] * c + points[11, k]
-            out[16, k] = points[5, k] * a + points[6, k] * b + points[7, k] * c + points[12, k]
-            out[17, k] = points[8, k] * a + points[9, k] * b + points[10, k] * c + points[13, k]
-        for k in range(n):
-            rx, ry, rz = shrunk * rows[0, k], shrunk * rows[1, k], shrunk * rows[2, k]
-            # The row in the world's axes, then in the sensor's.
-            ux = rx * target[0, 0] + ry * target[1, 0] + rz * target[2, 0]
-            uy = rx * target[0, 1] + ry * target[1, 1] + rz * target[2, 1]
-            uz = rx * target[0, 2] + ry * target[1, 2] + rz * target[2, 2]
-            value = ux * out[15, k] + uy * out[16, k] + uz * out[17, k] - shrunk * rows[3, k]
-            out[14, k] = value + rx * tx + ry * ty + rz * tz
-            out[8, k], out[9, k], out[10, k] = rx, ry, rz
-            out[2, k] = ux * points[2, k] + uy * points[5, k] + uz * points[8, k]
-            out[3, k] = ux * points[3, k] + uy * points[6, k] + uz * points[9, k]
-            out[4, k] = ux * points[4, k] + uy * points[7, k] + uz * points[10, k]
-        for k in range(n):
-            sx, sy, sz = out[2, k], out[3, k], out[4, k]
-            out[0, k] = (sx * p00 + sy * p10 + sz * p20) * points[0, k]
-            out[1, k] = (sx * p01 + sy * p11 + sz * p21) * points[1, k] - out[14, k] * by_rows
-        for i in range(3):
-            d = by_probe[i]
-            d00, d01, d10, d11, d20, d21 = d[0, 0], d[0, 1], d[1, 0], d[1, 1], d[2, 0], d[2, 1]
-            for k in range(n):
-                x, y = points[0, k] * sx_mm, points[1, k] * sy_mm
-                out[5 + i, k] = (
-                    out[2, k] * (d00 * x + d01 * y)
-                    + out[3, k] * (d10 * x + d11 * y)
-                    + out[4, k] * (d20 * x + d21 * y)
-                )
-            d = by_target[i]
-            e00, e01, e02, e10, e11, e12 = d[0, 0], d[0, 1], d[0, 2], d[1, 0], d[1, 1], d[1, 2]
-            e20, e21, e22 = d[2, 0], d[2, 1], d[2, 2]
-            for k in range(n):
-                wx, wy, wz = out[15, k], out[16, k], out[17, k]
-                out[11 + i, k] = (
-                    out[8, k] * (e00 * wx + e01 * wy + e02 * wz)
-                    + out[9, k] * (e10 * wx + e11 * wy + e12 * wz)
-                    + out[10, k] * (e20 * wx + e21 * wy + e22 * wz)
-                )
     free = columns.shape[0]
-    for i in range(free + 1):
-        first = slopes[columns[i]] if i < free else slopes[14]
-        for j in range(i + 1):
-            second = slopes[columns[j]] if j < free else slopes[14]
-            total = 0.0
-            for k in range(first.shape[0]):
-                total += first[k] * second[k]
-            normal[i, j] = total
+    normal[:] = 0.0
+    out = slopes
+    for r in range(equations.shape[0]):
+        for block in range(points.shape[0] // (14 * _BLOCK)):
+            here = points[block * 14 * _BLOCK : (block + 1) * 14 * _BLOCK]
+            rows = equations[r, block * 4 * _BLOCK : (block + 1) * 4 * _BLOCK]
+            for k in range(_BLOCK):
+                x, y = here[k] * sx_mm, here[_BLOCK + k] * sy_mm
+                a = p00 * x + p01 * y + shift_x
+                b = p10 * x + p11 * y + shift_y
+                c = p20 * x + p21 * y + shift_z
+                out[15 * _BLOCK + k] = (
+                    here[2 * _BLOCK + k] * a
+                    + here[3 * _BLOCK + k] * b
+                    + here[4 * _BLOCK + k] * c
+                    + here[11 * _BLOCK + k]
+                )
+                out[16 * _BLOCK + k] = (
+                    here[5 * _BLOCK + k] * a
+                    + here[6 * _BLOCK + k] * b
+                    + here[7 * _BLOCK + k] * c
+                    + here[12 * _BLOCK + k]
+                )
+                out[17 * _BLOCK + k] = (
+                    here[8 * _BLOCK + k] * a
+                    + here[9 * _BLOCK + k] * b
+                    + here[10 * _BLOCK + k] * c
+                    + here[13 * _BLOCK + k]
+                )
+            for k in range(_BLOCK):
+                rx, ry, rz = shrunk * rows[k], shrunk * rows[_BLOCK + k], shrunk * rows[2 * _BLOCK + k]
+                # The row in the world's axes, then in the sensor's.
+                ux = rx * target[0, 0] + ry * target[1, 0] + rz * target[2, 0]
+                uy = rx * target[0, 1] + ry * target[1, 1] + rz * target[2, 1]
+                uz = rx * target[0, 2] + ry * target[1, 2] + rz * target[2, 2]
+                value = (
+                    ux * out[15 * _BLOCK + k]
+                    + uy * out[16 * _BLOCK + k]
+                    + uz * out[17 * _BLOCK + k]
+                    - shrunk * rows[3 * _BLOCK + k]
+                )
+                out[14 * _BLOCK + k] = value + rx * tx + ry * ty + rz * tz
+                out[8 * _BLOCK + k], out[9 * _BLOCK + k], out[10 * _BLOCK + k] = rx, ry, rz
+                out[2 * _BLOCK + k] = (
+                    ux * here[2 * _BLOCK + k] + uy * here[5 * _BLOCK + k] + uz * here[8 * _BLOCK + k]
+                )
+                out[3 * _BLOCK + k] = (
+                    ux * here[3 * _BLOCK + k] + uy * here[6 * _BLOCK + k] + uz * here[9 * _BLOCK + k]
+                )
+                out[4 * _BLOCK + k] = (
+                    ux * here[4 * _BLOCK + k] + uy * here[7 * _BLOCK + k] + uz * here[10 * _BLOCK + k]
+                )
+            for k in range(_BLOCK):
+                sx, sy, sz = out[2 * _BLOCK + k], out[3 * _BLOCK + k], out[4 * _BLOCK + k]
+                out[k] = (sx * p00 + sy * p10 + sz * p20) * here[k]
+                out[_BLOCK + k] = (sx * p01 + sy * p11 + sz * p21) * here[_BLOCK + k] - out[
+                    14 * _BLOCK + k
+                ] * by_rows
+            for i in range(3):
+                d = by_probe[i]
+                d00, d01, d10, d11, d20, d21 = d[0, 0], d[0, 1], d[1, 0], d[1, 1], d[2, 0], d[2, 1]
+                for k in range(_BLOCK):
+                    x, y = here[k] * sx_mm, here[_BLOCK + k] * sy_mm
+                    out[(5 + i) * _BLOCK + k] = (
+                        out[2 * _BLOCK + k] * (d00 * x + d01 * y)
+                        + out[3 * _BLOCK + k] * (d10 * x + d11 * y)
+                        + out[4 * _BLOCK + k] * (d20 * x + d21 * y)
+                    )
+                d = by_target[i]
+                e00, e01, e02, e10, e11, e12 = d[0, 0], d[0, 1], d[0, 2], d[1, 0], d[1, 1], d[1, 2]
+                e20, e21, e22 = d[2, 0], d[2, 1], d[2, 2]
+                for k in range(_BLOCK):
+                    wx, wy, wz = out[15 * _BLOCK + k], out[16 * _BLOCK + k], out[17 * _BLOCK + k]
+                    out[(11 + i) * _BLOCK + k] = (
+                        out[8 * _BLOCK + k] * (e00 * wx + e01 * wy + e02 * wz)
+                        + out[9 * _BLOCK + k] * (e10 * wx + e11 * wy + e12 * wz)
+                        + out[10 * _BLOCK + k] * (e20 * wx + e21 * wy + e22 * wz)
+                    )
+            for i in range(free + 1):
+                at = (columns[i] if i < free else 14) * _BLOCK
+                first = out[at : at + _BLOCK]
+                for j in range(i + 1):
+                    at = (columns[j] if j < free else 14) * _BLOCK
+                    second = out[at : at + _BLOCK]
+                    total = 0.0
+                    for k in range(_BLOCK):
+                        total += first[k] * second[k]
+                    normal[i, j] += total
     if known[2] != 0.0:
         for i in range(2):
             value = known[2] * (parameters[i] / known[i] - 1.0)
