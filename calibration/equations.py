@@ -12,9 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from calibration.chain import CHAIN, Chain, ImagePoints, Phantom, canonical
+from calibration.chain import CHAIN, Chain, ImagePoints, Phantom, PixelPrior, canonical
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.kernels.chain import chain_derivatives, chain_residuals, placed_between, turned
+from speckle3d.kernels.chain_fit import fit_chain
+
+_MOST_STEPS = 200
 
 
 class BareChain(NamedTuple):
@@ -40,7 +44,7 @@ class BareChain(NamedTuple):
     @property
     def chain(self) -> Chain:
         """Put the chain together."""
-        probe, target = (RigidTransform.from_matrix(matrix) for matrix in (self.probe, self.target))
+        probe, target = (RigidTransform(matrix, normalize=False) for matrix in (self.probe, self.target))
         return Chain(self.pixel_mm, probe, target)
 
     @property
@@ -143,6 +147,56 @@ class Equations:
             jacobian,
         )
         return values, jacobian
+
+    @staticmethod
+    def known(prior: PixelPrior | None, sigma: float, in_rows: bool) -> FloatArray:
+        """A prior as `fit_chain` takes it, against residuals of standard deviation `sigma`, shape (4,)."""
+        if prior is None:
+            return np.array([1.0, 1.0, 0.0, 0.0])
+        return np.array([*prior.pixel_mm, sigma / prior.error, float(in_rows)])
+
+    def least_squares(
+        self,
+        chain: BareChain,
+        columns: IntArray,
+        weights: FloatArray | None,
+        known: FloatArray,
+        tolerance: float,
+    ) -> tuple[FloatArray, int, bool]:
+        """Parameters of least squares in frames where a chain says that the image and the phantom lie.
+
+        Returns
+        -------
+        parameters : ndarray, shape (14,)
+        steps : int
+        converged : bool
+
+        Raises
+        ------
+        InvalidInputError
+            If there are fewer residuals than parameters, or some are not finite.
+        """
+        count = self.offsets.size + (2 if known[2] else 0)
+        if count < len(columns):
+            raise InvalidInputError(f"expected at least {len(columns)} residuals, got {count}")
+        found = chain.on_image
+        steps, converged = fit_chain(
+            np.stack([chain.probe, chain.target]),
+            self.pixels,
+            self.turns,
+            self.shifts_mm,
+            self.rows,
+            self.offsets,
+            np.ones(self.offsets.shape) if weights is None else weights,
+            columns,
+            known,
+            tolerance,
+            _MOST_STEPS,
+            found,
+        )
+        if steps < 0:
+            raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
+        return found, steps, converged
 
 
 def columns_of(names: tuple[str, ...]) -> IntArray:

@@ -108,8 +108,8 @@ class InadequateError(InsufficientDataError):
         self.solution = solution
 
 
-def require_adequate(solution: ChainSolution) -> ChainSolution:
-    """Return `solution` if its motion was sufficient.
+def require_adequate(solution: ChainSolution, verdict: Adequacy | None = None) -> ChainSolution:
+    """Return `solution` if its motion was sufficient, as `judge` said if it was asked.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def require_adequate(solution: ChainSolution) -> ChainSolution:
         Naming the missing motions, if the answer is too uncertain to be used, or another explains the images
         as well; or if the phantom does not explain the images.
     """
-    found = judge(solution)
+    found = verdict or judge(solution)
     if found.refused:
         raise InadequateError(found.verdict, solution)
     return solution

@@ -26,7 +26,7 @@ from calibration.chain import (
     SeenAs,
     as_directions,
 )
-from calibration.identifiability import judge, require_adequate
+from calibration.identifiability import Adequacy, judge, require_adequate
 from calibration.solver import (
     OUTLIER_SIGMA,
     SOME_FRAMES,
@@ -142,10 +142,10 @@ def calibrate_plane(
     prior = None
     if fit_pixels and pixel_mm is not None and np.isfinite(pixel_error):
         prior = PixelPrior(np.asarray(pixel_mm, dtype=float), pixel_error)
-    solution = _solved(lines, held, prior, stages, probe, outlier_sigma)
+    solution, verdict = _solved(lines, held, prior, stages, probe, outlier_sigma)
     if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
-        solution = _without_prior(lines, solution, stages, outlier_sigma)
-    return facing_up(require_adequate(solution))
+        solution, verdict = _without_prior(lines, solution, stages, outlier_sigma), None
+    return facing_up(require_adequate(solution, verdict))
 
 
 def _solved(
@@ -155,15 +155,17 @@ def _solved(
     stages: Stages,
     probe: tuple[str, ...],
     outlier_sigma: float,
-) -> ChainSolution:
+) -> tuple[ChainSolution, Adequacy | None]:
+    """The best solution, and the verdict on it if it was asked for."""
     given = held if prior is None else prior.pixel_mm
     starts = _one_stage(lines, given) if stages == "one" else _three_stages(lines, given)
     found = best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
-    if given is not None or stages == "one" or not judge(found).refused:
-        return found
+    verdict = None if given is not None or stages == "one" else judge(found)
+    if verdict is None or not verdict.refused:
+        return found, verdict
     # Free pixels may shrink to nothing on the way where the motion is poor.
     also = _three_stages(lines, np.full(2, _PIXEL_MM))
-    return best_solution(lines, Plane(), [found.chain, *also], probe, outlier_sigma)
+    return best_solution(lines, Plane(), [found.chain, *also], probe, outlier_sigma), None
 
 
 def _without_prior(
@@ -176,8 +178,8 @@ def _without_prior(
     InsufficientDataError
         If they do not.
     """
-    alone = _solved(lines, None, None, stages, PROBE, outlier_sigma)
-    verdict = judge(alone)
+    alone, found_so = _solved(lines, None, None, stages, PROBE, outlier_sigma)
+    verdict = found_so or judge(alone)
     if not verdict.refused:
         return alone
     if judge(solution).refused or solution.prior is None:

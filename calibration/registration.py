@@ -116,6 +116,6 @@ def _missed_mm(solution: ChainSolution, blocks: list[BoolArray]) -> FloatArray:
     """Mean distance of the dots of each block from their wires, by the other blocks' calibration."""
     points, phantom, missed = solution.points, solution.phantom, []
     for out in blocks:
-        chain, _ = refined(points[solution.used & ~out], phantom, solution.chain, solution.free)
+        chain = refined(points[solution.used & ~out], phantom, solution.chain, solution.free)
         missed.append(float(np.linalg.norm(residuals_of(points[out], phantom, chain), axis=1).mean()))
     return np.array(missed)

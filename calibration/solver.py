@@ -6,7 +6,6 @@ frames that contradict the others are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +30,6 @@ from speckle3d.core.leastsquares import (
     Fit,
     condition_number,
     huber_weights,
-    levenberg_marquardt,
     robust_sigma,
 )
 
@@ -97,12 +95,12 @@ def solve_chain(
         chain = settled
     if phantom.determined:
         # Where the phantom is, as the readings say on average: what wanders is not in its place.
-        chain, _ = refined(points[used], phantom, chain, phantom.determined)
+        chain = refined(points[used], phantom, chain, phantom.determined)
     noise = replace(noise, covariance=widened(points[used], phantom, chain, free, noise.covariance))
     residuals = residuals_of(points, phantom, chain)
     sigma = sigma_of(residuals[used])
     # Once more from the answer: the covariance holds in the frames where the last refinement began.
-    _, fit = refined(points[used], phantom, chain, free, prior=prior, sigma=sigma)
+    fit = fitted(points[used], phantom, chain, free, prior=prior, sigma=sigma)
     return ChainSolution(
         chain,
         phantom,
@@ -136,7 +134,7 @@ def agreed(
     while True:
         _require_majority(used, points)
         sigma = sigma_of(residuals[used])
-        chain, _ = _refined(equations[used], chain, free, None, _TOLERANCE, prior, sigma, in_rows)
+        chain = _refined(equations[used], chain, free, None, _TOLERANCE, prior, sigma, in_rows)
         residuals = equations.residuals(chain)
         agreeing = _frames_within(residuals, points.frame, outlier_sigma * sigma_of(residuals[used]))
         if round_ >= _FREE_ROUNDS:
@@ -194,7 +192,7 @@ def _first_guess(
             break
         before = size.mean()
         weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
-        chain, _ = _refined(equations, chain, free, weights, tolerance=1e-3)
+        chain = _refined(equations, chain, free, weights, tolerance=1e-3)
     return chain
 
 
@@ -203,22 +201,40 @@ def residuals_of(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatAr
     return Equations.of(points, phantom).residuals(BareChain.of(chain))
 
 
-def refined(
+def refined(points: ImagePoints, phantom: Phantom, chain: Chain, free: tuple[str, ...]) -> Chain:
+    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
+
+    There all angles start at zero: far from where fixed angles become singular, and well scaled.
+    """
+    return _refined(Equations.of(points, phantom), BareChain.of(chain), free).chain
+
+
+def fitted(
     points: ImagePoints,
     phantom: Phantom,
     chain: Chain,
     free: tuple[str, ...],
     prior: PixelPrior | None = None,
     sigma: float = 1.0,
-) -> tuple[Chain, Fit]:
-    """One least-squares solution, in frames that lie where `chain` says the image and the phantom are.
+) -> Fit:
+    """The solution of `refined` with its residuals and derivatives, in the frames where it began.
 
-    There all angles start at zero: far from where fixed angles become singular, and well scaled. The prior's
-    deviations are weighed against residuals of standard deviation `sigma`, and follow them in the fit.
+    The prior's deviations are weighed against residuals of standard deviation `sigma`, and follow them.
     """
-    equations, in_rows = Equations.of(points, phantom), phantom.seen_as == "line"
-    found, fit = _refined(equations, BareChain.of(chain), free, None, _TOLERANCE, prior, sigma, in_rows)
-    return found.chain, fit
+    equations, columns, in_rows = Equations.of(points, phantom), columns_of(free), phantom.seen_as == "line"
+    begun = BareChain.of(chain)
+    known = equations.known(prior, sigma, in_rows)
+    found, steps, converged = equations.least_squares(begun, columns, None, known, _TOLERANCE)
+    values, jacobian = equations.near(begun).derivatives(found, columns)
+    if prior is not None:
+        if in_rows:
+            # Lines err by rows: in millimetres, an image that shrinks to nothing would leave no residual.
+            larger = found[1] / begun.pixel_mm[1]
+            jacobian, values = jacobian / larger, values / larger
+            jacobian[:, free.index("s_y")] -= values / found[1]
+        extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
+        values, jacobian = np.append(values, sigma * prior.deviation(found[:2])), np.vstack([jacobian, extra])
+    return Fit(found[columns], free, values, jacobian, steps, converged)
 
 
 def _refined(
@@ -230,53 +246,11 @@ def _refined(
     prior: PixelPrior | None = None,
     sigma: float = 1.0,
     in_rows: bool = False,
-) -> tuple[BareChain, Fit]:
-    """`refined` on bare arrays, each equation times its weight, shape (n, r)."""
-    near, columns, origin = equations.near(chain), columns_of(free), chain.on_image
-    scale = np.ones(equations.offsets.shape) if weights is None else weights
-
-    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        full = origin.copy()
-        full[columns] = x
-        values, jacobian = near.derivatives(full, columns, scale)
-        if prior is None:
-            return values, jacobian
-        if in_rows:
-            # Lines err by rows: in millimetres, an image that shrinks to nothing would leave no residual.
-            larger = full[1] / origin[1]
-            jacobian, values = jacobian / larger, values / larger
-            jacobian[:, free.index("s_y")] -= values / full[1]
-        extra = (columns == np.arange(2)[:, None]) * sigma / (prior.error * prior.pixel_mm[:, None])
-        return np.append(values, sigma * prior.deviation(full[:2])), np.vstack([jacobian, extra])
-
-    both = _Remembered(at)
-    fit = levenberg_marquardt(both.values, origin[columns], both.jacobian, free, tolerance=tolerance)
-    found = origin.copy()
-    found[columns] = fit.parameters
-    return chain.moved_to(found), fit
-
-
-class _Remembered:
-    """Residuals and derivatives at the last two places: MINPACK asks for one, then for the other."""
-
-    def __init__(self, at: Callable[[FloatArray], tuple[FloatArray, FloatArray]]) -> None:
-        self._at = at
-        self._places: list[tuple[bytes, tuple[FloatArray, FloatArray]]] = []
-
-    def _look(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        key = x.tobytes()
-        for place, both in self._places:
-            if place == key:
-                return both
-        both = self._at(x)
-        self._places = [(key, both), *self._places[:1]]
-        return both
-
-    def values(self, x: FloatArray) -> FloatArray:
-        return self._look(x)[0].copy()
-
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        return self._look(x)[1].copy()
+) -> BareChain:
+    """The answer of `refined` on bare arrays, each equation times its weight, shape (n, r)."""
+    known = equations.known(prior, sigma, in_rows)
+    found, _, _ = equations.least_squares(chain, columns_of(free), weights, known, tolerance)
+    return chain.moved_to(found)
 
 
 def _frames_within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:

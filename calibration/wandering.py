@@ -22,7 +22,6 @@ from calibration.chain import SCALES, Chain, ImagePoints, Phantom, PixelPrior
 from calibration.near import moved_by, near_jacobian
 from calibration.wander import JITTER, SensorError, WanderingFit, attributed, wandering_fit
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.geometry import skew
 
 _STEPS = 3
 """The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
@@ -108,14 +107,14 @@ def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorE
     nearly level.
     """
     rows, _ = phantom.vanishing(points)
-    in_world = rows @ chain.target_from_world.rotation.as_matrix()
+    in_world = (rows.reshape(-1, 3) @ chain.target_from_world.as_matrix()[:3, :3]).reshape(rows.shape)
     flat = np.column_stack([points.pixels * chain.pixel_mm, np.zeros(len(points))])
     if phantom.seen_as == "direction":
         along = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.rotation.apply(flat))
-        turned = in_world @ -skew(along)
+        turned = np.cross(along[:, None], in_world)
         return SensorError(turned.reshape(-1, 3)[:, :2], (np.ones(2),))
     arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
-    both = np.concatenate([in_world @ -skew(arm), in_world], axis=2)
+    both = np.concatenate([np.cross(arm[:, None], in_world), in_world], axis=2)
     return SensorError(both.reshape(-1, 6), [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in _PROPORTIONS_MM])
 
 
@@ -134,13 +133,12 @@ def _corrected(
     several = rows.shape[1]
     error = np.zeros((len(points), 6))
     error[:, : sensor.shape[1]] = sensor[::several]
-    shift, turn = points.world_from_sensor.as_components()
-    poses = RigidTransform.from_components(shift - error[:, 3:], Rotation.from_rotvec(-error[:, :3]) * turn)
-    in_image = (
-        rows
-        @ (chain.target_from_world.rotation.as_matrix() @ points.turns)
-        @ (chain.sensor_from_image.rotation.as_matrix()[:, :2])
-    )
+    moved = points.world_from_sensor.as_matrix()
+    moved[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
+    moved[:, :3, 3] -= error[:, 3:]
+    poses = RigidTransform(moved, normalize=False)
+    in_world = (rows.reshape(-1, 3) @ chain.target_from_world.as_matrix()[:3, :3]).reshape(rows.shape)
+    in_image = in_world @ points.turns @ chain.sensor_from_image.as_matrix()[:3, :2]
     # The smallest displacement in the image, mm, that explains what is left to it.
     if several == 1:  # a batch of pseudo-inverses takes as long as all else
         square = np.maximum(np.sum(in_image**2, axis=2), np.finfo(float).tiny)

@@ -9,7 +9,6 @@ ends elsewhere, that is part of the claim.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,7 +114,7 @@ def certainty(
     angulation: Angulation,
     unit: float,
     tracker: tuple[float, float],
-    pool: ThreadPoolExecutor | None = None,
+    share: bool = False,
 ) -> Certainty:
     """Covariance of an answer from the similarity's curvature, and from three kinds of errors.
 
@@ -145,8 +144,8 @@ def certainty(
     base = about_pivot(refined.pivot_mm)[:, chosen]
     slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
     wide = unit * (WIDE_MM if len(chosen) == len(PARAMETERS) else NARROW_MM)
-    bends = _bends(refined, _steps(angulation, wide, unit), base, pool)
-    pulls, stiffness = _pulls(refined, wide, base, pool)
+    bends = _bends(refined, _steps(angulation, wide, unit), base, share)
+    pulls, stiffness = _pulls(refined, wide, base, share)
     curvature = positive(bends.sum(axis=0), refined.system[0], _LEAST_CURVATURE)
     norms = np.sqrt(np.diag(curvature))
     values, vectors = np.linalg.eigh(curvature / np.outer(norms, norms))
@@ -157,7 +156,7 @@ def certainty(
     wander = moved @ _wandering(refined, pulls, np.repeat(np.square(tracker), 3)) @ moved.T
     covariance = base @ (tissue + poses + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
-    covariance[:6, :6] += _scatter(refined, restarted, unit, pool)
+    covariance[:6, :6] += _scatter(refined, restarted, unit, share)
     return Certainty(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]], stiffness)
 
 
@@ -198,7 +197,7 @@ def require_one_answer(
     found: Estimate,
     rivals: list[Estimate],
     centre_mm: FloatArray,
-    pool: ThreadPoolExecutor | None = None,
+    share: bool = False,
 ) -> None:
     """Refuse an answer if another that the search found, far from it, is as good for all that is known.
 
@@ -207,12 +206,12 @@ def require_one_answer(
     InsufficientDataError
         Saying how far off the other is.
     """
-    here = comparison.at(found, pool=pool)
+    here = comparison.at(found, share=share)
     for rival in rivals:
         apart = apart_mm(rival, found, centre_mm)
         if apart < RIVAL_MM:
             continue
-        there = comparison.at(rival, pool=pool)
+        there = comparison.at(rival, share=share)
         if there.score < LEAST_SIMILARITY:
             continue
         both = here.valid & there.valid
@@ -228,15 +227,13 @@ def require_one_answer(
             )
 
 
-def _scatter(
-    refined: Refined, restarted: Comparison, unit: float, pool: ThreadPoolExecutor | None
-) -> FloatArray:
+def _scatter(refined: Refined, restarted: Comparison, unit: float, share: bool) -> FloatArray:
     """Covariance of where fits end that start beside the answer on all sides, shape (6, 6)."""
     beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * unit], 3)
     ends = []
     for side in np.concatenate([_SIDES, -_SIDES]):
         start = refined.estimate.stepped(np.append(side * beside, [0.0, 0.0]), refined.pivot_mm)
-        end = refine(restarted, start, max_steps=_RESTART_STEPS, pool=pool).estimate
+        end = refine(restarted, start, max_steps=_RESTART_STEPS, share=share).estimate
         away = refined.estimate.sensor_from_image.inv() * end.sensor_from_image
         ends.append(np.append(away.rotation.as_rotvec(), away.translation))
     return np.cov(ends, rowvar=False)
@@ -251,23 +248,19 @@ def _steps(angulation: Angulation, wide_mm: float, unit: float) -> FloatArray:
     return np.asarray(np.minimum(wide_mm / np.maximum(shows, 1e-6), farthest))
 
 
-def _bends(
-    refined: Refined, steps: FloatArray, base: FloatArray, pool: ThreadPoolExecutor | None
-) -> FloatArray:
+def _bends(refined: Refined, steps: FloatArray, base: FloatArray, share: bool) -> FloatArray:
     """Curvature of each patch's weighted correlation, by differences of its slopes, shape (p, f, f)."""
     columns = []
     for parameter in refined.free:
         step = np.zeros(len(LEVERS_MM))
         step[parameter] = steps[parameter]
         places = (refined.estimate.stepped(sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
-        seen = [refined.comparison.at(place, True, pool) for place in places]
+        seen = [refined.comparison.at(place, True, share) for place in places]
         columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
     return np.stack(columns, axis=2)
 
 
-def _pulls(
-    refined: Refined, step_mm: float, base: FloatArray, pool: ThreadPoolExecutor | None
-) -> tuple[FloatArray, FloatArray]:
+def _pulls(refined: Refined, step_mm: float, base: FloatArray, share: bool) -> tuple[FloatArray, FloatArray]:
     """How each patch's slopes change as the second sweep is displaced, and the stiffness against it.
 
     Displacements are along the world's axes: shapes (p, f, 3) and (3,); the latter along the axes of the
@@ -281,7 +274,7 @@ def _pulls(
         for sign in (-1.0, 1.0):
             world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
             moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
-            seen.append(moved.at(refined.estimate, True, pool))
+            seen.append(moved.at(refined.estimate, True, share))
         columns.append(_fallen(refined, seen) @ base / (2.0 * step_mm))
         there = _throughout(refined, seen)
         fall = refined.similarity.alike - 0.5 * (seen[0].alike + seen[1].alike)

@@ -11,7 +11,6 @@ steps too short. Differences of the exact slopes are free of that, so they give 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,7 +89,7 @@ def refine(
     start: Estimate,
     free: tuple[int, ...] = (0, 1, 2, 3, 4, 5),
     max_steps: int = MAX_STEPS,
-    pool: ThreadPoolExecutor | None = None,
+    share: bool = False,
 ) -> Refined:
     """Levenberg-Marquardt steps until they are too small to matter."""
     pivot = comparison.stacks[0].centre_mm
@@ -98,7 +97,7 @@ def refine(
     chosen = np.array(free)
 
     def look(estimate: Estimate) -> Similarity:
-        return comparison.at(estimate, True, pool)
+        return comparison.at(estimate, True, share)
 
     estimate, here = start, look(start)
     weight = weights(here)
@@ -160,9 +159,9 @@ def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     return bool(base @ loss[1] < base @ loss[0])
 
 
-def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> tuple[Refined, FloatArray]:
+def settle(refined: Refined, share: bool = False) -> tuple[Refined, FloatArray]:
     """Take Newton steps from where Gauss-Newton stopped, all with the curvature there; return that, too."""
-    bend = curvature(refined, pool)
+    bend = curvature(refined, share)
     now, converged = refined, False
     for _ in range(_MOST_STEPS):
         step = np.zeros(len(LEVERS_MM))
@@ -174,7 +173,7 @@ def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> tuple[Re
             converged = float(np.abs(step * LEVERS_MM).max()) < SETTLED
             if converged:
                 break
-            moved = _stepped(now, step, pool)
+            moved = _stepped(now, step, share)
             if better(now.similarity, moved.similarity, now.weight):
                 break
             step /= 4.0
@@ -187,7 +186,7 @@ def settle(refined: Refined, pool: ThreadPoolExecutor | None = None) -> tuple[Re
     return replace(now, converged=converged), bend
 
 
-def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> FloatArray:
+def curvature(refined: Refined, share: bool = False) -> FloatArray:
     """Curvature of the similarity by central differences of its exact slope, shape (f, f)."""
     chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
     found = np.empty((len(chosen), len(chosen)))
@@ -197,16 +196,16 @@ def curvature(refined: Refined, pool: ThreadPoolExecutor | None = None) -> Float
             step = np.zeros(len(LEVERS_MM))
             step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
             there = refined.estimate.stepped(step, refined.pivot_mm)
-            seen = refined.comparison.at(there, True, pool)
+            seen = refined.comparison.at(there, True, share)
             weight = np.where(seen.valid, refined.weight, 0.0)
             slopes.append((base.T @ (weight @ seen.gradient))[chosen])
         found[:, column] = (slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM)
     return positive(found, refined.system[0])
 
 
-def _stepped(refined: Refined, step: FloatArray, pool: ThreadPoolExecutor | None) -> Refined:
+def _stepped(refined: Refined, step: FloatArray, share: bool) -> Refined:
     estimate = refined.estimate.stepped(step, refined.pivot_mm)
-    seen = refined.comparison.at(estimate, True, pool)
+    seen = refined.comparison.at(estimate, True, share)
     count = refined.evaluations + 1
     return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)
 

@@ -9,7 +9,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,6 +23,7 @@ from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration, Imp
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
+from speckle3d.core.threads import ahead
 from speckle3d.imaging.images import ChosenImages
 from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
 
@@ -133,7 +133,7 @@ def figure_of(
 
 
 def similarities(
-    comparison: Comparison, about: Estimate, names: tuple[str, ...], offset: FloatArray, threads: int = 2
+    comparison: Comparison, about: Estimate, names: tuple[str, ...], offset: FloatArray
 ) -> FloatArray:
     """Mean correlation of images with cuts of the other sweep, with some of `PARAMETERS` moved at once.
 
@@ -155,8 +155,7 @@ def similarities(
     def at(step: FloatArray) -> float:
         return comparison.at(incremented(about, step)).mean
 
-    with ThreadPoolExecutor(threads) as pool:
-        return np.reshape(list(pool.map(at, steps.reshape(-1, 6))), steps.shape[:-1])
+    return np.reshape(list(ahead(at, steps.reshape(-1, 6))), steps.shape[:-1])
 
 
 def cut_of(

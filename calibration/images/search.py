@@ -11,7 +11,6 @@ References
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,6 +23,7 @@ from calibration.images.fit import Refined, refine
 from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.threads import ahead
 
 GLANCE = Level(4.0, images=6, side=5, overlap=0.0, least_weight=0.45)
 FOLLOWED = Level(3.0, images=8, side=5, least_weight=0.45)
@@ -61,7 +61,6 @@ def search(
     start: Estimate,
     capture_mm: float,
     capture_rad: float,
-    pool: ThreadPoolExecutor,
     progress: Progress | None = None,
 ) -> tuple[list[Estimate], int]:
     """Search a box of six parameters about the start, from coarse to fine.
@@ -78,9 +77,7 @@ def search(
     InsufficientDataError
         If the sweeps show nothing in common anywhere.
     """
-    box = _Box(
-        crossing, start, capture_mm, capture_rad, pool, progress or (lambda _stage, _done, _total: None)
-    )
+    box = _Box(crossing, start, capture_mm, capture_rad, progress or (lambda _stage, _done, _total: None))
     looks, followed = 0, []
     for glances in (_GLANCES, _MORE_GLANCES):
         looks += glances
@@ -109,7 +106,6 @@ def climb(
     crossing: CrossingSweeps,
     start: Estimate,
     scales: bool,
-    pool: ThreadPoolExecutor,
     progress: Progress | None = None,
 ) -> tuple[Estimate, int, bool]:
     """Maximise the mean correlation by Nelder-Mead over increments of the start (`incremented`).
@@ -127,7 +123,7 @@ def climb(
         count += 1
         if progress:
             progress("simplex", count, MAX_EVALUATIONS)
-        mean = comparison.at(incremented(start, increment), pool=pool).mean
+        mean = comparison.at(incremented(start, increment), share=True).mean
         return 1.0 - mean if np.isfinite(mean) else 2.0
 
     size = 8 if scales else 6
@@ -157,7 +153,6 @@ class _Box:
     start: Estimate
     mm: float
     rad: float
-    pool: ThreadPoolExecutor
     say: Progress
 
     def best_of(self, count: int) -> list[Estimate]:
@@ -165,7 +160,7 @@ class _Box:
         places = self._spread(self.start, 1.0, count)
         glance = self.crossing.level(GLANCE, self.start.sensor_from_image)
         scores = np.empty(len(places))
-        for n, score in enumerate(self.pool.map(partial(_score, glance), places)):
+        for n, score in enumerate(ahead(partial(_score, glance), places)):
             scores[n] = score
             self.say("looking around", n + 1, len(places))
         most = _FOLLOWED if count == _GLANCES else 2 * _FOLLOWED
@@ -177,7 +172,7 @@ class _Box:
         for number, one in enumerate(about):
             comparison = self.crossing.level(FOLLOWED, one.estimate.sensor_from_image)
             places = self._spread(one.estimate, 0.5, _BESIDE)
-            scores = np.array(list(self.pool.map(partial(_score, comparison), places)))
+            scores = np.array(list(ahead(partial(_score, comparison), places)))
             chosen = np.argsort(-scores)[: _FOLLOWED // len(about)]
             best += [places[int(n)] for n in chosen if scores[n] > -1]
             self.say("looking beside", number + 1, len(about))
@@ -189,7 +184,7 @@ class _Box:
             return []
         comparison = self.crossing.level(level, starts[0].sensor_from_image)
         done = []
-        for one in self.pool.map(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
+        for one in ahead(lambda start: refine(comparison, start, max_steps=_STEPS), starts):
             done.append(one)
             self.say(stage, len(done), len(starts))
         return sorted(done, key=lambda one: -one.similarity.score)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -16,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, TrackedImages, read_stack
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.threads import ahead
 from speckle3d.kernels.slicing import PARAMETERS, PatchGrid, PatchScores, PlacedImages, compare_patches
 
 Progress = Callable[[str, int, int], None]
@@ -105,11 +105,9 @@ class Comparison:
     sources: tuple[Stack, Stack] | None = None
     least_share: float = LEAST_SHARE
 
-    def at(
-        self, estimate: Estimate, derivatives: bool = False, pool: ThreadPoolExecutor | None = None
-    ) -> Similarity:
-        """Compare at a calibration."""
-        run = pool.map if pool else map
+    def at(self, estimate: Estimate, derivatives: bool = False, share: bool = False) -> Similarity:
+        """Compare at a calibration; shared out to the cores if there is nothing else to be done."""
+        run = ahead if share else map
         parts = list(run(lambda way: self._one_way(way, estimate, derivatives), (0, 1)))
         return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 

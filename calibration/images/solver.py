@@ -11,7 +11,7 @@ References
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -33,6 +33,7 @@ from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, 
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.threads import on_one_thread
 
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
 """Resolutions at which the search's answer is refined. The last is still coarser than speckle; there many
@@ -64,6 +65,7 @@ class ImageSettings(BaseModel):
         Standard deviations, on each axis, of what the tracker displaces and turns one sweep against the
         other by. No comparison of the images shows it; it is part of the claimed errors.
     threads : int
+        One: on the calling thread alone. More: on all cores that this process may use.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -185,34 +187,34 @@ def calibrate_from_sweeps(
     chosen = settings or ImageSettings()
     first = found = Estimate(start, np.ones(2))
     free, looks, rivals = tuple(range(8 if chosen.scales else 6)), 0, list[Estimate]()
-    with ThreadPoolExecutor(chosen.threads) as pool:
+    with on_one_thread() if chosen.threads == 1 else nullcontext():
         if chosen.method == "nelder-mead":
-            found, looks, converged = climb(crossing, first, chosen.scales, pool, progress)
+            found, looks, converged = climb(crossing, first, chosen.scales, progress)
             # The simplex knows no derivatives; the covariance needs them.
             comparison = crossing.level(FINE[-1], found.sensor_from_image)
-            refined = refine(comparison, found, free, max_steps=1, pool=pool)
-            alike = _require_alike(crossing, found, pool)
+            refined = refine(comparison, found, free, max_steps=1, share=True)
+            alike = _require_alike(crossing, found)
         else:
             if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
                 reach = float(np.deg2rad(chosen.capture_deg))
-                (found, *rivals), looks = search(crossing, first, chosen.capture_mm, reach, pool, progress)
+                (found, *rivals), looks = search(crossing, first, chosen.capture_mm, reach, progress)
             for number, level in enumerate(FINE):
-                refined = refine(crossing.level(level, found.sensor_from_image), found, free, pool=pool)
+                refined = refine(crossing.level(level, found.sensor_from_image), found, free, share=True)
                 found, looks = refined.estimate, looks + refined.evaluations
                 if progress:
                     progress("refining", number + 1, len(FINE))
-            alike = _require_alike(crossing, found, pool)
-            refined, _ = settle(refined, pool)
+            alike = _require_alike(crossing, found)
+            refined, _ = settle(refined, share=True)
             found, converged = refined.estimate, refined.converged
         near = found.sensor_from_image
         angles = _angulation(crossing, near)
         angles.require()
         tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
         restarted = crossing.level(RESTARTED, near)
-        known = certainty(refined, restarted, angles, crossing.unit, tracker, pool)
+        known = certainty(refined, restarted, angles, crossing.unit, tracker, share=True)
         if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
             require_known(known, angles, crossing.centre_mm)
-        require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, pool)
+        require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, share=True)
     covariance = known.covariance
     return ImageCalibration(
         settings=chosen,
@@ -240,10 +242,10 @@ def _angulation(crossing: CrossingSweeps, sensor_from_image: RigidTransform) -> 
     return angulation(*poses, sensor_from_image, first.corners_mm)
 
 
-def _require_alike(crossing: CrossingSweeps, found: Estimate, pool: ThreadPoolExecutor) -> float:
+def _require_alike(crossing: CrossingSweeps, found: Estimate) -> float:
     """Score of the sweeps at an answer, with speckle blurred away; refuse one below `LEAST_SIMILARITY`."""
     seen = crossing.level(DECIDED, found.sensor_from_image)
-    score = seen.at(found, pool=pool).score
+    score = seen.at(found, share=True).score
     if score < LEAST_SIMILARITY:
         got = "no overlap" if score < 0 else f"{score:.2f} at best"
         raise InsufficientDataError(

@@ -19,6 +19,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.images import Images, PosedImages
 
 BASE_PIXEL_MM = 0.35
@@ -122,15 +123,23 @@ class Stack:
             millimetre at a blur of 2 mm with a share of a half.
         """
         sigma = np.append(0.0, sigma_mm / self.pixels[:2])
-        there = np.isfinite(self.images)
-        grey = gaussian_filter(
-            np.where(there, self.images, np.float32(0.0)), sigma, mode="constant", truncate=3.0
-        )
-        weight = gaussian_filter(there.astype(np.float32), sigma, mode="constant", truncate=3.0)
-        level = np.where(there & (weight > least_weight), grey / np.maximum(weight, np.float32(1e-6)), np.nan)
         steps = np.maximum(1, np.floor(sigma[1:] / _PIXELS_PER_BLUR + 1e-6)).astype(int)
+        few = np.empty_like(self.images[:, :: steps[0], :: steps[1]], order="C")
+
+        def some(first: int, stop: int) -> None:
+            images = self.images[first:stop]
+            there = np.isfinite(images)
+            filled = np.where(there, images, np.float32(0.0))
+            grey, weight = (
+                gaussian_filter(one, sigma, mode="constant", truncate=3.0)
+                for one in (filled, there.astype(np.float32))
+            )
+            grey /= np.maximum(weight, np.float32(1e-6))
+            grey[~there | (weight <= least_weight)] = np.nan
+            few[first:stop] = grey[:, :: steps[0], :: steps[1]]
+
+        in_parallel(some, len(self), grain=8)
         pixels = np.concatenate([self.pixels[:2] * steps, self.pixels[2:]])
-        few = np.ascontiguousarray(level[:, :: steps[0], :: steps[1]], dtype=np.float32)
         return replace(self, images=few, pixels=pixels)
 
     def travelled(self, sensor_from_image: RigidTransform) -> FloatArray:

@@ -13,7 +13,7 @@ PARAMETERS = 14
 _SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def turned(angles: FloatArray, rotation: FloatArray, derivatives: FloatArray) -> None:
     """Fill the rotation by fixed angles, Rz(a) Ry(b) Rx(c), and its derivatives by each, shape (3, 3, 3)."""
     ca, sa = math.cos(angles[0]), math.sin(angles[0])

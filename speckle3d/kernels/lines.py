@@ -10,7 +10,7 @@ from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 _ROUNDS = 20
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def filter_columns(
     samples: Float32Array, spans: IntArray, middle: float, taps: Float32Array, sign: float, out: Float32Array
 ) -> None:
@@ -49,7 +49,7 @@ def filter_columns(
                 line[j] += weight * (below[j] + turned * above[j])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="python", fastmath=False)
 def echo_levels(
     response: Float32Array,
     levels: Float32Array,
@@ -83,7 +83,7 @@ def echo_levels(
                 out[c, j] = max(levels[c, j : min(j + ahead, last) + 1].max() - dark, 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def first_edges(
     response: Float32Array,
     score: Float32Array,
@@ -125,7 +125,7 @@ def first_edges(
             rows[c] = j + 0.5 * (line[j - 1] - line[j + 1]) / bend
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def echo_fronts(
     levels: Float32Array,
     spans: IntArray,
@@ -172,7 +172,7 @@ def echo_fronts(
             fronts[c] = top + k - (profile[k] - half) / (profile[k] - profile[k - 1])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="python", fastmath=False)
 def agreeing(
     column: FloatArray,
     row: FloatArray,
@@ -214,7 +214,7 @@ def agreeing(
     return agreed, possible, squares
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="python", fastmath=False)
 def best_pair(
     column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float, agree: BoolArray
 ) -> tuple[float, float]:
@@ -242,7 +242,7 @@ def best_pair(
     return best_start, best_slope
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="python", fastmath=False)
 def consensus_line(
     column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float, agree: BoolArray
 ) -> tuple[int, float, float]:

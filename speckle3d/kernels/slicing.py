@@ -84,7 +84,7 @@ class PatchScores(NamedTuple):
     gradient: FloatArray
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
 def bilinear(image, u, v):  # type: ignore[no-untyped-def]
     """Grey level at a point of the image and its change with either coordinate; NaN beside a NaN."""
     # In an image one pixel wide the lower neighbour is number -1, which is that pixel too.
@@ -98,7 +98,7 @@ def bilinear(image, u, v):  # type: ignore[no-untyped-def]
     return near + a * (far - near), far - near, right - left
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
 def _clip(first: float, last: float, start: float, step: float, low: float, high: float):  # type: ignore[no-untyped-def]
     """Shrink [first, last] to where ``low <= start + step * k <= high``, rounding aside."""
     if abs(step) < 1e-12:
@@ -110,7 +110,7 @@ def _clip(first: float, last: float, start: float, step: float, low: float, high
 
 # One thread: an image takes a fraction of a millisecond, and a team of threads gathered anew for each image
 # waits far longer than that as soon as another process wants a core.
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def keep_nearest(
     image: Float32Array,
     index_from_pixel: FloatArray,
@@ -353,7 +353,7 @@ def _cut_patch(
 
 
 # Inlined, which costs no time; a function of its own for the images beside a point took 40 % more.
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
 def _fill_rows(
     poses: FloatArray,
     frame: IntArray,

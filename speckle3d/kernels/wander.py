@@ -7,7 +7,7 @@ from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
 
-LANES = 32
+LANES = 56
 """Points of the grid that pass through the recording together."""
 
 COMPONENTS = 6
@@ -52,57 +52,49 @@ def innovations(
     log_determinant : ndarray, shape (blocks, LANES)
         Filled.
     """
-    wide, lanes = columns.shape[1], kept.shape[2]
+    wide, frames = columns.shape[1], starts.shape[0] - 1
     rows = 1
-    for frame in range(starts.shape[0] - 1):
+    for frame in range(frames):
         rows = max(rows, starts[frame + 1] - starts[frame])
-    variance = np.empty((COMPONENTS, COMPONENTS, lanes))
-    expected = np.empty((COMPONENTS, wide, lanes))
-    white = np.empty((rows, wide, lanes))
-    gain = np.empty((rows, COMPONENTS, lanes))
-    root = np.empty((rows, rows, lanes))
-    product = np.empty(lanes)
+    variance = np.empty((COMPONENTS, COMPONENTS, LANES))
+    expected = np.empty((COMPONENTS, wide, LANES))
+    white = np.empty((rows + 1, wide, LANES))
+    gain = np.empty((rows + 1, COMPONENTS, LANES))
+    root = np.empty((rows, rows, LANES))
+    product, all_kept = np.empty(LANES), np.ones(LANES)
     for block in range(first, stop):
+        # Before the first frame the error is as it is at any time.
         variance[:] = 0.0
+        for i in range(COMPONENTS):
+            for lane in range(LANES):
+                variance[i, i, lane] = stationary[block, i, lane]
         expected[:] = 0.0
         normal[block] = 0.0
         log_determinant[block] = 0.0
         product[:] = 1.0
-        for i in range(COMPONENTS):
-            for lane in range(lanes):
-                variance[i, i, lane] = stationary[block, i, lane]
-        for frame in range(starts.shape[0] - 1):
+        for frame in range(frames):
             start = starts[frame]
-            _predict(variance, expected, kept[block, frame], stationary[block])
             n = starts[frame + 1] - start
             _decompose(effects[start : start + n], variance, shaken[block], root, gain, product)
             _whiten(columns[start : start + n], effects[start : start + n], expected, root, white)
-            _correct(n, white, gain, expected, variance, normal[block])
-            for lane in range(lanes):
+            # Rows are used two at a time, for time: a last one without a partner gets one of zeros.
+            gain[n] = 0.0
+            white[n] = 0.0
+            for a in range(0, n, 2):
+                last = a + 2 >= n and frame + 1 < frames
+                left = kept[block, frame + 1] if last else all_kept
+                _correct(white[a : a + 2], gain[a : a + 2], left, stationary[block], expected, variance)
+                _multiply(white[a : a + 2], normal[block])
+            for lane in range(LANES):
                 if product[lane] > _LARGE:
                     log_determinant[block, lane] += math.log(product[lane])
                     product[lane] = 1.0
-        for lane in range(lanes):
+        for lane in range(LANES):
             log_determinant[block, lane] += math.log(product[lane])
         for c in range(wide):
             for d in range(c):
-                for lane in range(lanes):
+                for lane in range(LANES):
                     normal[block, d, c, lane] = normal[block, c, d, lane]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
-def _predict(variance: FloatArray, expected: FloatArray, kept: FloatArray, stationary: FloatArray) -> None:
-    """Let the error wander from one frame to the next."""
-    lanes = kept.shape[0]
-    for i in range(COMPONENTS):
-        for j in range(COMPONENTS):
-            for lane in range(lanes):
-                variance[i, j, lane] *= kept[lane] * kept[lane]
-        for lane in range(lanes):
-            variance[i, i, lane] += (1.0 - kept[lane] * kept[lane]) * stationary[i, lane]
-        for c in range(expected.shape[1]):
-            for lane in range(lanes):
-                expected[i, c, lane] *= kept[lane]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
@@ -115,23 +107,22 @@ def _decompose(
     product: FloatArray,
 ) -> None:
     """Root of the rows' covariance (Cholesky), its determinant, and its inverse times the rows' gain."""
-    lanes = product.shape[0]
     for a in range(effects.shape[0]):
         e0, e1, e2, e3, e4, e5 = effects[a]
         for i in range(COMPONENTS):
-            for lane in range(lanes):
+            for lane in range(LANES):
                 gain[a, i, lane] = (
-                    e0 * variance[0, i, lane]
-                    + e1 * variance[1, i, lane]
-                    + e2 * variance[2, i, lane]
-                    + e3 * variance[3, i, lane]
-                    + e4 * variance[4, i, lane]
-                    + e5 * variance[5, i, lane]
+                    e0 * variance[max(i, 0), min(i, 0), lane]
+                    + e1 * variance[max(i, 1), min(i, 1), lane]
+                    + e2 * variance[max(i, 2), min(i, 2), lane]
+                    + e3 * variance[max(i, 3), min(i, 3), lane]
+                    + e4 * variance[max(i, 4), min(i, 4), lane]
+                    + e5 * variance[max(i, 5), min(i, 5), lane]
                 )
         for b in range(a + 1):
             f0, f1, f2, f3, f4, f5 = effects[b]
             own = 1.0 if a == b else 0.0
-            for lane in range(lanes):
+            for lane in range(LANES):
                 root[a, b, lane] = (
                     own
                     + f0 * (gain[a, 0, lane] + e0 * shaken[0, lane])
@@ -144,19 +135,19 @@ def _decompose(
     for a in range(effects.shape[0]):
         for b in range(a):
             for k in range(b):
-                for lane in range(lanes):
+                for lane in range(LANES):
                     root[a, b, lane] -= root[a, k, lane] * root[b, k, lane]
-            for lane in range(lanes):
+            for lane in range(LANES):
                 root[a, b, lane] *= root[b, b, lane]  # whose inverse is kept
                 root[a, a, lane] -= root[a, b, lane] * root[a, b, lane]
-        for lane in range(lanes):
+        for lane in range(LANES):
             product[lane] *= root[a, a, lane]
             root[a, a, lane] = 1.0 / math.sqrt(root[a, a, lane])
         for i in range(COMPONENTS):
             for b in range(a):
-                for lane in range(lanes):
+                for lane in range(LANES):
                     gain[a, i, lane] -= root[a, b, lane] * gain[b, i, lane]
-            for lane in range(lanes):
+            for lane in range(LANES):
                 gain[a, i, lane] *= root[a, a, lane]
 
 
@@ -165,12 +156,11 @@ def _whiten(
     columns: FloatArray, effects: FloatArray, expected: FloatArray, root: FloatArray, white: FloatArray
 ) -> None:
     """The root's inverse times what the columns have beyond what was expected."""
-    lanes = white.shape[2]
     for a in range(columns.shape[0]):
         e0, e1, e2, e3, e4, e5 = effects[a]
         for c in range(columns.shape[1]):
             value = columns[a, c]
-            for lane in range(lanes):
+            for lane in range(LANES):
                 white[a, c, lane] = (
                     value
                     - e0 * expected[0, c, lane]
@@ -181,35 +171,50 @@ def _whiten(
                     - e5 * expected[5, c, lane]
                 )
             for b in range(a):
-                for lane in range(lanes):
+                for lane in range(LANES):
                     white[a, c, lane] -= root[a, b, lane] * white[b, c, lane]
-            for lane in range(lanes):
+            for lane in range(LANES):
                 white[a, c, lane] *= root[a, a, lane]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
 def _correct(
-    n: int,
     white: FloatArray,
     gain: FloatArray,
+    kept: FloatArray,
+    stationary: FloatArray,
     expected: FloatArray,
     variance: FloatArray,
-    normal: FloatArray,
 ) -> None:
-    """Correct the error by `n` whitened rows, and add their products to those so far."""
-    wide, lanes = expected.shape[1], white.shape[2]
-    for a in range(n):
-        for i in range(COMPONENTS):
-            for c in range(wide):
-                for lane in range(lanes):
-                    expected[i, c, lane] += gain[a, i, lane] * white[a, c, lane]
-            for j in range(COMPONENTS):
-                for lane in range(lanes):
-                    variance[i, j, lane] -= gain[a, i, lane] * gain[a, j, lane]
-        for c in range(wide):
-            for d in range(c + 1):
-                for lane in range(lanes):
-                    normal[c, d, lane] += white[a, c, lane] * white[a, d, lane]
+    """Correct the error by two whitened rows, and let it wander until only a share of it is left."""
+    for i in range(COMPONENTS):
+        for c in range(expected.shape[1]):
+            for lane in range(LANES):
+                expected[i, c, lane] = kept[lane] * (
+                    expected[i, c, lane]
+                    + gain[0, i, lane] * white[0, c, lane]
+                    + gain[1, i, lane] * white[1, c, lane]
+                )
+        for j in range(i + 1):
+            for lane in range(LANES):
+                variance[i, j, lane] = (kept[lane] * kept[lane]) * (
+                    variance[i, j, lane]
+                    - gain[0, i, lane] * gain[0, j, lane]
+                    - gain[1, i, lane] * gain[1, j, lane]
+                )
+        for lane in range(LANES):
+            variance[i, i, lane] += (1.0 - kept[lane] * kept[lane]) * stationary[i, lane]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _multiply(white: FloatArray, normal: FloatArray) -> None:
+    """Add the products of the columns of two whitened rows to those so far, below the diagonal."""
+    for c in range(white.shape[1]):
+        for d in range(c + 1):
+            for lane in range(LANES):
+                normal[c, d, lane] += (
+                    white[0, c, lane] * white[0, d, lane] + white[1, c, lane] * white[1, d, lane]
+                )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)

@@ -49,7 +49,7 @@ def by_us(lines: ImagePoints, start: Chain) -> ChainSolution:
 
 def by_us_once(lines: ImagePoints, start: Chain) -> Chain:
     """The same least squares as SciPy's, nothing else: analytic derivatives, frames on image and plane."""
-    return refined(lines, Plane(), start, FREE)[0]
+    return refined(lines, Plane(), start, FREE)
 
 
 def median_seconds(function, *arguments, runs: int) -> float:
