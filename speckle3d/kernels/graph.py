@@ -15,6 +15,7 @@ from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
 
+# Assigning whole rows would make numba compile the texts of NumPy's errors, for two seconds.
 _FAST = {"reassoc", "contract", "arcp"}
 _RIDGE = 1e-9
 _SMALL_RAD = 1e-3
@@ -106,9 +107,10 @@ def marginals(graph: PoseGraph, poses: FloatArray, huber: float, frames: IntArra
 def _gather(graph: PoseGraph, poses: FloatArray, huber: float, gradient: FloatArray) -> None:
     """Fill the rows with the normal equations at some poses; the increments of these are on the right."""
     rows, at = graph.rows, graph.at
-    rows[:] = 0.0
-    gradient[:] = 0.0
+    for i in range(rows.size):
+        rows[i] = 0.0
     for i in range(at.size):
+        gradient[i] = 0.0
         rows[at[i] + i] = _RIDGE
     relative, left = np.empty((4, 4)), np.empty((4, 4))
     error, pull, carried = np.empty(6), np.empty(6), np.empty((6, 6))
@@ -199,7 +201,8 @@ def _between(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
         out[i, 3] = 0.0
         for k in range(3):
             out[i, 3] += a[k, i] * (b[k, 3] - a[k, 3])
-    out[3] = a[3]
+    for j in range(4):
+        out[3, j] = a[3, j]
 
 
 @njit(fastmath=_FAST, error_model="numpy")
@@ -208,7 +211,8 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
         for j in range(4):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
         out[i, 3] += a[i, 3]
-    out[3] = b[3]
+    for j in range(4):
+        out[3, j] = b[3, j]
 
 
 @njit(fastmath=_FAST, error_model="numpy")
@@ -253,7 +257,7 @@ def _logarithm(pose: FloatArray, out: FloatArray) -> None:
 @njit(fastmath=_FAST, error_model="numpy")
 def _move(pose: FloatArray, twist: FloatArray) -> None:
     """Multiply a pose from the right by the exponential of a twist, rotation first."""
-    x, y, z, u, v, s = twist
+    x, y, z, u, v, s = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5]
     square = x * x + y * y + z * z
     angle = np.sqrt(square)
     if angle < _SMALL_RAD:
