@@ -19,16 +19,16 @@ _LANES = 16
 _TOGETHER = 4
 """Rows whose sums are taken in float32; more would leave too much of a flat patch's variance."""
 
-Buffers = tuple[Float32Array, Float32Array, Float32Array]
+Buffers = tuple[Float32Array, Float32Array, Float32Array, FloatArray]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _stride(size: IntArray, axial_radius: int) -> int:
     """Length of padded rows."""
     return int((size[1] + 2 * axial_radius + _LANES - 1) // _LANES * _LANES)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def buffers(size: IntArray, lateral_radius: int, axial_radius: int) -> Buffers:
     """Room for the real and imaginary parts of a patch and of its neighbourhood, and for what it covers.
 
@@ -39,6 +39,8 @@ def buffers(size: IntArray, lateral_radius: int, axial_radius: int) -> Buffers:
     float32, shape (2, (rows + 2 * lateral_radius + 1) * stride)
     float32, shape (rows * stride + 1,)
         One at the patch's samples, zero at its rows' padding; last the width of rows it was made for.
+    float64, shape (rows + 2 * lateral_radius, 2 * axial_radius + 1)
+        Power of the neighbourhood's rows at each axial lag.
     """
     stride = _stride(size, axial_radius)
     rows = size[0] + 2 * lateral_radius + 1
@@ -46,16 +48,17 @@ def buffers(size: IntArray, lateral_radius: int, axial_radius: int) -> Buffers:
         np.zeros((2, size[0] * stride), np.float32),
         np.zeros((2, rows * stride), np.float32),
         np.zeros(size[0] * stride + 1, np.float32),
+        np.zeros((size[0] + 2 * lateral_radius, 2 * axial_radius + 1)),
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _common(first: int, size: int, length: int, radius: int, shift: int) -> tuple[int, int]:
     """Start and end of what stays inside both images at every lag, so that all lags share it."""
     return max(first, 0, radius - shift), min(first + size, length, length - radius - shift)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _copy(
     image: Float32Array, corner: tuple[int, int], rows: int, width: int, stride: int, out: Float32Array
 ) -> None:
@@ -73,7 +76,7 @@ def _copy(
         out[n] = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _cover(width: int, stride: int, inside: Float32Array) -> None:
     """Mark the first samples of each row, unless they are marked already."""
     if inside[-1] != width:
@@ -82,7 +85,7 @@ def _cover(width: int, stride: int, inside: Float32Array) -> None:
         inside[-1] = np.float32(width)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"}, error_model="numpy")
 def _sums(
     a: Float32Array, b: Float32Array, start: int, inside: Float32Array, end: int, chunk: int
 ) -> tuple[float, float, float]:
@@ -105,36 +108,46 @@ def _sums(
     return product, total, square
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
-def _echo_sums(
-    a: Float32Array,
-    ai: Float32Array,
-    b: Float32Array,
-    bi: Float32Array,
-    start: int,
-    inside: Float32Array,
-    end: int,
-    chunk: int,
-) -> tuple[float, float, float]:
-    """Real and imaginary part of the sum of conj(a) b, and of the power of b where `inside` is one."""
-    in_phase, quadrature, power = 0.0, 0.0, 0.0
-    behind = np.uint64(start)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"}, error_model="numpy")
+def _echo_product(
+    a: Float32Array, ai: Float32Array, b: Float32Array, bi: Float32Array, start: int, end: int, chunk: int
+) -> tuple[float, float]:
+    """Real and imaginary part of the sum of conj(a) b, b beginning with its sample `start`."""
+    in_phase, quadrature, behind = 0.0, 0.0, np.uint64(start)
     for first in range(0, end, chunk):
-        some_in_phase: Any = np.float32(0.0)
-        some_quadrature: Any = np.float32(0.0)
-        some_power: Any = np.float32(0.0)
+        some: Any = np.float32(0.0)
+        across: Any = np.float32(0.0)
         for k in range(np.uint64(first), np.uint64(min(first + chunk, end))):
             real, imaginary = b[behind + k], bi[behind + k]
-            some_in_phase += a[k] * real + ai[k] * imaginary
-            some_quadrature += a[k] * imaginary - ai[k] * real
-            some_power += inside[k] * (real * real + imaginary * imaginary)
-        in_phase += some_in_phase
-        quadrature += some_quadrature
-        power += some_power
-    return in_phase, quadrature, power
+            some += a[k] * real + ai[k] * imaginary
+            across += a[k] * imaginary - ai[k] * real
+        in_phase += some
+        quadrature += across
+    return in_phase, quadrature
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"}, error_model="numpy")
+def _powers(b: Float32Array, bi: Float32Array, rows: int, stride: int, width: int, out: FloatArray) -> None:
+    """Power of `width` samples of each row from its first, its second ... sample on."""
+    lags = out.shape[1]
+    for v in range(rows):
+        start = np.uint64(v * stride)
+        shared: Any = np.float32(0.0)
+        for k in range(start + np.uint64(lags - 1), start + np.uint64(width)):
+            shared += b[k] * b[k] + bi[k] * bi[k]
+        for j in range(lags):
+            power = float(shared)
+            # Before what all lags share, and behind it.
+            for k in range(j, min(lags - 1, j + width)):
+                at = start + np.uint64(k)
+                power += b[at] * b[at] + bi[at] * bi[at]
+            for k in range(max(width, lags - 1), j + width):
+                at = start + np.uint64(k)
+                power += b[at] * b[at] + bi[at] * bi[at]
+            out[v, j] = power
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def correlate_patch(
     fixed: Float32Array,
     moving: Float32Array,
@@ -176,7 +189,7 @@ def correlate_patch(
                 out[i, j] = (ab_sum - a_sum * b_sum / n) / np.sqrt(a_var * b_var)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def turns(size: IntArray, axial_radius: int, ramp_rad: FloatArray) -> Float32Array:
     """Cosine and sine of a ramp's phase at the samples of a patch in `buffers`, shape (2, rows * stride)."""
     stride = _stride(size, axial_radius)
@@ -193,7 +206,7 @@ def turns(size: IntArray, axial_radius: int, ramp_rad: FloatArray) -> Float32Arr
     return out
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"}, error_model="numpy")
 def _turn(a: Float32Array, ai: Float32Array, cosine: Float32Array, sine: Float32Array, end: int) -> float:
     """Turn a patch's echo back by the ramp's phase, in place; return its power."""
     power: Any = np.float32(0.0)
@@ -205,7 +218,7 @@ def _turn(a: Float32Array, ai: Float32Array, cosine: Float32Array, sine: Float32
     return float(power)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def cohere_patch(
     fixed: Float32Array,
     moving: Float32Array,
@@ -228,25 +241,28 @@ def cohere_patch(
             out[i, j] = np.nan
     if rows <= 0 or width <= 0 or rows * width < least_overlap * size[0] * size[1]:
         return
-    end, chunk, inside = rows * stride, _TOGETHER * stride, room[2]
+    end, chunk, powers = rows * stride, _TOGETHER * stride, room[3]
     a, ai, b, bi = room[0][0], room[0][1], room[1][0], room[1][1]
     corner = v0 + shift[0] - lateral, s0 + shift[1] - axial
     _copy(fixed[0], (v0, s0), rows, width, stride, a)
     _copy(fixed[1], (v0, s0), rows, width, stride, ai)
     _copy(moving[0], corner, rows + 2 * lateral, width + 2 * axial, stride, b)
     _copy(moving[1], corner, rows + 2 * lateral, width + 2 * axial, stride, bi)
-    _cover(width, stride, inside)
+    _powers(b, bi, rows + 2 * lateral, stride, width, powers)
     power = _turn(a, ai, turn[0], turn[1], end)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             if not corners and i != lateral and j != axial:
                 continue
-            in_phase, quadrature, other = _echo_sums(a, ai, b, bi, i * stride + j, inside, end, chunk)
+            in_phase, quadrature = _echo_product(a, ai, b, bi, i * stride + j, end, chunk)
+            other = 0.0
+            for v in range(i, i + rows):
+                other += powers[v, j]
             if power * other > 0.0:
                 out[i, j] = (in_phase**2 + quadrature**2) / (power * other)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def patch_correlations(
     fixed: Float32Array,
     moving: Float32Array,
@@ -280,7 +296,7 @@ def patch_correlations(
         correlate_patch(fixed, moving, first[p], size, shift[p], least_overlap, corners, room, out[p])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def patch_coherences(
     fixed: Float32Array,
     moving: Float32Array,

@@ -74,7 +74,7 @@ class Matches(NamedTuple):
     settled: BoolArray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def select(values: FloatArray, count: int, rank: int) -> float:
     """Value of a rank among the first `count`, which are brought in partial order about it (Hoare, 1961)."""
     low, high = 0, count - 1
@@ -99,7 +99,7 @@ def select(values: FloatArray, count: int, rank: int) -> float:
     return float(values[rank])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def finite_median(values: FloatArray, spare: FloatArray) -> float:
     """Median of what is finite; zero if nothing is."""
     count = 0
@@ -118,7 +118,7 @@ def finite_median(values: FloatArray, spare: FloatArray) -> float:
     return 0.5 * (lower + upper)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _sound(rho: FloatArray) -> bool:
     """Whether a patch's logarithms carry: the corners, which weigh little, may be lower."""
     for k in range(3):  # noqa: SIM110 (compiled; NaN does not count)
@@ -127,19 +127,19 @@ def _sound(rho: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _at_least(value: float) -> float:
     """Value limited from below for its logarithm; NaN stays."""
     return float(LEAST_CORRELATION if value < LEAST_CORRELATION else value)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _vertex(before: float, at: float, after: float) -> float:
     curvature = before - 2.0 * at + after
     return (before - after) / (2.0 * curvature) if curvature < 0.0 else np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _peak(rho: FloatArray) -> tuple[float, float, float]:
     """Sub-sample peak of a patch from parabolas through ln(rho), and how much it is worth."""
     up, left, at, right, down = rho[0, 1], rho[1, 0], rho[1, 1], rho[1, 2], rho[2, 1]
@@ -153,7 +153,7 @@ def _peak(rho: FloatArray) -> tuple[float, float, float]:
     return lateral, axial, peak**2 / (1.0 - peak**2)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _read(rho: FloatArray, lateral: float, axial: float) -> float:
     """Correlation a fraction of a lag off the centre, by quadratics through ln(rho) in both directions."""
     t, u = min(max(lateral, -1.0), 1.0), min(max(axial, -1.0), 1.0)
@@ -167,7 +167,7 @@ def _read(rho: FloatArray, lateral: float, axial: float) -> float:
     return np.exp(total) if sound else total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _fill_corners(rho: FloatArray) -> None:
     """Speckle's correlation is nearly the product of what it is along either axis.
 
@@ -199,7 +199,7 @@ def _normal(at: FloatArray, weight: FloatArray, data: FloatArray, count: int, ou
     out[5], out[6], out[7], out[8] = nyy, r, rx, ry
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _invert(sums: FloatArray, out: FloatArray) -> None:
     """Inverse of the symmetric matrix whose upper triangle comes first in `sums`, by its adjugate."""
     a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
@@ -212,7 +212,7 @@ def _invert(sums: FloatArray, out: FloatArray) -> None:
             out[j, i] = out[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _robust_fit(
     at: FloatArray,
     data: FloatArray,
@@ -254,7 +254,7 @@ def _robust_fit(
             covariance[i, j] *= scale * scale
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _determined(at: FloatArray, count: int) -> bool:
     """Whether there are patches enough, and not all on a line."""
     if count < _LEAST_PATCHES:
@@ -269,7 +269,7 @@ def _determined(at: FloatArray, count: int) -> bool:
     return xx * yy - xy * xy > _COLLINEAR * (xx + yy) ** 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _displaced(x_mm: float, y_mm: float, roll_rad: float, at_mm: FloatArray, out: FloatArray) -> None:
     """Where each place of the first frame is found in the second, less itself."""
     c, s = np.cos(roll_rad), np.sin(roll_rad)
@@ -279,7 +279,7 @@ def _displaced(x_mm: float, y_mm: float, roll_rad: float, at_mm: FloatArray, out
         out[p, 1] = c * y - s * x - at_mm[p, 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _round(shift: FloatArray, spacing: FloatArray, lag: IntArray, changed: BoolArray) -> bool:
     """Nearest lags, which of them are others than before, and whether any is."""
     some = False
@@ -291,7 +291,7 @@ def _round(shift: FloatArray, spacing: FloatArray, lag: IntArray, changed: BoolA
     return some
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _fit(
     at_mm: FloatArray,
     shift: FloatArray,
@@ -337,7 +337,7 @@ def _fit(
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def match_pairs(
     images: tuple[Float32Array, ...],
     echoes: tuple[Float32Array, ...],

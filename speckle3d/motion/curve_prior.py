@@ -242,18 +242,28 @@ class _Family:
 
     def factors(self, values: FloatArray) -> FloatArray:
         """Logarithm of true over given distances, at the depths."""
-        n, depths = self.nominal, np.unique(self.depth_mm)
-        focus, aperture, attenuation, frequency = values[:4] * self.tolerance
-        lens = replace(
-            n.lens,
-            focus_mm=n.lens.focus_mm * np.exp(focus),
-            aperture_mm=n.lens.aperture_mm * np.exp(aperture),
+        depths = np.unique(self.depth_mm)
+        # Derivatives by what is not the lens' are asked for at the same lens.
+        width = _log_width(
+            self.nominal, tuple((values[:4] * self.tolerance).tolist()), tuple(depths.tolist())
         )
-        low, high = (float(f * np.exp(frequency)) for f in n.band_hz)
-        more = n.attenuation_db_cm_mhz + attenuation
-        other = replace(n, lens=lens, band_hz=(low, high), attenuation_db_cm_mhz=more)
-        changed = np.interp(self.depth_mm, depths, other.log_width(depths)) - self.width
+        changed = np.interp(self.depth_mm, depths, width) - self.width
         return np.asarray(changed + values[4] * self.near + values[5] * self.free)
+
+
+@lru_cache(maxsize=16)
+def _log_width(nominal: Nominal, off: tuple[float, ...], depth_mm: tuple[float, ...]) -> FloatArray:
+    """`Nominal.log_width` of a lens that is off: focus, aperture and frequency by logarithms, attenuation."""
+    focus, aperture, attenuation, frequency = off
+    lens = replace(
+        nominal.lens,
+        focus_mm=nominal.lens.focus_mm * np.exp(focus),
+        aperture_mm=nominal.lens.aperture_mm * np.exp(aperture),
+    )
+    low, high = (float(f * np.exp(frequency)) for f in nominal.band_hz)
+    more = nominal.attenuation_db_cm_mhz + attenuation
+    other = replace(nominal, lens=lens, band_hz=(low, high), attenuation_db_cm_mhz=more)
+    return other.log_width(np.array(depth_mm))
 
 
 def nominal_probe(curves: DecorrelationCurves) -> Nominal:

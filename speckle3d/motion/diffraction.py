@@ -28,6 +28,8 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from speckle3d.core.arrays import ComplexArray, FloatArray
+from speckle3d.core.threads import in_parallel
+from speckle3d.kernels.diffraction import lens_fields
 
 FREQUENCIES = 11
 """Nodes over the band; twice as many change distances by less than 0.1 %."""
@@ -153,31 +155,18 @@ def _two_way_fields(
     strip = lens.aperture_mm * ((np.arange(count) + 0.5) / count - 0.5)
     reach = 0.8 * lens.aperture_mm + 1.5
     steps = int(np.ceil(reach / STEP_MM))
-    z = STEP_MM * np.arange(steps + 1)
+    z: FloatArray = STEP_MM * np.arange(steps + 1, dtype=float)
     delay = lens.focus_mm - np.hypot(lens.focus_mm, strip)
-    across2 = (z[:, None] - strip) ** 2
     off_mm = np.sqrt(_OFF_AXIS) * lens.transmit_mm / 2.0
-    fields = np.empty((depth_mm.size, frequency_hz.size, 2 * steps + 1), dtype=complex)
-    for n, y in enumerate(depth_mm):
-        received = _one_way(y, across2, delay, wavenumber)
-        sent = _one_way(np.hypot(y, off_mm), across2, delay, wavenumber) if off_mm else received
-        half = sent * received
-        fields[n] = np.concatenate([half[:, :0:-1], half], axis=1)
-    return fields, np.concatenate([-z[:0:-1], z])
-
-
-def _one_way(
-    distance_mm: float, across2: FloatArray, delay: FloatArray, wavenumber: FloatArray
-) -> ComplexArray:
-    """Field of the lens over elevation at evenly spaced wavenumbers, shape (f, z)."""
-    path = np.sqrt(distance_mm**2 + across2)
-    phase = np.exp(-1j * wavenumber[0] * (path + delay)) / path
-    turn = np.exp(-1j * (wavenumber[1] - wavenumber[0]) * (path + delay))
-    field = np.empty((wavenumber.size, across2.shape[0]), dtype=complex)
-    for k in range(wavenumber.size):
-        field[k] = phase.sum(axis=1)
-        phase *= turn
-    return field
+    distance = np.append(depth_mm, np.hypot(depth_mm, off_mm)) if off_mm else depth_mm
+    parts = np.empty((distance.size, frequency_hz.size, z.size, 2))
+    in_parallel(
+        lambda first, stop: lens_fields(distance, z, strip, delay, wavenumber, first, stop, parts),
+        distance.size,
+    )
+    one_way = parts.view(complex)[..., 0]
+    half = one_way[: depth_mm.size] * one_way[-depth_mm.size :]
+    return np.concatenate([half[..., :0:-1], half], axis=-1), np.concatenate([-z[:0:-1], z])
 
 
 @dataclass(frozen=True)

@@ -8,20 +8,24 @@ A ``!`` marks a target that is missed; peers are given in the unit of the row.
 import argparse
 import os
 import platform
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from bench_accuracy import curves_of
 from cache import DEFAULT, simulated, to_and_fro
-from speed import memory, patches, tracking
+from speed import commands, memory, patches, sensors, simulation, studies, tracking
 from speed.rows import Row, print_table
 
 from speckle3d.core.threads import cores
 from speckle3d.io.curves import write_curves
 from speckle3d.simulation.settings import SimulationSettings
 
+PARTS = ("tracking", "patches", "sensors", "simulation", "commands", "studies", "memory")
 SWEEP = SimulationSettings(preset="phantom", seed=2001, length_mm=7.5, frames=60)
 
 
@@ -39,20 +43,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--cache", type=Path, default=DEFAULT)
-    parser.add_argument("--only", nargs="*", default=[], help="parts: tracking, patches, memory, ...")
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=[], help=f"parts: {', '.join(PARTS)}")
     options = parser.parse_args()
     sweep = simulated(SWEEP, options.cache)
     curves = curves_of(options.cache)
     curves_file = options.cache / "curves-of-bench.h5"
     write_curves(curves_file, curves)
     long = [to_and_fro(sweep, frames, options.cache) for frames in memory.FRAMES]
-    parts: dict[str, Callable[[], list[Row]]] = {
+    ways: dict[str, Callable[[], list[Row]]] = {
         "tracking": lambda: tracking.rows([sweep, long[0]], curves, options.runs),
         "patches": lambda: patches.rows(sweep, options.runs),
+        "sensors": lambda: sensors.rows(options.runs),
+        "simulation": lambda: simulation.rows(options.runs),
+        "commands": lambda: commands.rows(options.runs),
+        "studies": studies.rows,
         "memory": lambda: memory.rows(long, curves_file),
     }
-    print(machine())
-    print_table([row for name, part in parts.items() if name in (options.only or parts) for row in part()])
+    print(machine(), flush=True)
+    print_table([row for part in options.only or PARTS for row in ways[part]()])
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from copy import copy
 from dataclasses import replace
 from functools import cache
 
+import inplane_twin
 import numpy as np
 import pytest
 import speckle
@@ -11,7 +12,13 @@ import speckle
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.correlation import patch_correlations
-from speckle3d.matching.inplane import CoarseMatcher, InPlaneMotion, InPlaneSettings, match_patches
+from speckle3d.matching.inplane import (
+    CoarseMatcher,
+    InPlaneMotion,
+    InPlaneSettings,
+    match_patches,
+    match_with_each,
+)
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchSettings, lay_patches
 
@@ -386,3 +393,70 @@ def test_speckle_finer_than_most_is_found_to_the_sample_the_matching_needs():
 def test_search_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         InPlaneSettings(**bad)
+
+
+def test_a_frame_matched_with_many_at_once_is_matched_as_with_each_alone():
+    """More than one call of the kernel takes, one of them flat."""
+    moving = pair(0, (0.1, 0.0, 0.0), 0.8)[1]
+    fixed = [pair(0)[0], np.ones_like(moving), *[pair(0, (0.05 * k, 0.0, 0.0))[1] for k in range(8)]]
+    starts = [InPlaneMotion(0.05, 0.01 * k) for k in range(len(fixed))]
+    together = match_with_each(fixed, moving, PATCHES, starts, GRID.centre_mm)
+    for image, start, found in zip(fixed, starts, together, strict=True):
+        alone = match_patches(image, moving, PATCHES, start, GRID.centre_mm)
+        np.testing.assert_array_equal(found.correlation, alone.correlation)
+        np.testing.assert_array_equal(found.shift_mm, alone.shift_mm)
+        assert (found.motion.x_mm, found.motion.y_mm) == (alone.motion.x_mm, alone.motion.y_mm)
+        known = found.correlation[np.isfinite(found.correlation)]
+        assert found.median == (np.median(known) if known.size else 0.0)
+
+
+# ---- twin ------------------------------------------------------------------------------------------------
+
+SOME = np.arange(len(PATCHES))[:: max(1, len(PATCHES) // 14)]
+FEW = replace(PATCHES, first=PATCHES.first[SOME], centre_mm=PATCHES.centre_mm[SOME])
+"""Few, because the twin goes from sample to sample."""
+
+
+def spoilt(image):
+    """Flat under one patch, and not a number in another."""
+    out = image.copy()
+    (v, s), (rows, columns) = FEW.first[2], FEW.size
+    out[v : v + rows, s : s + columns] = 1.0
+    out[tuple(FEW.first[5])] = np.nan
+    return out
+
+
+@pytest.mark.parametrize(
+    ("start", "settings"),
+    [
+        ((0.2, -0.3, 0.01), {}),
+        ((0.2, -0.3, 0.0), {"passes": 1}),
+        # The start is so far off that patches leave the image.
+        ((6.0, 0.0, 0.0), {"passes": 3, "least_overlap": 0.3}),
+        ((0.2, -0.3, 0.0), {"interpolate": False}),
+    ],
+)
+@pytest.mark.parametrize("of_echo", [False, True])
+def test_kernel_does_what_its_twin_does(start, settings, of_echo):
+    first, second = echo_pair(7, (0.25, -0.31, 0.008), rho=0.8, strain=0.002)
+    images = speckle.intensity(first), spoilt(speckle.intensity(second))
+    made, begin = InPlaneSettings(**settings), InPlaneMotion(*start)
+    echoes, complex_parts, wavenumber = None, None, 0.0
+    if of_echo:
+        echoes, wavenumber = (first, second), WAVENUMBER_PER_MM
+        complex_parts = tuple(parts(each) for each in echoes)
+    correlation, shift, motion, covariance = inplane_twin.match(
+        *images, FEW, begin, GRID.centre_mm, made, echoes, wavenumber
+    )
+    found = match_patches(*images, FEW, begin, GRID.centre_mm, made, complex_parts, wavenumber)
+    got = found.motion
+    # Single precision of up to four rows of a patch: 1e-6 of their energy.
+    np.testing.assert_allclose(found.correlation, correlation, atol=1e-5)
+    np.testing.assert_allclose(found.shift_mm, shift, atol=2e-4)
+    np.testing.assert_allclose([got.x_mm, got.y_mm, got.roll_rad], motion, atol=1e-6)
+    if covariance is None:
+        assert got.covariance is None
+    else:
+        np.testing.assert_allclose(got.covariance, covariance, rtol=1e-3, atol=1e-12)
+    known = correlation[np.isfinite(correlation)]
+    assert found.median == pytest.approx(np.median(known) if known.size else 0.0, abs=1e-5)

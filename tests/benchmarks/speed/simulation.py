@@ -1,0 +1,32 @@
+"""Simulated frames per second, on all cores beside one."""
+
+from contextlib import nullcontext
+from itertools import islice
+
+from speckle3d.core.threads import cores, on_one_thread
+from speckle3d.simulation.presets import simulate
+from speckle3d.simulation.settings import SimulationSettings
+from speed.rows import Row, Timing, timed
+
+FRAMES = 24
+
+
+def rows(runs: int) -> list[Row]:
+    """One row for a phantom, one for tissue."""
+    return [_row(preset, min(runs, 3)) for preset in ("phantom", "tissue")]
+
+
+def _row(preset: str, runs: int) -> Row:
+    settings = SimulationSettings(preset=preset, seed=2001, length_mm=7.5, frames=60)
+    frames = simulate(settings)[0].sweep.frames
+
+    def made(alone: bool) -> Timing:
+        def some() -> None:
+            with on_one_thread() if alone else nullcontext():
+                list(islice(frames.in_order(), FRAMES))
+
+        return timed(some, runs)
+
+    ours, one = made(False), made(True)
+    what = f"simulate, {preset}, {settings.vectors} vectors, {cores()} cores"
+    return Row(what, FRAMES / ours.seconds, "frames/s", "one core", FRAMES / one.seconds, cores=ours.cores)
