@@ -1,5 +1,8 @@
 """Poses are the same to the last bit whatever the number of threads."""
 
+import threading
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,3 +40,26 @@ def test_poses_do_not_depend_on_threads(sweep, curves, many_threads):
         alone = poses_of(track(part, curves), part)
     for name, values in alone.items():
         np.testing.assert_array_equal(shared[name], values, err_msg=name)
+
+
+class OneBuffer:
+    """Frames that all come in the same memory, for one reader at a time."""
+
+    def __init__(self, frames):
+        self._frames, self.shape, self.dtype = frames, frames.shape, frames.dtype
+        self._buffer, self._alone = np.empty(frames.shape[1:], frames.dtype), threading.Lock()
+
+    def __getitem__(self, index):
+        assert self._alone.acquire(blocking=False), "read by two threads at once"
+        try:
+            self._buffer[:] = self._frames[index]
+            return self._buffer
+        finally:
+            self._alone.release()
+
+
+def test_frames_that_share_their_memory_are_read_one_at_a_time(sweep, curves, many_threads):
+    part = sweep.part(0, 24)
+    shared = track(replace(part, frames=OneBuffer(part.frames)), curves)
+    np.testing.assert_array_equal(shared.image.as_matrix(), track(part, curves).image.as_matrix())
+    assert not shared.flags.any()

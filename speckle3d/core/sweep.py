@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, Protocol
 
@@ -45,6 +46,21 @@ def stored_dtype(frames: Frames) -> np.dtype[Any]:
     return pairs if own.kind == "c" and getattr(frames, "stored_dtype", own) == pairs else own
 
 
+_READING = threading.Lock()
+
+
+def read_frame(frames: Frames, index: int) -> npt.NDArray[Any]:
+    """Read one frame while other threads may read others.
+
+    Frames that say ``any_thread = True`` are read as they are. Others, which may reuse their memory or hold a
+    place in a file, are read one at a time, and each is copied.
+    """
+    if isinstance(frames, np.ndarray) or getattr(frames, "any_thread", False):
+        return frames[index]
+    with _READING:
+        return np.array(frames[index])
+
+
 @dataclass(frozen=True)
 class _FramesPart:
     """Frames `first` to before `stop` of others, still read one at a time."""
@@ -65,8 +81,12 @@ class _FramesPart:
     def stored_dtype(self) -> np.dtype[Any]:
         return stored_dtype(self.frames)
 
+    @property
+    def any_thread(self) -> bool:
+        return True
+
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return self.frames[range(self.first, self.stop)[index]]
+        return read_frame(self.frames, range(self.first, self.stop)[index])
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,9 @@ class LazyFrames(ABC):
     to another process opens it there.
     """
 
+    any_thread = True
+    """Several threads may read at once: each frame has memory of its own."""
+
     def __init__(self, path: PathLike, shape: tuple[int, int, int], dtype: npt.DTypeLike) -> None:
         self.path = Path(path).absolute()
         self.shape, self.dtype = shape, np.dtype(dtype)

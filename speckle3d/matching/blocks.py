@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from speckle3d.core.arrays import Float32Array
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.core.threads import ahead, counting_seconds
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
@@ -286,7 +286,7 @@ class _BlockMatcher:
 
         def make(index: int) -> _MadeReady:
             with self._times.of("reading"):
-                frame = self._sweep.frames[index]
+                frame = read_frame(self._sweep.frames, index)
             with self._times.of("intensity"):
                 echo = self._matcher.echo(frame)
                 features = self._inspector.inspect(frame, echo.intensity)

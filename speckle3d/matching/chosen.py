@@ -7,7 +7,7 @@ from itertools import groupby
 from operator import itemgetter
 
 from speckle3d.core.arrays import IntArray
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
@@ -70,7 +70,7 @@ def _keep_ready(
 ) -> None:
     """Have some frames ready, and of others those that were last asked for."""
     missing = sorted(set(wanted) - kept.keys())
-    made = ahead(lambda frame: matcher.prepare(matcher.echo(sweep.frames[frame])), missing)
+    made = ahead(lambda frame: matcher.prepare(matcher.echo(read_frame(sweep.frames, frame))), missing)
     kept |= dict(zip(missing, made, strict=True))
     for frame in wanted:
         kept[frame] = kept.pop(frame)

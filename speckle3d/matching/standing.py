@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
@@ -37,7 +37,7 @@ def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -
     """
 
     def look(frame: int) -> Float32Array:
-        return _normalised(*matcher.equalised(matcher.echo(sweep.frames[frame])), matcher.patches)
+        return _normalised(*matcher.equalised(matcher.echo(read_frame(sweep.frames, frame))), matcher.patches)
 
     echoes = list(ahead(look, frames))
     shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(echoes, 2)]

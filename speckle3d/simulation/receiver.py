@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from scipy import signal as filters
 
 from speckle3d.core.arrays import Complex64Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
@@ -112,6 +112,7 @@ class Demodulator:
 class _Received:
     frames: Frames
     demodulate: Demodulator
+    any_thread: ClassVar[bool] = True
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -146,7 +147,7 @@ class IQFrames(_Received):
 
     def __getitem__(self, index: int) -> Complex64Array:
         """One frame, shape (vector, sample)."""
-        counts = self.demodulate(self.frames[index])
+        counts = self.demodulate(read_frame(self.frames, index))
         limits = np.iinfo(np.int16)
         parts = np.clip(np.rint(counts.view(np.float32)), limits.min, limits.max)
         return parts.view(np.complex64)
@@ -165,7 +166,7 @@ class GreyFrames(_Received):
 
     def __getitem__(self, index: int) -> npt.NDArray[np.uint8]:
         """One frame, shape (column, row)."""
-        power = np.abs(self.demodulate(self.frames[index])) ** 2
+        power = np.abs(self.demodulate(read_frame(self.frames, index))) ** 2
         # The envelope's square is twice the RF's.
         over_speckle = np.maximum(power / (2.0 * SPECKLE_RMS_COUNTS**2), 1e-12)
         level = 1.0 + (10.0 * np.log10(over_speckle) - WHITE_DB) / self.dynamic_range_db

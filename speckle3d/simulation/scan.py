@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +57,7 @@ class SimulatedFrames:
     image: ImageGrid
     snr_db: float = 40.0
     noise_entropy: int = 0
+    any_thread: ClassVar[bool] = True
 
     @property
     def shape(self) -> tuple[int, int, int]:
