@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
-from speckle3d.correction.fused.fuse import FusedSettings
+from speckle3d.correction.fused.settings import FusedSettings
 from speckle3d.correction.inertial.settings import InertialSettings
 from speckle3d.io.toml import load_toml, parsed, validated
 from speckle3d.matching.inplane import InPlaneSettings

@@ -1,4 +1,7 @@
-"""Tracked sweeps corrected in every mode: by cubics, a crossing sweep, inertia, all that is known."""
+"""Tracked sweeps corrected in every mode: by cubics, a crossing sweep, inertia, all that is known.
+
+The solvers of the last two are imported when they are asked for.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,8 @@ from speckle3d.core.geometry import elevational_steps
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
-from speckle3d.correction.fused.fuse import FusedPoses, fuse
-from speckle3d.correction.inertial.scale import correct_inertial
 from speckle3d.correction.modes import PUBLISHED, correct_mode, require_modes, sensor_of
-from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
+from speckle3d.correction.scale import FusedPoses, ScaledPoses, ScaleEvidence
 from speckle3d.correction.trust import ORIENTATION, believed, cleaned_readings, require_believed
 from speckle3d.pipeline import Tracked
 
@@ -103,6 +104,8 @@ def steps_turned(inertial: ScaledPoses, tracked: Tracked, sweep: Sweep) -> BoolA
 
 
 def _inertial(tracked: Tracked, sweep: Sweep, config: Config) -> ScaledPoses:
+    from speckle3d.correction.inertial.scale import correct_inertial
+
     sensor = sweep.orientation
     assert isinstance(sensor, OrientationSensor)
     with naming(f"{sweep.name}: drift mode inertial"):
@@ -119,6 +122,8 @@ def _inertial(tracked: Tracked, sweep: Sweep, config: Config) -> ScaledPoses:
 
 def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair | None) -> FusedPoses:
     """Fuse with what is left of the sensors once those that are refuted are out."""
+    from speckle3d.correction.fused.fuse import fuse
+
     sweep = believed(sweep, tracked.doubts)
     evidence: list[ScaleEvidence] = []
     if crossed is not None:

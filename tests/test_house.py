@@ -1,5 +1,6 @@
 """What holds for the project as a whole: imports that cost nothing, public names, README, shipped data."""
 
+import ast
 import importlib
 import json
 import re
@@ -73,6 +74,31 @@ def test_the_version_stands_in_one_place(project):
     )
     settings = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
     assert cited[1] == settings["project"]["version"]
+
+
+def compiled_kernels(project):
+    """Every use of `njit` in the kernels: where, its keywords, and whether it is a decorator."""
+    for path in sorted((project / "speckle3d" / "kernels").glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        above = {id(use) for each in ast.walk(tree) for use in getattr(each, "decorator_list", ())}
+        called = {id(each.func) for each in ast.walk(tree) if isinstance(each, ast.Call)}
+        for each in ast.walk(tree):
+            if isinstance(each, ast.Name) and each.id == "njit" and id(each) not in called:
+                yield f"{path.name}:{each.lineno}", {}, id(each) in above
+            elif isinstance(each, ast.Call) and isinstance(each.func, ast.Name) and each.func.id == "njit":
+                words = {word.arg: ast.unparse(word.value) for word in each.keywords}
+                yield f"{path.name}:{each.lineno}", words, id(each) in above
+
+
+def test_every_kernel_says_how_it_is_rounded_and_is_kept(project):
+    """A kernel without flags inherits those of whichever kernel calls it first; that copy is then on disk.
+
+    One function compiled with two sets of flags must not be kept: both would have the same place.
+    """
+    found = list(compiled_kernels(project))
+    assert len(found) > 100
+    assert [where for where, words, _ in found if "fastmath" not in words] == []
+    assert [where for where, words, above in found if (words.get("cache") == "True") != above] == []
 
 
 def examples(project):

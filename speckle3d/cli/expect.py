@@ -35,8 +35,8 @@ def expect_inertial(
     as_json: Json = False,
 ) -> None:
     """Length error to expect of mode `inertial`, for a sensor, a scanner and a motion."""
-    from speckle3d.correction.inertial import ASSUMPTION
     from speckle3d.correction.inertial.expected import InertialPlan, expected_scale_error
+    from speckle3d.correction.inertial.settings import ASSUMPTION
 
     plan = from_options(InertialPlan, locals())
     found = expected_scale_error(plan)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.doubts import Doubt
 
 TERMS = ("log_scale", "tilt_per_mm", "yaw_per_mm")
 """What `ScaleEvidence.values` are: the logarithm of true elevational distance over the images', and the
@@ -63,3 +64,23 @@ class ScaledPoses:
     def scale(self) -> float:
         """Corrected length over the images' own."""
         return float(np.exp(self.log_scale))
+
+
+@dataclass(frozen=True)
+class FusedPoses(ScaledPoses):
+    """Poses from all that is known of a sweep.
+
+    Attributes
+    ----------
+    used : tuple of str
+        "images" and what else took part: "orientation sensor", "tracker", "crossing", "inertial".
+    contradictions : tuple of Doubt
+        Sensors that differ from the images by more than the errors of both; poses then allow for either.
+    sizes : dict of str to float
+        Standard deviations found of the sensors' errors: ``tracker_jitter_mm``, ``tracker_jitter_deg``,
+        ``tracker_wander_mm``, ``orientation_jitter_deg``, ``inclination_wander_deg``, ``heading_wander_deg``.
+    """
+
+    used: tuple[str, ...] = ()
+    contradictions: tuple[Doubt, ...] = ()
+    sizes: dict[str, float] | None = None

@@ -11,7 +11,7 @@ from numba import njit, prange
 from speckle3d.core.arrays import Float32Array, FloatArray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False)
 def add_samples(
     image: Float32Array,
     index_from_sample: FloatArray,
@@ -45,7 +45,7 @@ def add_samples(
                 count[i, j, k] += np.uint32(1)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, fastmath=False)
 def fill_from_shell(voxels: Float32Array, distance: npt.NDArray[np.int32], cap: int) -> None:
     """Give each empty voxel the mean of the filled ones in the smallest cube around it that holds any.
 
@@ -66,7 +66,7 @@ def fill_from_shell(voxels: Float32Array, distance: npt.NDArray[np.int32], cap: 
                     voxels[i, j, k] = _mean_of_filled(voxels, distance, i, j, k)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=False)
 def _mean_of_filled(voxels: Float32Array, distance: npt.NDArray[np.int32], i: int, j: int, k: int) -> float:
     r = distance[i, j, k]
     total, count = 0.0, 0

@@ -9,12 +9,12 @@ from numba import njit
 from speckle3d.core.arrays import Float32Array, FloatArray
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", fastmath=False)
 def _local(pose, p0, p1, p2, row):  # type: ignore[no-untyped-def]
     return pose[row, 0] * p0 + pose[row, 1] * p1 + pose[row, 2] * p2 + pose[row, 3]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False)
 def look_up(
     points: FloatArray,
     volume: Float32Array,

@@ -15,6 +15,7 @@ from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
 
+# Assigning whole rows would make numba compile the texts of NumPy's errors, for two seconds.
 _FAST = {"reassoc", "contract", "arcp"}
 _RIDGE = 1e-9
 _SMALL_RAD = 1e-3
@@ -102,13 +103,14 @@ def marginals(graph: PoseGraph, poses: FloatArray, huber: float, frames: IntArra
                 out[k, a, b] = total
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _gather(graph: PoseGraph, poses: FloatArray, huber: float, gradient: FloatArray) -> None:
     """Fill the rows with the normal equations at some poses; the increments of these are on the right."""
     rows, at = graph.rows, graph.at
-    rows[:] = 0.0
-    gradient[:] = 0.0
+    for i in range(rows.size):
+        rows[i] = 0.0
     for i in range(at.size):
+        gradient[i] = 0.0
         rows[at[i] + i] = _RIDGE
     relative, left = np.empty((4, 4)), np.empty((4, 4))
     error, pull, carried = np.empty(6), np.empty(6), np.empty((6, 6))
@@ -156,7 +158,7 @@ def _gather(graph: PoseGraph, poses: FloatArray, huber: float, gradient: FloatAr
                         rows[at[i + a] + j + b] += twice[b, a]
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _factor(graph: PoseGraph) -> None:
     """Cholesky factor in place of the rows."""
     rows, at, begin = graph.rows, graph.at, graph.begin
@@ -175,7 +177,7 @@ def _factor(graph: PoseGraph) -> None:
         own[i - begin[i]] = np.sqrt(own[i - begin[i]] - total)
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _solve(graph: PoseGraph, x: FloatArray) -> None:
     """Solve with the factor, forwards and back, in place."""
     rows, at, begin = graph.rows, graph.at, graph.begin
@@ -190,7 +192,7 @@ def _solve(graph: PoseGraph, x: FloatArray) -> None:
             x[j] -= rows[at[i] + j] * x[i]
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _between(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Pose of the second in the first."""
     for i in range(3):
@@ -199,19 +201,21 @@ def _between(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
         out[i, 3] = 0.0
         for k in range(3):
             out[i, 3] += a[k, i] * (b[k, 3] - a[k, 3])
-    out[3] = a[3]
+    for j in range(4):
+        out[3, j] = a[3, j]
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     for i in range(3):
         for j in range(4):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
         out[i, 3] += a[i, 3]
-    out[3] = b[3]
+    for j in range(4):
+        out[3, j] = b[3, j]
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _logarithm(pose: FloatArray, out: FloatArray) -> None:
     """Exponential coordinates of a pose, rotation first."""
     # The largest component of the quaternion is found first: the angle may be near a half turn.
@@ -250,10 +254,10 @@ def _logarithm(pose: FloatArray, out: FloatArray) -> None:
     out[5] = s - 0.5 * (x * v - y * u) + k * (z * along - s * square)
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _move(pose: FloatArray, twist: FloatArray) -> None:
     """Multiply a pose from the right by the exponential of a twist, rotation first."""
-    x, y, z, u, v, s = twist
+    x, y, z, u, v, s = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5]
     square = x * x + y * y + z * z
     angle = np.sqrt(square)
     if angle < _SMALL_RAD:
@@ -279,7 +283,7 @@ def _move(pose: FloatArray, twist: FloatArray) -> None:
         pose[i, 2] += a * (p * y - q * x) + dot * z - b * square * r
 
 
-@njit(fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _adjoint_of_inverse(pose: FloatArray, out: FloatArray) -> None:
     """Matrix that carries (rotation, translation) twists through a pose's inverse."""
     for i in range(3):

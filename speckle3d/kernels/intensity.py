@@ -12,7 +12,7 @@ _LEAST_MEAN = 1e-9
 _TINY = float(np.finfo(np.float32).tiny)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False)
 def place_band(spectrum: Float32Array, weights: Float32Array, runs: IntArray, out: Float32Array) -> None:
     """Fill `out` with the weighted bins of a band in their new places, and with zeros elsewhere.
 
@@ -78,7 +78,7 @@ def place_band_of_real(
             done += count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=False)
 def squared_magnitude(analytic: Float32Array, out: Float32Array) -> None:
     """Fill `out`, shape (row, n), from real and imaginary parts in turn, shape (row, 2 * n or more)."""
     for row in range(out.shape[0]):
@@ -87,7 +87,7 @@ def squared_magnitude(analytic: Float32Array, out: Float32Array) -> None:
             target[k] = source[2 * k] * source[2 * k] + source[2 * k + 1] * source[2 * k + 1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
     """Fill `out` with the mean over a window about each sample, edges repeated, and return the floor.
 
@@ -145,7 +145,7 @@ def local_mean(image: Float32Array, half: IntArray, out: Float32Array) -> float:
     return _LEAST_MEAN * most + _TINY + not_finite
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def equalise_echo(
     analytic: Float32Array,
     intensity: Float32Array,

@@ -7,7 +7,7 @@ from numba import njit
 from speckle3d.core.arrays import ByteArray
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=False)
 def lzf_length(packed: ByteArray) -> int:
     """Count the bytes that a run packed by LibLZF unpacks to; -1 where it ends within a piece.
 

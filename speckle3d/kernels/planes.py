@@ -7,78 +7,21 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.kernels.statistics import INTERPOLATION, PatchCurves, correlation_variance
-
-_variance = njit(error_model="numpy", fastmath=False)(correlation_variance)
-_FAST = {"reassoc"}
-"""For sums over patches. Predictions are exact: starts of fits lie on knots of the curves, where a distance
-that is rounded otherwise has another slope. They say so, because a kernel that does not inherits its caller's
-flags."""
-
-_LEAST_MM = 0.05
-"""Distance below which correlation is flat: sensitivities are not taken to be less than here."""
-_LEAST_SENSITIVITY = 1e-6
-_RHO, _LATERAL, _LEVER, _SPREAD, _STAYING, _MOVING, _GAIN, _STRETCH, _STAYING_SD, _STRETCH_SD, _CELLS = range(
-    11
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.kernels.plane_misfit import (
+    LATERAL,
+    EchoModels,
+    FitRules,
+    Levers,
+    PairPatches,
+    conclude,
+    descend,
+    gather,
 )
-"""Rows of the table of a pair's patches that take part."""
+from speckle3d.kernels.statistics import PatchCurves
+
+_FAST = {"reassoc"}
 _STARTS = 4
-
-
-class EchoModels(NamedTuple):
-    """How patches depart from fully developed speckle, as kernels take it; see `speckle3d.motion.distances`.
-
-    Attributes
-    ----------
-    staying, moving, gain, stretch : float64, shape (e, p) or (1, p)
-        With one row, it is that of all pairs.
-    staying_error, stretch_error : float
-        Relative standard deviations, the second of stretches beyond one.
-    """
-
-    staying: FloatArray
-    moving: FloatArray
-    gain: FloatArray
-    stretch: FloatArray
-    staying_error: float
-    stretch_error: float
-
-
-class Levers(NamedTuple):
-    """What a plane's coefficients are multiplied by at each patch.
-
-    Attributes
-    ----------
-    lateral_mm, lever_mm, spread_mm : float64, shape (p,)
-        Of the slope along x; of the tilt; of the tilt again, in quadrature with the distance: what turning
-        alone decorrelates.
-    """
-
-    lateral_mm: FloatArray
-    lever_mm: FloatArray
-    spread_mm: FloatArray
-
-
-class FitRules(NamedTuple):
-    """How planes are fitted; see `speckle3d.motion.planes`.
-
-    Attributes
-    ----------
-    sensed : bool
-        Whether slopes are known from a sensor.
-    slope_sd : float
-        Standard deviation of the slopes' prior.
-    """
-
-    sensed: bool
-    slope_sd: float
-    widest_slope: float
-    huber: float
-    outlying: float
-    crossing_evidence: float
-    well_fitted: float
-    rounds: int
 
 
 class FittedPlanes(NamedTuple):
@@ -102,281 +45,6 @@ class FittedPlanes(NamedTuple):
     cost: FloatArray
     excess_mm: FloatArray
     sigma_mm: FloatArray
-
-
-class _Patches(NamedTuple):
-    """A pair's patches that take part, and the curves they are read with.
-
-    Attributes
-    ----------
-    table : float64, shape (11, p)
-    start : int64, shape (p,)
-        Of each patch's curve in `amplitude`.
-    patch : int64, shape (p,)
-        Which of the image's patches each is.
-    amplitude : float64
-        The curves one after the other.
-    last : float
-        Position in a curve up to which it is read.
-    step_mm : float
-    of_echo : bool
-    """
-
-    table: FloatArray
-    start: IntArray
-    patch: IntArray
-    amplitude: FloatArray
-    last: float
-    step_mm: float
-    of_echo: bool
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def predict_correlation(
-    distance_mm: float,
-    amplitude: FloatArray,
-    first: int,
-    last: float,
-    step_mm: float,
-    stretch: float,
-    staying: float,
-    moving: float,
-    gain: float,
-    staying_sd: float,
-    stretch_sd: float,
-    cells: float,
-    of_echo: bool,
-) -> tuple[float, float, float]:
-    """Correlation of one patch at a distance, its derivative by distance, and its variance.
-
-    Parameters
-    ----------
-    amplitude : float64
-        sqrt(rho_F) on a grid, from `first` on; read up to the position `last` in it.
-    step_mm, stretch : float
-        Of the grid, and what its distances are multiplied by.
-    staying, moving, gain : float
-        Shares of the amplitude, and gain.
-    staying_sd, stretch_sd : float
-        Standard deviations of the staying share and of the stretch, the latter relative.
-    """
-    at = distance_mm / stretch / step_mm
-    at = at if at < last else last
-    k = int(at)
-    low = amplitude[first + k]
-    rise = amplitude[first + k + 1] - low
-    g = low + (at - k) * rise
-    field = staying + moving * g
-    model = gain * field * field
-    derivative = 2.0 * gain * field * moving * (rise / step_mm / stretch)
-    limited = model if model < 0.999 else 0.999
-    share_error = staying_sd * (1.0 - g) * 2.0 * field * gain
-    stretch_error = stretch_sd * derivative * distance_mm
-    variance = _variance(limited, cells, of_echo) + INTERPOLATION**2
-    return model, derivative, variance + share_error * share_error + stretch_error * stretch_error
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _distance(plane: FloatArray, i: int, patches: _Patches) -> tuple[float, float, float]:
-    """Distance of a patch without and with what turning alone decorrelates, and the latter's part."""
-    t = patches.table
-    z = plane[0] + t[_LATERAL, i] * plane[1] + t[_LEVER, i] * plane[2]
-    turned = t[_SPREAD, i] * plane[2]
-    return z, turned, np.sqrt(z * z + turned * turned)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _predict(d: float, i: int, patches: _Patches) -> tuple[float, float, float]:
-    """As `predict_correlation`, but one over the standard deviation."""
-    t = patches.table
-    model, derivative, variance = predict_correlation(
-        d,
-        patches.amplitude,
-        patches.start[i],
-        patches.last,
-        patches.step_mm,
-        t[_STRETCH, i],
-        t[_STAYING, i],
-        t[_MOVING, i],
-        t[_GAIN, i],
-        t[_STAYING_SD, i],
-        t[_STRETCH_SD, i],
-        t[_CELLS, i],
-        patches.of_echo,
-    )
-    return model, derivative, 1.0 / np.sqrt(variance)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _evaluate(plane: FloatArray, size: int, patches: _Patches, rules: FitRules, sums: FloatArray) -> None:
-    """Fill `sums`: robust cost, capped cost, half the falling gradient, half the Hessian's upper triangle."""
-    huber, outlying, table = rules.huber, rules.outlying, patches.table
-    cost, capped = 0.0, 0.0
-    g0, g1, g2 = 0.0, 0.0, 0.0
-    h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(size):
-        z, turned, d = _distance(plane, i, patches)
-        model, slope, certainty = _predict(d, i, patches)
-        left = (table[_RHO, i] - model) * certainty
-        misfit = abs(left)
-        square = left * left
-        inside = misfit <= huber
-        weight = 1.0 if inside else huber / misfit
-        cost += square if inside else huber * (2.0 * misfit - huber)
-        capped += square if square < outlying else outlying
-        factor = slope * certainty / (d if d > 1e-9 else 1e-9)
-        j0 = factor * z
-        j1 = j0 * table[_LATERAL, i]
-        j2 = j0 * table[_LEVER, i] + factor * table[_SPREAD, i] * turned
-        w0, w1, w2 = weight * j0, weight * j1, weight * j2
-        g0 += w0 * left
-        g1 += w1 * left
-        g2 += w2 * left
-        h00 += w0 * j0
-        h01 += w0 * j1
-        h02 += w0 * j2
-        h11 += w1 * j1
-        h12 += w1 * j2
-        h22 += w2 * j2
-    sums[0], sums[1] = cost, capped
-    sums[2], sums[3], sums[4] = g0, g1, g2
-    sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = h00, h01, h02, h11, h12, h22
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _with_prior(plane: FloatArray, expected: FloatArray, precision: FloatArray, sums: FloatArray) -> None:
-    """Add what the prior has to the sums of `_evaluate`."""
-    for k in range(3):
-        off = plane[k] - expected[k]
-        sums[0] += precision[k] * off * off
-        sums[2 + k] -= precision[k] * off
-    sums[5] += precision[0]
-    sums[8] += precision[1]
-    sums[10] += precision[2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _solve(sums: FloatArray, damping: float, step: FloatArray) -> None:
-    """Step of the damped normal equations, by their triangular factors."""
-    d0 = sums[5] + damping * (sums[5] + 1e-9)
-    l1, l2 = sums[6] / d0, sums[7] / d0
-    d1 = sums[8] + damping * (sums[8] + 1e-9) - l1 * sums[6]
-    m2 = sums[9] - l1 * sums[7]
-    l12 = m2 / d1
-    d2 = sums[10] + damping * (sums[10] + 1e-9) - l2 * sums[7] - l12 * m2
-    y1 = sums[3] - l1 * sums[2]
-    y2 = sums[4] - l2 * sums[2] - l12 * y1
-    step[2] = y2 / d2
-    step[1] = y1 / d1 - l12 * step[2]
-    step[0] = sums[2] / d0 - l1 * step[1] - l2 * step[2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _descend(
-    plane: FloatArray,
-    size: int,
-    patches: _Patches,
-    expected: FloatArray,
-    precision: FloatArray,
-    rules: FitRules,
-) -> tuple[float, float]:
-    """Levenberg-Marquardt from `plane`, which it overwrites; returns the robust and the capped cost."""
-    damping, least, capped = 1e-3, np.inf, np.inf
-    trial, step, sums, best = plane.copy(), np.zeros(3), np.zeros(11), np.zeros(11)
-    for _ in range(rules.rounds + 1):
-        _evaluate(trial, size, patches, rules, sums)
-        _with_prior(trial, expected, precision, sums)
-        total = sums[0]
-        if total <= least:
-            settled = least - total < 1e-6 * max(total, 1.0)
-            least, capped = total, sums[1]
-            for k in range(3):
-                plane[k] = trial[k]
-            for k in range(11):
-                best[k] = sums[k]
-            damping = max(damping * 0.2, 1e-9)
-            if settled:
-                break
-        else:
-            damping *= 8.0
-        _solve(best, damping, step)
-        for k in range(3):
-            trial[k] = plane[k] + step[k]
-    return least, capped
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _conclude(
-    plane: FloatArray,
-    size: int,
-    patches: _Patches,
-    rules: FitRules,
-    excess_mm: FloatArray,
-    sigma_mm: FloatArray,
-    information: FloatArray,
-) -> None:
-    """Fill excess distances and their deviations, and add the patches' information on the plane."""
-    table = patches.table
-    for i in range(size):
-        z, _, d = _distance(plane, i, patches)
-        model, _, certainty = _predict(d, i, patches)
-        # Near no distance the correlation is flat; its curvature still tells one that is not small.
-        off = d if d > _LEAST_MM else _LEAST_MM
-        _, steep, _ = _predict(off, i, patches)
-        sensitivity = -steep * certainty
-        left = (table[_RHO, i] - model) * certainty
-        sigma = 1.0 / max(sensitivity, _LEAST_SENSITIVITY)
-        excess_mm[patches.patch[i]], sigma_mm[patches.patch[i]] = -left * sigma, sigma
-        misfit = abs(left)
-        weight = 1.0 if misfit <= rules.huber else rules.huber / misfit
-        told = sensitivity * max(abs(z), _LEAST_MM) / off
-        told *= weight * told
-        x, y = table[_LATERAL, i], table[_LEVER, i]
-        information[0, 0] += told
-        information[0, 1] += told * x
-        information[0, 2] += told * y
-        information[1, 1] += told * x * x
-        information[1, 2] += told * x * y
-        information[2, 2] += told * y * y
-    information[1, 0] = information[0, 1]
-    information[2, 0] = information[0, 2]
-    information[2, 1] = information[1, 2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _gather(
-    e: int,
-    rho: Float32Array,
-    used: BoolArray,
-    moved_mm: FloatArray,
-    models: EchoModels,
-    levers: Levers,
-    curves: PatchCurves,
-    patches: _Patches,
-) -> int:
-    """Fill in the patches of pair `e` that take part; returns how many they are."""
-    table = patches.table
-    row = e if models.staying.shape[0] > 1 else 0
-    size = 0
-    for p in range(used.shape[1]):
-        if not used[e, p]:
-            continue
-        stretch = models.stretch[row, p]
-        patches.patch[size] = p
-        patches.start[size] = p * curves.amplitude.shape[1]
-        table[_RHO, size] = rho[e, p]
-        table[_LATERAL, size] = levers.lateral_mm[p] - moved_mm[e, 0]
-        table[_LEVER, size] = levers.lever_mm[p] - moved_mm[e, 1]
-        table[_SPREAD, size] = levers.spread_mm[p]
-        table[_STAYING, size] = models.staying[row, p]
-        table[_MOVING, size] = models.moving[row, p]
-        table[_GAIN, size] = models.gain[row, p]
-        table[_STRETCH, size] = stretch
-        table[_STAYING_SD, size] = models.staying_error * models.staying[row, p]
-        table[_STRETCH_SD, size] = models.stretch_error if stretch > 1.0 + 1e-9 else 0.0
-        table[_CELLS, size] = curves.cells[p]
-        size += 1
-    return size
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -490,7 +158,7 @@ def fit_planes(
         Receives the results.
     """
     most = rho.shape[1]
-    patches = _Patches(
+    patches = PairPatches(
         np.empty((11, most)),
         np.empty(most, np.int64),
         np.empty(most, np.int64),
@@ -504,17 +172,17 @@ def fit_planes(
     precision[0] = 1e-6
     precision[1] = precision[2] = 1.0 / (rules.slope_sd * rules.slope_sd)
     for e in range(rho.shape[0]):
-        size = _gather(e, rho, used, moved_mm, models, levers, curves, patches)
+        size = gather(e, rho, used, moved_mm, models, levers, curves, patches)
         if size == 0:
             continue
         expected[1], expected[2] = slopes[e, 0], slopes[e, 1]
-        lateral = patches.table[_LATERAL]
+        lateral = patches.table[LATERAL]
         count = _list_starts(middle_mm[e], slopes[e], either_side[e], size, lateral, rules, off, starts)
         least = np.inf
         for n in range(count):
             for k in range(3):
                 plane[k] = starts[n, k]
-            cost, misfit = _descend(plane, size, patches, expected, precision, rules)
+            cost, misfit = descend(plane, size, patches, expected, precision, rules)
             misfit += rules.crossing_evidence if n > 0 else 0.0
             if misfit < least:
                 least = misfit
@@ -528,7 +196,7 @@ def fit_planes(
             for j in range(3):
                 information[k, j] = precision[k] if j == k else 0.0
         best = fitted.coefficients[e]
-        _conclude(best, size, patches, rules, fitted.excess_mm[e], fitted.sigma_mm[e], information)
+        conclude(best, size, patches, rules, fitted.excess_mm[e], fitted.sigma_mm[e], information)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)

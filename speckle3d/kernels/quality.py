@@ -9,8 +9,10 @@ from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
+_FAST = {"reassoc", "contract", "arcp"}
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp"})
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def patch_statistics(image: Float32Array, first: IntArray, size: IntArray, out: FloatArray) -> None:
     """Fill ``out[p]`` with the mean, the contrast and three correlations of patch p.
 
@@ -80,7 +82,7 @@ def patch_statistics(image: Float32Array, first: IntArray, size: IntArray, out: 
         out[p, 4] = _pearson(along, a_top, a_bottom, aa_top, aa_bottom, wide * half_high)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, fastmath=_FAST)
 def _products(a: Float32Array, b: Float32Array) -> tuple[float, float, float, float, float]:
     """Sums of either's values and squares, and of their products."""
     x: Any = np.float32(0.0)
@@ -97,7 +99,7 @@ def _products(a: Float32Array, b: Float32Array) -> tuple[float, float, float, fl
     return x, xx, y, yy, xy
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, fastmath=_FAST)
 def _product(a: Float32Array, b: Float32Array) -> float:
     total: Any = np.float32(0.0)
     for k in range(a.size):
@@ -105,7 +107,7 @@ def _product(a: Float32Array, b: Float32Array) -> float:
     return float(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _pearson(ab: float, a: float, b: float, aa: float, bb: float, count: int) -> float:
     """Coefficient from sums of products, of either's values and of their squares."""
     a, b = a / count, b / count

@@ -9,6 +9,7 @@ from numba import njit
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 
+_SUMS = {"reassoc", "contract", "arcp"}
 _TURNS = 8192
 _TWO_PI = 2.0 * np.pi
 _PHASORS = np.exp(-1j * _TWO_PI * np.arange(_TURNS) / _TURNS).astype(np.complex64)
@@ -68,7 +69,7 @@ def field_table(
     return FieldTable(rows.reshape(ny, nz, per_pitch + 1, -1), reached, vectors, curvature_per_mm, grid)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", fastmath=_SUMS)
 def _unit_phasor(cycles: float) -> Any:
     """``exp(-2 pi i cycles)`` to 1e-7: the nearest tabulated phasor, turned by the small rest."""
     scaled = (cycles - np.floor(cycles)) * _TURNS
@@ -77,7 +78,7 @@ def _unit_phasor(cycles: float) -> Any:
     return _PHASORS[nearest & (_TURNS - 1)] * np.complex64(complex(1.0, -rest))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
 def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out: Float32Array) -> None:
     """Fill `out` with a weighted sum of eight pieces of a table.
 
@@ -94,7 +95,7 @@ def _interpolate(table: Float32Array, row: int, corners: Any, weights: Any, out:
         out[q] = near + (w4 * a4[q] + w5 * a5[q] + w6 * a6[q] + w7 * a7[q])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
 def scatter_echoes(
     position_mm: FloatArray,
     strength: Float32Array,

@@ -28,7 +28,7 @@ class PathRules(NamedTuple):
     hold: bool
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _agree(z: float, slope: float, moved: FloatArray, weight: FloatArray) -> tuple[float, float]:
     """Squared deviation of a signed plane from an unsigned one, and the sign that makes it least."""
     u, v = z - moved[0], slope - moved[1]
@@ -38,7 +38,7 @@ def _agree(z: float, slope: float, moved: FloatArray, weight: FloatArray) -> tup
     return (plus, 1.0) if plus <= minus else (minus, -1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _invert(covariance: FloatArray, moved: FloatArray, rules: PathRules, weight: FloatArray) -> None:
     """Fill the three numbers of a pair's inverse covariance."""
     a = rules.placed * covariance[0, 0] + (rules.relative_error * moved[0]) ** 2
@@ -48,7 +48,7 @@ def _invert(covariance: FloatArray, moved: FloatArray, rules: PathRules, weight:
     weight[0], weight[1], weight[2] = c / determinant, -b / determinant, a / determinant
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _refine(
     place: FloatArray,
     path: FloatArray,
@@ -77,7 +77,7 @@ def _refine(
         place[1] = (w00 * u1 - w01 * u0) / determinant
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _least(values: FloatArray, size: int) -> int:
     """Where the least of the first values is, the first of equal ones."""
     at = 0
@@ -87,7 +87,7 @@ def _least(values: FloatArray, size: int) -> int:
     return at
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def follow_paths(
     start: IntArray,
     first: IntArray,

@@ -34,7 +34,7 @@ class Readings(NamedTuple):
     mounting_moved: FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def steps_of_readings(
     readings: Readings, centre_mm: FloatArray, first_s: FloatArray, second_s: FloatArray, out: FloatArray
 ) -> None:
@@ -55,7 +55,8 @@ def steps_of_readings(
     c = (centre_mm[0], centre_mm[1], centre_mm[2])
     for m in range(first_s.size):
         if np.isnan(first_s[m]) or np.isnan(second_s[m]):
-            out[m] = np.nan
+            for k in range(6):
+                out[m, k] = np.nan
             continue
         (x, y, z, w), before = _pose_at(readings, first_s[m])
         second, after = _pose_at(readings, second_s[m])
@@ -75,11 +76,19 @@ def steps_of_readings(
             out[m, 3 + k] = size * turn[k]
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _pose_at(readings: Readings, time_s: float) -> tuple[_Four, _Three]:
     """Rotation and place of the image at a time."""
     time, turned, moved = readings.time_s, readings.turned, readings.moved
-    k = max(min(int(np.searchsorted(time, time_s)), time.size - 1), 1) - 1
+    # NumPy's search is as quick, but takes half a second to compile.
+    low, high = 0, time.size
+    while low < high:
+        middle = (low + high) // 2
+        if time[middle] < time_s:
+            low = middle + 1
+        else:
+            high = middle
+    k = max(min(low, time.size - 1), 1) - 1
     n = min(k + 1, time.size - 1)
     part = (time_s - time[k]) / (time[n] - time[k]) if n > k else 0.0
     alike, across, along = 0.0, 0.0, 0.0
@@ -109,7 +118,7 @@ def _pose_at(readings: Readings, time_s: float) -> tuple[_Four, _Three]:
     return _product(sensor, (q[0], q[1], q[2], q[3])), place
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _product(a: _Four, b: _Four) -> _Four:
     """Of two quaternions."""
     return (
@@ -120,7 +129,7 @@ def _product(a: _Four, b: _Four) -> _Four:
     )
 
 
-@njit(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _turned(q: _Four, v: _Three) -> _Three:
     """A vector turned by a unit quaternion."""
     x = 2.0 * (q[1] * v[2] - q[2] * v[1])

@@ -21,7 +21,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.threads import in_parallel
-from speckle3d.kernels.planes import FitRules, FittedPlanes, Levers, agreeing_patches, fit_planes
+from speckle3d.kernels.plane_misfit import FitRules, Levers
+from speckle3d.kernels.planes import FittedPlanes, agreeing_patches, fit_planes
 from speckle3d.kernels.statistics import PatchCurves
 from speckle3d.motion.coherence import PairEchoes
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances

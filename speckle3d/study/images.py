@@ -190,7 +190,8 @@ class Strip:
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep the strip of a frame."""
         part = intensity[self._first : self._first + self.grid.vectors, : self.grid.samples * self._pool]
-        pooled = part.reshape(self.grid.vectors, self.grid.samples, self._pool).mean(axis=2)
+        # NumPy's mean takes more than twice as long over so short an axis.
+        pooled = np.einsum("vsp->vs", part.reshape(self.grid.vectors, self.grid.samples, -1)) / self._pool
         decibel = 10 * np.log10(np.maximum(pooled, 1e-12))
         self._images[index] = decibel.astype(np.float16)
 

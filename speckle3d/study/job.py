@@ -19,9 +19,8 @@ from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
-from speckle3d.correction.fused.fuse import FusedPoses
 from speckle3d.correction.modes import PUBLISHED
-from speckle3d.correction.scale import ScaledPoses
+from speckle3d.correction.scale import FusedPoses, ScaledPoses
 from speckle3d.correction.trust import believed, require_believed
 from speckle3d.corrections import Correction, correct
 from speckle3d.io.calibrations import apply_calibrations

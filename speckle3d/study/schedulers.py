@@ -33,6 +33,9 @@ CONNECT_S = 20
 DESERTED_S = 60
 """How long a cluster may be without any worker; a killed one is started again within seconds."""
 
+_PROFILE = "distributed.worker.profile.enabled"
+"""Whether Dask's workers sample their own stack, a hundred times a second; nothing here reads it."""
+
 _PAGES = (
     "distributed.scheduler.http.routes",
     "distributed.worker.http.routes",
@@ -188,7 +191,7 @@ def local_cluster(workers: int) -> Iterator[Any]:
     # A worker has one thread: more threads in the kernels would only compete with the other workers.
     env = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     security = _fresh_key()
-    silent = importlib.import_module("dask").config.set({key: [] for key in _PAGES})
+    silent = importlib.import_module("dask").config.set({_PROFILE: False} | {key: [] for key in _PAGES})
     with _without_interrupts(), silent:
         cluster = _dask().LocalCluster(
             n_workers=workers,

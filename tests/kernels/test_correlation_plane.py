@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from speckle3d.kernels.planes import predict_correlation
+from speckle3d.kernels.plane_misfit import predict_correlation
 
 STEP_MM, WIDTH_MM, CELLS = 0.01, 0.55, 60.0
 GRID_MM = np.arange(0, 3.0, STEP_MM)

@@ -4,15 +4,8 @@ import numpy as np
 import oracles
 import pytest
 
-from speckle3d.kernels.planes import (
-    EchoModels,
-    FitRules,
-    FittedPlanes,
-    Levers,
-    agreeing_patches,
-    fit_planes,
-    sum_by_halves,
-)
+from speckle3d.kernels.plane_misfit import EchoModels, FitRules, Levers
+from speckle3d.kernels.planes import FittedPlanes, agreeing_patches, fit_planes, sum_by_halves
 from speckle3d.kernels.statistics import PatchCurves
 
 STEP_MM, PATCHES, PAIRS = 0.01, 37, 24

@@ -16,74 +16,27 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.doubts import Doubt
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.fused.contradictions import Contradiction, contradictions, difference
 from speckle3d.correction.fused.images import ImageEvidence
 from speckle3d.correction.fused.sensors import SensorEvidence, SensorLimits, read_sensor
+from speckle3d.correction.fused.settings import FusedSettings
 from speckle3d.correction.fused.sides import on_felt_sides, on_sensed_sides
 from speckle3d.correction.fused.sizes import Wander
 from speckle3d.correction.fused.solution import Problem, Solution
-from speckle3d.correction.scale import ScaledPoses, ScaleEvidence
+from speckle3d.correction.scale import FusedPoses, ScaleEvidence
 from speckle3d.correction.trust import ORIENTATION, TRACKER
 
 UNUSED = 1e-9
 """Standard deviation of what a sensor does not have: an orientation sensor's millimetres."""
 LEAST_PATH_MM = 0.1
 """Travel by the images that a scale is given of at least."""
-
-
-class FusedSettings(BaseModel):
-    """What is assumed of the sensors beside their readings."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    mounting_sigma_rad: float = Field(
-        0.006,
-        gt=0,
-        description="How well it is known how the image is turned on a sensor: a third of a degree.",
-    )
-    mounting_sigma_mm: float = Field(0.5, gt=0, description="How well its place on a tracker is known.")
-    clock_sigma_s: float = Field(0.005, gt=0, description="How well the sensors' clocks are known.")
-    tracker_scale_sigma: float = Field(
-        0.004, gt=0, description="Relative error of a tracker's millimetres: distortion of its field."
-    )
-    inclination_sigma_rad: float = Field(
-        0.0026, gt=0, description="Slow error of an orientation sensor's inclination: 0.15 degrees."
-    )
-    heading_sigma_rad: float = Field(0.0087, gt=0, description="Slow error of its heading: half a degree.")
-    wander_s: float = Field(40.0, gt=0, description="Time in which these errors change.")
-    contradiction_sigma: float = Field(
-        6.0, gt=0, description="Deviations by which a sensor must differ from the images to contradict them."
-    )
-
-
-@dataclass(frozen=True)
-class FusedPoses(ScaledPoses):
-    """Poses from all that is known of a sweep.
-
-    Attributes
-    ----------
-    used : tuple of str
-        "images" and what else took part: "orientation sensor", "tracker", "crossing", "inertial".
-    contradictions : tuple of Doubt
-        Sensors that differ from the images by more than the errors of both; poses then allow for either.
-    sizes : dict of str to float
-        Standard deviations found of the sensors' errors: ``tracker_jitter_mm``, ``tracker_jitter_deg``,
-        ``tracker_wander_mm``, ``orientation_jitter_deg``, ``inclination_wander_deg``, ``heading_wander_deg``.
-    """
-
-    used: tuple[str, ...] = ()
-    contradictions: tuple[Doubt, ...] = ()
-    sizes: dict[str, float] | None = None
 
 
 def fuse(

@@ -20,7 +20,7 @@ from scenes import FIRST_SEED, borrowed_curves, short
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.correction.fused import fuse
+from speckle3d.correction.fused.fuse import fuse
 from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
@@ -124,8 +124,9 @@ def _speed(seed: int) -> Row:
 
 def _against_gtsam(seed: int, twin: type) -> str:
     """The same problem with a tracker, sizes given, in GTSAM with factors in Python."""
-    from speckle3d.correction.fused.fuse import FusedSettings, _sensors
+    from speckle3d.correction.fused.fuse import _sensors
     from speckle3d.correction.fused.images import ImageEvidence
+    from speckle3d.correction.fused.settings import FusedSettings
     from speckle3d.correction.fused.solution import Problem
 
     made = scene(seed, frames=60)

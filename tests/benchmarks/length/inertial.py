@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.inertial import correct_inertial
+from speckle3d.correction.inertial.scale import correct_inertial
 from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import Tracked, track
 

@@ -7,9 +7,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.streams import TimedPoses
-from speckle3d.correction.fused import fuse, images, sensors
-from speckle3d.correction.fused.fuse import FusedSettings, _sensors
+from speckle3d.correction.fused import images, sensors
+from speckle3d.correction.fused.fuse import _sensors, fuse
 from speckle3d.correction.fused.images import ImageEvidence
+from speckle3d.correction.fused.settings import FusedSettings
 from speckle3d.correction.fused.solution import Problem
 from speckle3d.correction.scale import ScaleEvidence
 from speckle3d.motion.trajectory import joined

@@ -7,7 +7,8 @@ import pytest
 from benchmarks.length.inertial_cases import CENTRE_MM, WOBBLE, Setup, along, drawn
 
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.correction.inertial import InertialPlan, correct_inertial, expected_scale_error
+from speckle3d.correction.inertial.expected import InertialPlan, expected_scale_error
+from speckle3d.correction.inertial.scale import correct_inertial
 
 CURVES_SIGMA = 0.1
 
