@@ -6,7 +6,6 @@ the same on bare arrays, laid out in `orientation_arrays`, samples and increment
 
 import math
 
-import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
@@ -18,7 +17,6 @@ from speckle3d.kernels.orientation_arrays import (
     BIAS,
     BIAS_WALK,
     CLEAN,
-    CROSS,
     DISTURBED,
     DISTURBS,
     DURATION,
@@ -30,14 +28,9 @@ from speckle3d.kernels.orientation_arrays import (
     FIELD_SD,
     FIRST_S,
     FORCE,
-    FORCE_NOISE,
     FOUND,
-    GAIN,
     GRAVITY,
-    GYRO_NOISE,
-    GYRO_SCALE_NOISE,
     HEADING,
-    INNOVATION,
     LEVEL,
     MAGNETIC,
     MATRIX,
@@ -53,7 +46,6 @@ from speckle3d.kernels.orientation_arrays import (
     REST_FORCE,
     REST_KNOWN,
     REST_MEMORY_S,
-    REST_NOISE,
     REST_RATE,
     REST_SPEED_VARIANCE,
     RESTART,
@@ -90,15 +82,17 @@ from speckle3d.kernels.orientation_arrays import (
     TURNS,
     VARIANCE,
     VECTOR,
-    WIDE,
 )
-from speckle3d.kernels.rotations import apply_into, product_into, solve_into, turn_into
-
-_SPEED_ZERO, _BIAS_SEEN, _NORTH_BIAS_SEEN, _NEW_NORTH, _NORTH, _KINDS = 0, 1, 2, 3, 4, 5
-"""Observations, in the order in which a step takes them."""
-
-_ALL, _LEVEL_ONLY, _HEADING_ONLY = 0, 1, 2
-"""States that an observation corrects."""
+from speckle3d.kernels.orientation_kalman import (
+    KINDS,
+    NEW_NORTH,
+    NORTH_BIAS_SEEN,
+    SPEED_ZERO,
+    predict_covariance,
+    update,
+    wrapped,
+)
+from speckle3d.kernels.rotations import apply_into, product_into, turn_into
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -163,13 +157,13 @@ def run_filter(
         starting = s[STARTING] > 0.0
         if starting:
             _begin(s, limits, step, work[TURNS], work[VECTOR])
-        kinds = 0 if starting and s[STARTING] > 0.0 else _KINDS
-        for kind in range(_NEW_NORTH if starting else _SPEED_ZERO, kinds):
-            if kind == _NEW_NORTH and not _sees_field(s, limits, step, starting, work):
+        kinds = 0 if starting and s[STARTING] > 0.0 else KINDS
+        for kind in range(NEW_NORTH if starting else SPEED_ZERO, kinds):
+            if kind == NEW_NORTH and not _sees_field(s, limits, step, starting, work):
                 break
             variance = _observe(kind, s, p, limits, step, work)
             if variance >= 0.0:
-                _update(kind, variance, s, p, limits[MAGNETIC] > 0.0, work)
+                update(kind, variance, s, p, limits[MAGNETIC] > 0.0, work)
         _about_up(s, step, MATRIX)
         for i in range(3):
             step[STEP_SPEED + i], step[STEP_BIAS + i] = s[SPEED + i], s[bias + i]
@@ -296,7 +290,7 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
             f[2, (9 if magnetic else 3) + j] = -z
             f[6, 3 + j], f[7, 3 + j], f[8, 3 + j] = vz * y - vy * z, vx * z - vz * x, vy * x - vx * y
     f[6, 1], f[7, 0] = limits[GRAVITY] * duration, -limits[GRAVITY] * duration
-    _predict_covariance(p, _rate(s, step), resting, limits, duration, work)
+    predict_covariance(p, _rate(s, step), resting, limits, duration, work)
     s[STRAY] *= f[12, 12]
     for i in range(3):
         s[BEFORE + 3 * i], s[BEFORE + 3 * i + 1] = level[3 * i], level[3 * i + 1]
@@ -316,44 +310,6 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
         step[PREDICTED + i] = level[i]
     for i in range(3):
         step[PREDICTED_SPEED + i] = s[SPEED + i]
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _predict_covariance(
-    p: FloatArray, rate: float, resting: bool, limits: FloatArray, duration: float, work: FloatArray
-) -> None:
-    f, wide = work[TRANSITION : TRANSITION + SIZE], work[WIDE : WIDE + SIZE]
-    q, size = work[NOISES : NOISES + SIZE], p.shape[0]  # not unrolled
-    turning = limits[GYRO_NOISE] * limits[GYRO_NOISE] + (limits[GYRO_SCALE_NOISE] * rate) ** 2
-    if resting:
-        turning = (limits[REST_NOISE] * limits[GYRO_NOISE]) ** 2
-    walk = limits[BIAS_WALK] * limits[BIAS_WALK] * duration
-    for i in range(3):
-        q[i, i] = turning * duration
-        q[i + 3, i + 3] = walk
-        q[i + 6, i + 6] = limits[FORCE_NOISE] * limits[FORCE_NOISE] * duration
-        if limits[MAGNETIC] > 0.0:
-            q[i + 9, i + 9] = q[i + 3, i + 9] = q[i + 9, i + 3] = walk
-    q[12, 12] = 0.0
-    if limits[MAGNETIC] > 0.0 and not resting:
-        q[12, 12] = 2.0 * limits[FIELD_SD] * limits[FIELD_SD] / limits[FIELD_PLACE_S] * duration
-    for i in range(size):
-        for j in range(size):
-            wide[i, j] = f[i, i] * p[i, j]
-        for k in range(size):
-            factor = f[i, k]
-            if k != i and factor != 0.0:
-                for j in range(size):
-                    wide[i, j] += factor * p[k, j]
-    for i in range(size):
-        for j in range(size):
-            p[i, j] = q[i, j] + f[j, j] * wide[i, j]
-    for j in range(size):
-        for k in range(size):
-            factor = f[j, k]
-            if k != j and factor != 0.0:
-                for i in range(size):
-                    p[i, j] += factor * wide[i, k]
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -424,12 +380,12 @@ def _observe(
     for r in range(3):
         for j in range(SIZE):
             shows[r, j] = 0.0
-    if kind == _SPEED_ZERO:  # a velocity of zero, whose error is a hand's, or smaller at rest, and persists
+    if kind == SPEED_ZERO:  # a velocity of zero, whose error is a hand's, or smaller at rest, and persists
         for i in range(3):
             shows[i, 6 + i], residual[i] = 1.0, -s[SPEED + i]
         return float((limits[REST_SPEED_VARIANCE] if resting else limits[SPEED_VARIANCE]) / duration)
-    if kind <= _NORTH_BIAS_SEEN:  # both copies of the bias, one by one, by the gyroscope's reading at rest
-        of_north = kind == _NORTH_BIAS_SEEN
+    if kind <= NORTH_BIAS_SEEN:  # both copies of the bias, one by one, by the gyroscope's reading at rest
+        of_north = kind == NORTH_BIAS_SEEN
         if not resting or (of_north and not magnetic):
             return -1.0
         for i in range(3):
@@ -438,9 +394,9 @@ def _observe(
         return float(limits[REST_BIAS_VARIANCE] / duration)
     shows[0, 2] = shows[0, 12] = 1.0
     x, y, z = reading[CLEAN], reading[CLEAN + 1], reading[CLEAN + 2]
-    if kind == _NEW_NORTH:  # a heading found beside iron, if it is far from that of the room's field
+    if kind == NEW_NORTH:  # a heading found beside iron, if it is far from that of the room's field
         place = limits[FIELD_SD] * limits[FIELD_SD]
-        residual[0] = _wrapped(-math.atan2(reading[RESTART + 1], reading[RESTART]) - s[HEADING] - s[STRAY])
+        residual[0] = wrapped(-math.atan2(reading[RESTART + 1], reading[RESTART]) - s[HEADING] - s[STRAY])
         square = residual[0] * residual[0]
         if reading[RESTARTED] == 0.0 or not square > 9.0 * (p[2, 2] + place):
             return -1.0
@@ -450,93 +406,6 @@ def _observe(
     if reading[DISTURBS] > 0.0 or horizontal == 0.0:
         return -1.0
     shows[0, 0], shows[0, 1] = -z * x / horizontal, -z * y / horizontal
-    residual[0] = _wrapped(-math.atan2(y, x) - s[HEADING] - s[STRAY])
+    residual[0] = wrapped(-math.atan2(y, x) - s[HEADING] - s[STRAY])
     noise = limits[FIELD_NOISE] * limits[FIELD_NOISE] + 2.0 * limits[FIELD_OFF_S] * reading[VARIANCE]
     return float(noise / duration)
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _wrapped(angle: float) -> float:
-    """Angle brought into [-pi, pi], as `math.remainder` does."""
-    return float(angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi)))
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _update(
-    kind: int, variance: float, s: FloatArray, p: FloatArray, magnetic: bool, work: FloatArray
-) -> None:
-    """Kalman's correction (Joseph's form) by the residuals in `work` of an observation of that kind.
-
-    Where there is a magnetometer, the field corrects the states of the heading alone, and the first copy of
-    the bias the others (Schmidt): errors of states left alone count as noise.
-    """
-    rows, size, corrected = 1 if kind >= _NEW_NORTH else 3, p.shape[0], _ALL  # size: not unrolled
-    if kind >= _NORTH_BIAS_SEEN:
-        corrected = _HEADING_ONLY
-    elif kind == _BIAS_SEEN and magnetic:
-        corrected = _LEVEL_ONLY
-    shows, cross, gain = work[SHOWS : SHOWS + 3], work[CROSS : CROSS + 3], work[GAIN : GAIN + 3]
-    wide, innovation = work[WIDE : WIDE + SIZE], work[INNOVATION : INNOVATION + 3]
-    for r in range(rows):
-        for j in range(size):
-            cross[r, j] = 0.0
-        for k in range(size):
-            factor = shows[r, k]
-            if factor != 0.0:
-                for j in range(size):
-                    cross[r, j] += factor * p[k, j]
-    for r in range(rows):
-        for t in range(rows):
-            total = variance if r == t else 0.0
-            for k in range(size):
-                total += cross[r, k] * shows[t, k]
-            innovation[r, t] = total
-        for j in range(size):
-            gain[r, j] = cross[r, j]
-    solve_into(innovation, gain[:rows])
-    for j in range(size):
-        north = j == 2 or j >= 9
-        if corrected != _ALL and north != (corrected == _HEADING_ONLY):
-            for r in range(rows):
-                gain[r, j] = 0.0
-    for i in range(size):
-        for j in range(size):
-            total = p[i, j]
-            for r in range(rows):
-                total -= gain[r, i] * cross[r, j]
-            wide[i, j] = total
-    for i in range(size):
-        for r in range(rows):
-            total = -variance * gain[r, i]
-            for k in range(size):
-                total += wide[i, k] * shows[r, k]
-            cross[r, i] = total
-    for i in range(size):
-        for j in range(size):
-            total = wide[i, j]
-            for r in range(rows):
-                total -= cross[r, i] * gain[r, j]
-            p[i, j] = total
-    _inject(rows, s, magnetic, work)
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _inject(rows: int, s: FloatArray, magnetic: bool, work: FloatArray) -> None:
-    """Apply the estimated error to the state."""
-    error, turn = work[VECTOR], work[TURNS]
-    level, speed = s[LEVEL : LEVEL + 9], s[SPEED : SPEED + 3]
-    for j in range(SIZE):
-        error[j] = 0.0
-        for r in range(rows):
-            error[j] += work[GAIN + r, j] * work[RESIDUAL, r]
-    if magnetic:
-        s[HEADING] = _wrapped(s[HEADING] + error[2])
-        error[2] = 0.0
-    turn_into(error[0], error[1], error[2], turn)
-    product_into(turn, level, level)
-    apply_into(turn, speed, speed)
-    for i in range(3):
-        speed[i] += error[6 + i]
-        s[BIAS + i] += error[3 + i]
-        s[NORTH_BIAS + i] += error[9 + i]
-    s[STRAY] += error[12]
