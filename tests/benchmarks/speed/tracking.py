@@ -63,7 +63,7 @@ def ratio(row: Row) -> Row:
 
 def transforms_per_second(sweep: Sweep, threads: int, runs: int) -> float:
     """Frames whose samples go to the band's spectrum and back in a second, single precision, nothing else."""
-    plan = IntensityExtractor.for_sweep(sweep).plan
+    plan = IntensityExtractor.for_sweep(sweep)._plan
     frame = np.asarray(sweep.frames[0], dtype=np.float32)
     band = np.zeros((frame.shape[0], plan.out_length), dtype=np.complex64)
     frames = 20 * threads
