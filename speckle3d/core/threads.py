@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
+from functools import partial
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
@@ -46,8 +47,9 @@ def cores() -> int:
         return 1
     affinity = getattr(os, "sched_getaffinity", None)
     allowed = len(affinity(0)) if affinity else os.cpu_count() or 1
-    limits = (int(value) for name in _LIMITS if (value := os.environ.get(name, "")).isdigit())
-    return max(1, min([allowed, *limits]))
+    # OpenMP's may be a list, by depth of nesting.
+    told = (os.environ.get(name, "").partition(",")[0].strip() for name in _LIMITS)
+    return max(1, min([allowed, *(int(value) for value in told if value.isascii() and value.isdecimal())]))
 
 
 @contextmanager
@@ -85,6 +87,14 @@ def _others() -> ThreadPoolExecutor:
     return _pool
 
 
+def _submitted(work: Callable[[], Result]) -> Future[Result] | None:
+    """Give work to another thread; None while the interpreter ends, when there are none."""
+    try:
+        return _others().submit(work)
+    except RuntimeError:
+        return None
+
+
 def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1) -> None:
     """Call a function with the first and the end of slices of ``range(count)``, until all are done.
 
@@ -107,16 +117,21 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
     size = max(grain, -(-count // (_SLICES_PER_CORE * threads)))
     starts = itertools.count(0, size)
 
+    failed: list[bool] = []
+
     def work() -> None:
         # The counter gives each start once, whichever thread asks.
         for first in iter(starts.__next__, None):
-            if first >= count:
+            if first >= count or failed:
                 return
             function(first, min(first + size, count))
 
-    others = [_others().submit(_helping(work)) for _ in range(threads - 1)]
+    others = [other for _ in range(threads - 1) if (other := _submitted(_helping(work)))]
     try:
         work()
+    except BaseException:
+        failed.append(True)
+        raise
     finally:
         begun = [other for other in others if not other.cancel()]
         wait(begun)
@@ -149,7 +164,8 @@ class _Ahead(Generic[Item, Result]):
 
     def __init__(self, function: Callable[[Item], Result], item: Item) -> None:
         self._function, self._item = function, item
-        self.future: Future[Result] = _others().submit(copy_context().run, function, item)
+        work = partial(copy_context().run, function, item)
+        self.future: Future[Result] = _submitted(work) or Future()
 
     def begin_here(self) -> bool:
         """Make the result on this thread, unless it is made or being made."""
@@ -158,7 +174,7 @@ class _Ahead(Generic[Item, Result]):
         self.future = Future()
         try:
             self.future.set_result(self._function(self._item))
-        except BaseException as error:  # noqa: BLE001 (raised when its turn comes)
+        except Exception as error:  # noqa: BLE001 (raised when its turn comes; Ctrl-C at once)
             self.future.set_exception(error)
         return True
 

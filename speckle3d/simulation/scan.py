@@ -13,6 +13,7 @@ from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.scatter import EchoGrid, FieldTable, field_table, scatter_echoes
@@ -58,6 +59,13 @@ class SimulatedFrames:
     snr_db: float = 40.0
     noise_entropy: int = 0
     any_thread: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        pitch_mm, probe_mm = self.image.vector_pitch_mm, self.beam.probe.pitch_mm
+        if not np.isclose(pitch_mm, probe_mm, rtol=1e-9, atol=0.0):
+            raise InvalidInputError(
+                f"expected vectors at the probe's pitch, {probe_mm:g} mm, got {pitch_mm:g} mm"
+            )
 
     @property
     def shape(self) -> tuple[int, int, int]:

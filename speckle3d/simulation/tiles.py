@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from functools import partial
 from threading import Lock
 from typing import Generic, TypeVar
 
@@ -55,6 +56,10 @@ class Tiles(Generic[Made]):
     def __len__(self) -> int:
         return len(self._kept)
 
+    def __reduce__(self) -> tuple[type[Tiles[Made]], tuple[Callable[[int, int], Made], int]]:
+        """Copies make their own tiles."""
+        return type(self), (self._make, self._most)
+
     def __call__(self, indices: Iterable[tuple[int, int]]) -> list[Made]:
         """Return tiles; threads that need the same ones share the work of making them."""
         tiles = [self._tile(int(i), int(j)) for i, j in indices]
@@ -64,7 +69,7 @@ class Tiles(Generic[Made]):
 
     def _tile(self, i: int, j: int) -> _Tile[Made]:
         with self._lock:
-            tile = self._kept.pop((i, j), None) or _Tile(lambda: self._make(i, j))
+            tile = self._kept.pop((i, j), None) or _Tile(partial(self._make, i, j))
             self._kept[i, j] = tile
             if len(self._kept) > self._most:
                 self._kept.popitem(last=False)

@@ -1,8 +1,10 @@
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
+from speckle3d.core import memory
 from speckle3d.core.memory import borrowed
 
 
@@ -42,3 +44,16 @@ def test_threads_share_no_memory_that_is_in_use():
 
     with ThreadPoolExecutor(4) as threads:
         assert np.all(list(threads.map(fill, range(200))))
+
+
+def test_no_more_is_kept_than_the_limit(monkeypatch):
+    monkeypatch.setattr(memory, "_pieces", defaultdict(list))
+    monkeypatch.setattr(memory, "_MOST_BYTES", 2**20)
+    held = [borrowed((2**18,), np.uint8) for _ in range(6)]
+    for i, array in enumerate(held):
+        array[:] = i
+    assert [int(array[-1]) for array in held] == list(range(6))
+    assert sum(size * len(kept) for size, kept in memory._pieces.items()) == 2**20
+    del held, array
+    borrowed((2**19,), np.uint8)
+    assert sum(size * len(kept) for size, kept in memory._pieces.items()) <= 2**20

@@ -1,5 +1,7 @@
 """Tiles that are made once, whichever threads ask, and forgotten in the order they were asked for."""
 
+import copy
+import pickle
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -49,3 +51,11 @@ def test_a_tile_that_could_not_be_made_is_tried_again():
 def test_seeds_differ_on_either_side_of_the_origin():
     assert len({tile_seed(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}) == 9
     assert min(min(tile_seed(i, j)) for i in (-1, 1) for j in (-1, 1)) >= 0
+
+
+def test_a_copy_makes_its_own_tiles():
+    tiles = Tiles(divmod, 3)
+    assert tiles([(7, 2), (9, 4)]) == [(3, 1), (2, 1)]
+    for other in (copy.deepcopy(tiles), pickle.loads(pickle.dumps(tiles))):
+        assert len(other) == 0
+        assert other([(7, 2)]) == [(3, 1)]

@@ -187,7 +187,7 @@ def _sane(vectors: FloatArray | None, kept: BoolArray) -> FloatArray | None:
 
 def _within(rows: FloatArray) -> bool:
     """Whether all are numbers that may be a measurement; without a copy of them."""
-    return bool(rows.max() < _ABSURD and rows.min() > -_ABSURD)  # a NaN makes this false
+    return bool(rows.max(initial=0.0) < _ABSURD and rows.min(initial=0.0) > -_ABSURD)  # false for a NaN
 
 
 # -- the sensor's own orientation
