@@ -12,7 +12,7 @@ TARGET = 0.55
 
 def rows() -> list[Row]:
     """Time on two workers over that on one; workers are there already, and have done one sweep each."""
-    paths, warm, config = short_study()
+    paths, warm, config = short_study(frames=60)
     with tempfile.TemporaryDirectory() as folder:
         one, two = (
             timed(paths, warm, config, Path(folder) / str(workers), workers, kill=False)[0]
