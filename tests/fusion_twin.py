@@ -10,11 +10,12 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from xsens.fusion.detectors import FieldMonitor, FieldReading
 from xsens.fusion.errorstate import ANGLE, BIAS, HEADING, SPEED, ErrorStateFilter
 from xsens.fusion.increments import Increment, Samples, increments_of, turn_matrix
 from xsens.fusion.settings import FusionSettings
+from xsens.fusion.smoothing import Smoothed
 
 _CHUNK = 64
 """Blocks summed with one bias, about two seconds; its later change is corrected to first order."""
@@ -128,27 +129,6 @@ def _step(kalman: ErrorStateFilter, increment: Increment) -> Step:
 
 
 # -- backward
-
-
-@dataclass(frozen=True)
-class Smoothed:
-    """Smoothed orientation at the start of a stretch and at the end of each step.
-
-    Attributes
-    ----------
-    matrices : ndarray, shape (steps + 1, 3, 3)
-        World from sensor.
-    bias_rad_s : ndarray, shape (steps + 1, 3)
-    sd_rad : ndarray, shape (steps + 1, 3)
-        Standard deviation about the world's axes.
-    disturbed, resting : ndarray of bool, shape (steps,)
-    """
-
-    matrices: FloatArray
-    bias_rad_s: FloatArray
-    sd_rad: FloatArray
-    disturbed: BoolArray
-    resting: BoolArray
 
 
 def smooth(samples: Samples, settings: FusionSettings) -> tuple[list[Step], Smoothed]:
