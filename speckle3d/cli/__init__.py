@@ -30,7 +30,9 @@ from speckle3d.cli import (  # noqa: F401
     imu,
     imu_accuracy,
     reconstruction,
+    reslices,
     trajectory,
+    volumes,
 )
 from speckle3d.cli.common import app, note
 from speckle3d.core.errors import NoSpaceError, Speckle3DError

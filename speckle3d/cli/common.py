@@ -67,6 +67,29 @@ Region = Annotated[
     str | None, typer.Option(help='Polygon "column,row column,row ..." outside which nothing counts.')
 ]
 
+ReconstructionFile = Annotated[
+    Path,
+    typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder."),
+]
+PosedFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="INPUT",
+        help="reconstruction.h5 of a results folder, or a recording with a calibrated tracker or true poses.",
+    ),
+]
+Mode = Annotated[
+    str | None,
+    typer.Option(
+        help="Which poses to use: image (default), orientation, pose, crossed, inertial, fused of a "
+        "reconstruction; tracker, truth of a recording."
+    ),
+]
+SweepFile = Annotated[
+    Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
+]
+DynamicRange = Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")]
+
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:

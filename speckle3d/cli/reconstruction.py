@@ -1,4 +1,4 @@
-"""Reconstructing a sweep, and looking at what was reconstructed."""
+"""Reconstructing a sweep."""
 
 from __future__ import annotations
 
@@ -24,18 +24,6 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 if TYPE_CHECKING:
     from speckle3d.core.sweep import Sweep
     from speckle3d.study.job import JobResult
-
-ReconstructionFile = Annotated[
-    Path,
-    typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder."),
-]
-Mode = Annotated[
-    str, typer.Option(help="Which poses to use: image, orientation, pose, crossed, inertial, fused.")
-]
-SweepFile = Annotated[
-    Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
-]
-DynamicRange = Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")]
 
 
 @app.command()
@@ -176,64 +164,3 @@ def _find_curves(given: Path | None, sweep_file: Path) -> Path:
         )
     note(f"curves: {beside}")
     return beside
-
-
-@app.command()
-def volume(
-    reconstruction_file: ReconstructionFile,
-    out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha or .nii.gz to write.")],
-    mode: Mode = "image",
-    voxel_mm: Annotated[float, typer.Option(help="Side of a voxel.")] = 0.2,
-    sweep_file: SweepFile = None,
-    dynamic_range_db: DynamicRange = 60.0,
-) -> None:
-    """Compound the frames into voxels, at the poses of one mode."""
-    from speckle3d.imaging.volume import compound
-    from speckle3d.io.volumes import write_volume
-    from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.images import grey_images, open_reconstruction
-
-    require_own_place(out, "volume", reconstruction_file, sweep_file)
-    reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
-    with progress_bar(f"compounding {out.name}") as progress:
-        images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
-        voxels = compound(images, images.grid, poses_of(reconstruction, mode), voxel_mm, voxel_type="uint8")
-    write_volume(out, voxels)
-
-
-@app.command()
-def reslice(
-    reconstruction_file: ReconstructionFile,
-    out: Annotated[Path, typer.Option("-o", "--output", help="PNG to write.")],
-    mode: Mode = "image",
-    lateral_mm: Annotated[
-        float | None, typer.Option(help="Cut along the sweep at this lateral position (middle).")
-    ] = None,
-    depth_mm: Annotated[float | None, typer.Option(help="Cut parallel to the skin at this depth.")] = None,
-    reach_mm: Annotated[float, typer.Option(help="Frames farther from a pixel do not count.")] = 0.5,
-    sweep_file: SweepFile = None,
-    dynamic_range_db: DynamicRange = 60.0,
-) -> None:
-    """Cut a plane straight from the frames, at the poses of one mode."""
-    from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames, surface_plane
-    from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.figures import figure_reslice, save_figure
-    from speckle3d.study.images import grey_images, open_reconstruction
-
-    if lateral_mm is not None and depth_mm is not None:
-        raise InvalidInputError("expected --lateral-mm or --depth-mm, got both")
-    require_own_place(out, "picture", reconstruction_file, sweep_file)
-    reconstruction, sweep = open_reconstruction(reconstruction_file, sweep_file)
-    poses = poses_of(reconstruction, mode)
-    with progress_bar(f"reslicing {out.name}") as progress:
-        images = grey_images(sweep, dynamic_range_db, progress, reconstruction)
-        if depth_mm is not None:
-            plane = surface_plane(poses, images.grid, depth_mm)
-            labels = ("elevational / mm", "lateral / mm")
-        else:
-            middle = images.grid.width_mm / 2
-            plane = along_sweep_plane(poses, images.grid, middle if lateral_mm is None else lateral_mm)
-            labels = ("elevational / mm", "depth / mm")
-        cut = reslice_frames(images, images.grid, poses, plane, reach_mm)
-    decibel = cut / 255 * dynamic_range_db
-    save_figure(figure_reslice({mode: (decibel, plane)}, dynamic_range_db, sweep.name, labels), out)

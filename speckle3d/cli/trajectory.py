@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, note
+from speckle3d.cli.common import Json, ReconstructionFile, app, emit, note
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.cli.reconstruction import Mode, ReconstructionFile
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -39,7 +38,9 @@ _LABELS = (
 def export(
     reconstruction_file: ReconstructionFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="Text file to write.")],
-    mode: Mode = "image",
+    mode: Annotated[
+        str, typer.Option(help="Which poses to use: image, orientation, pose, crossed, inertial, fused.")
+    ] = "image",
     length_unit: Unit = "m",
 ) -> None:
     """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 
+VOXEL_TYPES = ("uint8", "int16", "uint16", "float32")
+"""Types that voxels may have."""
+
 
 @dataclass(frozen=True)
 class Volume:
@@ -19,11 +24,14 @@ class Volume:
 
     Parameters
     ----------
-    voxels : ndarray of uint8 or float32, shape (n_i, n_j, n_k)
+    voxels : ndarray of a type in `VOXEL_TYPES`, shape (n_i, n_j, n_k)
+        In any order in memory; files have the first axis run fastest.
     spacing_mm : tuple of float
         Distance between neighbouring voxel centres along i, j and k.
     world_from_grid : RigidTransform
         Pose of the grid, mm; its origin is the centre of voxel ``[0, 0, 0]``.
+    fields : mapping of str to str
+        What files say of the voxels beside where they lie: what their levels are, how they were made.
 
     Examples
     --------
@@ -35,12 +43,13 @@ class Volume:
     voxels: npt.NDArray[Any]
     spacing_mm: tuple[float, float, float]
     world_from_grid: RigidTransform
+    fields: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
         if self.voxels.ndim != 3 or 0 in self.voxels.shape:
             raise InvalidInputError(f"voxels: expected shape (n_i, n_j, n_k), got {self.voxels.shape}")
-        if self.voxels.dtype not in (np.dtype(np.uint8), np.dtype(np.float32)):
-            raise InvalidInputError(f"voxels: expected uint8 or float32, got {self.voxels.dtype}")
+        if self.voxels.dtype.name not in VOXEL_TYPES:
+            raise InvalidInputError(f"voxels: expected {', '.join(VOXEL_TYPES)}, got {self.voxels.dtype}")
         spacing = tuple(float(step) for step in self.spacing_mm)
         if len(spacing) != 3 or not all(np.isfinite(step) and step > 0 for step in spacing):
             raise InvalidInputError(f"spacing_mm: expected three values above zero, got {spacing}")

@@ -6,7 +6,6 @@ otherwise: in the mode `image` lateral, axial and elevational of the first frame
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -17,7 +16,8 @@ from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import Images, PosedImages, require_poses
+from speckle3d.imaging.grid import VoxelGrid, grid_around
+from speckle3d.imaging.images import Images, PosedImages
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
@@ -25,68 +25,7 @@ DEFAULT_FILL_RADIUS = 3
 MAX_MEMORY_GB = 4.0
 """Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
 
-BYTES_PER_VOXEL = 16
-"""Sum, count and hole distance at four bytes each, and as much again of passing masks and copies."""
-
 VoxelType = Literal["float32", "uint8"]
-
-
-@dataclass(frozen=True)
-class VoxelGrid:
-    """Where voxels lie.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Number of voxels along i, j and k.
-    spacing_mm : tuple of float
-        Distance between neighbouring voxel centres along i, j and k.
-    world_from_grid : RigidTransform
-        Its origin is the centre of voxel ``[0, 0, 0]``; mm.
-    """
-
-    shape: tuple[int, int, int]
-    spacing_mm: tuple[float, float, float]
-    world_from_grid: RigidTransform
-
-    @property
-    def memory_gb(self) -> float:
-        """Memory that compounding on this grid takes, GB."""
-        return float(np.prod(np.asarray(self.shape, dtype=float)) * BYTES_PER_VOXEL / 1e9)
-
-
-def grid_around(
-    grid: ImageGrid,
-    world_from_image: RigidTransform,
-    voxel_mm: float,
-    world_from_axes: Rotation | None = None,
-) -> VoxelGrid:
-    """Smallest grid of cubic voxels that holds the corners of every image.
-
-    Parameters
-    ----------
-    grid : ImageGrid
-    world_from_image : RigidTransform, length n
-    voxel_mm : float
-    world_from_axes : Rotation, optional
-        Directions of the voxel axes; without it, the world's.
-
-    Raises
-    ------
-    InvalidInputError
-        If `voxel_mm` is not positive, or there are no poses.
-    """
-    if not (np.isfinite(voxel_mm) and voxel_mm > 0):
-        raise InvalidInputError(f"voxel_mm: expected a value above zero, got {voxel_mm}")
-    require_poses(world_from_image)
-    axes = Rotation.identity() if world_from_axes is None else world_from_axes
-    corners = np.concatenate([world_from_image.apply(corner) for corner in grid.corners_mm])
-    along = axes.inv().apply(corners)
-    low, high = along.min(axis=0), along.max(axis=0)
-    # A corner half a voxel past the last centre would round up, and so may one a rounding error short of it.
-    n_i, n_j, n_k = (int(n) + 1 for n in np.floor((high - low) / voxel_mm + 0.5 + 1e-6))
-    placed = RigidTransform.from_components(axes.apply(low), axes)
-    return VoxelGrid((n_i, n_j, n_k), (voxel_mm, voxel_mm, voxel_mm), placed)
 
 
 def compound(
