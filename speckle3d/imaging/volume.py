@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
@@ -17,6 +16,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.grid import VoxelGrid, grid_around
+from speckle3d.imaging.holes import EMPTY, MEASURED, fill_holes
 from speckle3d.imaging.images import Images, PosedImages
 
 DEFAULT_FILL_RADIUS = 3
@@ -138,12 +138,7 @@ def _index_from_sample(voxel_grid: VoxelGrid, source: PosedImages) -> FloatArray
 
 
 def _fill_holes(voxels: Float32Array, fill_radius: int) -> None:
-    from speckle3d.kernels.compounding import fill_from_shell
-
-    empty = np.isnan(voxels)
-    if fill_radius > 0 and empty.any():
-        distance = distance_transform_cdt(empty, metric="chessboard")
-        fill_from_shell(voxels, np.asarray(distance, dtype=np.int32), fill_radius)
+    fill_holes(voxels, np.where(np.isnan(voxels), EMPTY, MEASURED).astype(np.uint8), fill_radius)
 
 
 def _as_uint8(voxels: Float32Array) -> ByteArray:
