@@ -118,7 +118,7 @@ def _checked_boxes(radius: int | npt.ArrayLike) -> IntArray:
     given = np.asarray(radius)
     if given.dtype.kind not in "iu" or (given.ndim > 0 and given.shape[1:] != (3,)):
         raise InvalidInputError(
-            f"radius: expected a number of voxels, or boxes of shape (n, 3), got {radius}"
+            f"radius: expected a number of voxels, or boxes of shape (n, 3), got {radius!r}"
         )
     boxes = np.asarray(given, dtype=np.int64)
     if given.size > 0 and not 0 <= given.min() <= given.max() <= MAX_RADIUS:
