@@ -180,8 +180,8 @@ class Region:
 
 def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray]:
     """Where the samples lie: x, shape (vector, 1), and y, shape (1, sample)."""
-    x = np.arange(grid.vectors)[:, None] * grid.vector_pitch_mm
-    y = grid.first_sample_depth_mm + np.arange(grid.samples)[None, :] * grid.sample_spacing_mm
+    x = np.arange(float(grid.vectors))[:, None] * grid.vector_pitch_mm
+    y = grid.first_sample_depth_mm + np.arange(float(grid.samples))[None, :] * grid.sample_spacing_mm
     return x, y
 
 
