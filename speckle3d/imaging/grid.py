@@ -295,8 +295,8 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
         return float(np.log(np.ptp(points @ axes.as_matrix(), axis=0) + skin).sum())
 
     def smallest_near(start: Rotation) -> Rotation:
-        best = fmin(log_volume, np.zeros(3), (start,), 1e-6, 1e-7, initial_simplex=_SIMPLEX, disp=False)
-        return start * Rotation.from_rotvec(best)
+        turn = fmin(log_volume, np.zeros(3), (start,), 1e-6, 1e-6, initial_simplex=_SIMPLEX, disp=False)
+        return start * Rotation.from_rotvec(turn)
 
     found = [lateral_first, Rotation.identity()]
     starts = (*found, _spread_axes(points), *(lateral_first * turn for turn in _STARTS))
