@@ -92,8 +92,8 @@ class Placed:
         far = near & (np.maximum(-low, high) > _FARTHEST).any(axis=1)
         if far.any():
             raise InvalidInputError(
-                f"images[{int(np.argmax(far))}]: expected to reach less than {_FARTHEST:.0f} voxels beyond the "
-                "grid: take larger voxels, or check the poses"
+                f"images[{int(np.argmax(far))}]: expected to reach less than {_FARTHEST:.0f} voxels beyond "
+                "the grid: take larger voxels, or check the poses"
             )
         return np.flatnonzero(near)
 
@@ -165,3 +165,183 @@ def _spans(source: PosedImages, mask: BoolArray | None, turned: bool) -> IntArra
     line, first = np.nonzero(inside[:, 1:] & ~inside[:, :-1])
     _, stop = np.nonzero(~inside[:, 1:] & inside[:, :-1])
     return np.ascontiguousarray(np.stack([line, first, stop], axis=1).astype(np.int64))
+
+
+class Accumulator:
+    """What images give to the voxels of a block of planes, by one way of splatting and one rule.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Voxels of the block along k, j and i.
+    kind : dtype
+        Of the images, as kernels read them.
+    splat : {"nearest", "linear"}
+    rule : {"mean", "maximum", "latest", "weighted"}
+    most_samples : float
+        Upper bound of the samples in a voxel.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int, int], kind: np.dtype[Any], splat: Splat, rule: Rule, most_samples: float
+    ) -> None:
+        self.shape, self.splat, self.rule = shape, splat, rule
+        self.counts = (
+            splat == "nearest" and rule == "mean" and kind.kind in "iu" and most_samples < 2**_COUNT_BITS
+        )
+        self._offset = 2**15 if kind.kind == "i" else 0
+        self._table = self._empty_table()
+        self._tags = np.zeros(shape if rule == "latest" else (1, 1, 1), np.uint32)
+
+    def _empty_table(self) -> npt.NDArray[Any]:
+        if self.rule == "maximum":
+            return np.full(self.shape, np.nan, np.float32)
+        return np.zeros(self.shape, np.uint64) if self.counts else np.zeros((*self.shape, 2))
+
+    def add(
+        self,
+        images: npt.NDArray[Any],
+        weights: Float32Array,
+        maps: IntArray,
+        spans: IntArray,
+        first_tag: int,
+    ) -> None:
+        """Add images, shape (n, line, sample), whose maps are fixed-point ones from `fixed_maps`."""
+        from speckle3d.kernels import splatting as kernels
+
+        whole = np.array([[0, n] for n in self.shape[::-1]], dtype=np.int64)
+        # Threads share out voxels, not images, along the axis that each image crosses most of.
+        axis = _common_axis(maps, images.shape[1:], whole)
+        tag = first_tag if self.rule == "latest" else 0
+
+        def work(first: int, stop: int) -> None:
+            box = whole.copy()
+            box[axis] = first, stop
+            if self.rule == "maximum":
+                raised = kernels.raise_nearest if self.splat == "nearest" else kernels.raise_linear
+                raised(images, maps, spans, box, self._table)
+            elif self.counts:
+                kernels.count_nearest(images, maps, spans, box, self._offset, self._table)
+            else:
+                added = kernels.add_nearest if self.splat == "nearest" else kernels.add_linear
+                added(images, weights, maps, spans, box, tag, self._table, self._tags)
+
+        count = int(whole[axis, 1])
+        in_parallel(work, count, max(_LEAST_BLOCK, -(-count // (_BLOCKS_PER_CORE * cores()))))
+
+    def finish(self) -> tuple[Float32Array, ByteArray]:
+        """Voxels, NaN where no sample was, and their states; both of shape (n_k, n_j, n_i)."""
+        from speckle3d.kernels import splatting as kernels
+
+        if self.rule == "maximum":
+            return self._table, (~np.isnan(self._table)).view(np.uint8)
+        voxels, state = np.empty(self.shape, np.float32), np.empty(self.shape, np.uint8)
+
+        def work(first: int, stop: int) -> None:
+            part = slice(first, stop)
+            if self.counts:
+                kernels.means_of_counts(self._table[part], self._offset, voxels[part], state[part])
+            else:
+                kernels.means_of_sums(self._table[part], voxels[part], state[part])
+
+        in_parallel(work, self.shape[0])
+        return voxels, state
+
+
+def bytes_per_voxel(splat: Splat, rule: Rule) -> int:
+    """Memory that an `Accumulator` and what it makes take at most, bytes per voxel."""
+    if rule == "maximum":
+        return 5
+    return 16 + 5 + (4 if rule == "latest" else 0)
+
+
+def fixed_maps(index_from_sample: FloatArray, splat: Splat, first_plane: int, turned: bool) -> IntArray:
+    """Maps from (line, sample, 1) to positions in units of 2^-40 voxel, planes counted from `first_plane`."""
+    maps = index_from_sample[:, :, [1, 0, 2]] if turned else index_from_sample
+    fixed = np.rint(maps * 2.0**_POSITION_BITS).astype(np.int64)
+    ahead = 0.5 + _BORDER if splat == "nearest" else 0.5 ** (_SHARE_BITS + 1)
+    fixed[:, :, 2] += int(ahead * 2.0**_POSITION_BITS)
+    fixed[:, 2, 2] -= first_plane << _POSITION_BITS
+    return np.ascontiguousarray(fixed)
+
+
+def _common_axis(maps: IntArray, shape: tuple[int, ...], box: IntArray) -> int:
+    """Axis of the voxels along which images extend most."""
+    extent = np.abs(maps[:, :, :2]).astype(float) @ np.asarray(shape, dtype=float) / 2.0**_POSITION_BITS
+    shared = np.minimum(extent / box[:, 1], 1.0).mean(axis=0)
+    return int(np.argmax(shared * np.minimum(box[:, 1], _LEAST_BLOCK * 4)))
+
+
+def splat_block(
+    placed: Placed, voxel_grid: VoxelGrid, splat: Splat, rule: Rule, first: int, stop: int
+) -> tuple[Float32Array, ByteArray]:
+    """Give images to the voxels of some planes.
+
+    Parameters
+    ----------
+    placed : Placed
+        On `voxel_grid`.
+    voxel_grid : VoxelGrid
+    splat, rule
+        As `CompoundingSettings` has them.
+    first, stop : int
+        Planes along k.
+
+    Returns
+    -------
+    voxels : ndarray of float32, shape (stop - first, n_j, n_i)
+        NaN where no sample was.
+    state : ndarray of uint8
+        1 where one was, else 0.
+    """
+    n_i, n_j, _ = voxel_grid.shape
+    box = np.array([[0, n_i], [0, n_j], [first, stop]], dtype=np.int64)
+    accumulator = None
+    for batch in _batches(placed.source, placed.touching(box)):
+        if accumulator is None:
+            most = _most_samples(placed)
+            accumulator = Accumulator((stop - first, n_j, n_i), batch.images.dtype, splat, rule, most)
+            spans = _spans(placed.source, placed.mask, batch.turned)
+        maps = fixed_maps(placed.index_from_sample[batch.frames], splat, first, batch.turned)
+        weights = _weights_of(placed, batch) if rule == "weighted" else _ones(batch)
+        accumulator.add(batch.images, weights, maps, spans, int(batch.frames[0]) + 1)
+    if accumulator is None:
+        shape = (stop - first, n_j, n_i)
+        return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
+    return accumulator.finish()
+
+
+def _most_samples(placed: Placed) -> float:
+    """Upper bound of the samples of all frames in one voxel."""
+    across, along = np.moveaxis(placed.index_from_sample[:, :, :2], 2, 0)
+    area = float(np.linalg.norm(np.cross(across, along), axis=1).min())
+    steps = np.array([np.linalg.norm(each, axis=1).max() for each in (across, along)])
+    # Cells of the samples that a voxel's cut, at most its diagonal wide, can touch.
+    reach = np.sqrt(3.0) + steps.sum()
+    grid = placed.source.grid
+    return float(len(placed.source)) * min(grid.vectors * grid.samples, float(reach) ** 2 / max(area, 1e-12))
+
+
+def _ones(batch: _Batch) -> Float32Array:
+    return _constant(np.ones(len(batch.frames), np.float32), batch)
+
+
+def _constant(weights: Float32Array, batch: _Batch) -> Float32Array:
+    """One weight per frame as images, without memory for them."""
+    return np.lib.stride_tricks.as_strided(weights, batch.images.shape, (weights.strides[0], 0, 0))
+
+
+def _weights_of(placed: Placed, batch: _Batch) -> Float32Array:
+    """Weights of the samples of a batch, shape (n, line, sample)."""
+    weights = placed.weights
+    if weights is None:
+        raise InvalidInputError(
+            "weights: expected one per frame, or images of them, with the rule 'weighted'"
+        )
+    if isinstance(weights, np.ndarray) and weights.ndim == 1:
+        return _constant(np.ascontiguousarray(weights[batch.frames], np.float32), batch)
+    source = PosedImages(weights, placed.source.grid, placed.source.world_from_image)
+    read = [source.read(int(frame)) for frame in batch.frames]
+    some = np.stack([each.T for each in read] if batch.turned else read)
+    # In the layout of the constant ones, for which the kernels are compiled.
+    return np.lib.stride_tricks.as_strided(some, some.shape, some.strides)

@@ -1,7 +1,7 @@
 """Samples of frames given to the voxels that they lie in, or to the eight around them.
 
-Positions are whole numbers of 2^-40 voxel, so that stepping along a line adds no error and a part of the voxels gets
-exactly what it gets as part of all. Lines are cut to the voxels wanted before they are walked.
+Positions are whole numbers of 2^-40 voxel, so that stepping along a line adds no error and a part of the
+voxels gets exactly what it gets as part of all. Lines are cut to the voxels wanted before they are walked.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Tags = npt.NDArray[np.uint32]
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _cut(start: int, stop: int, at: int, step: int, low: int, high: int) -> tuple[int, int]:
-    """Samples of ``range(start, stop)`` whose position ``at + sample * step`` is at least `low` and below `high`."""
+    """Samples of a range whose position ``at + sample * step`` is at least `low` and below `high`."""
     first, last = at + start * step, at + (stop - 1) * step
     if min(first, last) >= low and max(first, last) < high:
         return start, stop
@@ -71,7 +71,8 @@ def count_nearest(
     ----------
     images : ndarray of integers, shape (n, line, sample)
     maps : ndarray, shape (n, 3, 3)
-        From (line, sample, 1) to positions (i, j, k) in units of 2^-40 voxel; voxel n reaches from n to n + 1.
+        From (line, sample, 1) to positions (i, j, k) in units of 2^-40 voxel; voxel n reaches from n to n + 1
+        whole ones.
     spans : ndarray, shape (m, 3)
         Line, first sample and end of what is used of every image.
     box : ndarray, shape (3, 2)
@@ -137,8 +138,8 @@ def add_nearest(
     maps, spans, box
         As for `count_nearest`.
     first_tag : int
-        With 0 all images count; else the last that has a sample in a voxel: this is the first one's tag, and the
-        others' follow.
+        With 0 all images count; else the last that has a sample in a voxel: this is the first one's tag, and
+        the others' follow.
     table : ndarray, shape (n_k, n_j, n_i, 2), changed in place
         Sum of weighted levels, and of weights.
     tags : ndarray, shape (n_k, n_j, n_i), changed in place
@@ -212,11 +213,7 @@ def _share_out(
     i, j, k = cell
     at = (k * n_j + j) * n_i + i
     plane = n_j * n_i
-    if (
-        box[0, 0] <= i < box[0, 1] - 1
-        and box[1, 0] <= j < box[1, 1] - 1
-        and box[2, 0] <= k < box[2, 1] - 1
-    ):
+    if box[0, 0] <= i < box[0, 1] - 1 and box[1, 0] <= j < box[1, 1] - 1 and box[2, 0] <= k < box[2, 1] - 1:
         _give(sums, marks, tag, at, totals[0], weights[0])
         _give(sums, marks, tag, at + 1, totals[1], weights[1])
         _give(sums, marks, tag, at + n_i, totals[2], weights[2])
@@ -228,11 +225,7 @@ def _share_out(
         return
     for corner in range(8):
         a, b, c = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
-        if (
-            box[0, 0] <= a < box[0, 1]
-            and box[1, 0] <= b < box[1, 1]
-            and box[2, 0] <= c < box[2, 1]
-        ):
+        if box[0, 0] <= a < box[0, 1] and box[1, 0] <= b < box[1, 1] and box[2, 0] <= c < box[2, 1]:
             _give(sums, marks, tag, (c * n_j + b) * n_i + a, totals[corner], weights[corner])
 
 
@@ -257,8 +250,8 @@ def add_linear(
     images, weights, spans, box, table, tags
         As for `add_nearest`.
     maps : ndarray, shape (n, 3, 3)
-        As for `add_nearest`, but the centre of voxel n is n, and positions are half of 2^-10 voxel ahead: shares are
-        of positions rounded to 2^-10 voxel.
+        As for `add_nearest`, but the centre of voxel n is n, and positions are half of 2^-10 voxel ahead:
+        shares are of positions rounded to 2^-10 voxel.
     first_tag : int
         As for `add_nearest`; with tags, shares below 1/8 do not count.
     """
