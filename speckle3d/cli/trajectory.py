@@ -52,7 +52,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write the poses of one mode as TUM text, time_s x y z qx qy qz qw, image to world; or as ITK transforms.
+    """Write the poses of one mode as TUM text (time_s x y z qx qy qz qw, image to world), or ITK transforms.
 
     Transforms are as 3D Slicer reads them: axes lead left, posterior and superior, mm.
     """
