@@ -54,6 +54,9 @@ def write_polylines(
     for name, numbers in (values or {}).items():
         if numbers.shape != (count,) or not name.isidentifier():
             raise InvalidInputError(f"{path}: {name!r}: expected {count} values, got shape {numbers.shape}")
-        pieces += [f"SCALARS {name} float 1\nLOOKUP_TABLE default\n".encode(), numbers.astype(">f4").tobytes()]
+        pieces += [
+            f"SCALARS {name} float 1\nLOOKUP_TABLE default\n".encode(),
+            numbers.astype(">f4").tobytes(),
+        ]
     with atomic_path(path) as part:
         part.write_bytes(b"".join(pieces) + b"\n")

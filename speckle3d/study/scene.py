@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
@@ -21,6 +21,8 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
+from speckle3d.core.printable import printable
+from speckle3d.core.volume import Volume
 from speckle3d.imaging.outlines import frame_outlines
 from speckle3d.imaging.volume import DEFAULT_FILL_RADIUS, compound
 from speckle3d.io.fileset import FileSet
@@ -69,7 +71,8 @@ class _Files:
 
     @classmethod
     def of(cls, mode: str) -> _Files:
-        return cls(f"volume-{mode}.nrrd", f"state-{mode}.seg.nrrd", f"outlines-{mode}.vtk", f"first-{mode}.tfm")
+        names = ("volume-{}.nrrd", "state-{}.seg.nrrd", "outlines-{}.vtk", "first-frame-{}.tfm")
+        return cls(*(name.format(mode) for name in names))
 
     @property
     def all(self) -> tuple[str, ...]:
@@ -111,6 +114,22 @@ def write_scene(
         (part / SCENE).write_text(scene_text(modes, posed[0].sweep.name), encoding="utf-8")
 
 
+def require_scene_place(folder: Path, *inputs: Path | None) -> None:
+    """Refuse to write a scene into a folder that holds an input, or other things than a scene.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the folder.
+    """
+    if not folder.exists():
+        return
+    if any(each is not None and each.resolve().parent == folder.resolve() for each in inputs):
+        raise InvalidInputError(f"{folder}: holds an input: give another name")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / SCENE).is_file():
+        raise InvalidInputError(f"{folder}: expected a new name or a scene to replace, got another folder")
+
+
 def scene_text(modes: Sequence[str], title: str) -> str:
     """Scene of the modes' files as text.
 
@@ -119,10 +138,10 @@ def scene_text(modes: Sequence[str], title: str) -> str:
     title : str
         What names of nodes begin with.
     """
-    environment = jinja2.Environment(autoescape=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
-    nodes = [*_modes_nodes(modes, title), *_view_nodes()]
-    return template.render(nodes=nodes)
+    nodes = [node for i, mode in enumerate(modes, 1) for node in _mode_nodes(i, mode, printable(title))]
+    return template.render(nodes=[*nodes, *_view_nodes()])
 
 
 def _write_mode(
@@ -130,42 +149,77 @@ def _write_mode(
 ) -> None:
     files = _Files.of(posed.mode)
     images, grid = posed.images(settings.dynamic_range_db, progress)
-    volume = compound(
-        images, grid, posed.world_from_image, settings.voxel_mm,
-        fill_radius=settings.fill_radius, voxel_type="uint8",
-    )  # fmt: skip
-    write_volume(folder / files.volume, volume)
+    poses, voxel_mm = posed.world_from_image, settings.voxel_mm
+    volume = compound(images, grid, poses, voxel_mm, fill_radius=settings.fill_radius)
+    measured = compound(images, grid, poses, voxel_mm, fill_radius=0)
+    state = np.where(np.isfinite(measured.voxels), 1, np.where(np.isfinite(volume.voxels), 2, 0))
     place = volume.spacing_mm, volume.world_from_grid
-    write_volume(folder / files.state, LabelMap(volume.state, *place, {}, STATE_SEGMENTS))
-    outlines = frame_outlines(grid, posed.world_from_image)
+    levels = np.clip(np.nan_to_num(np.rint(volume.voxels)), 0, 255).astype(np.uint8)
+    write_volume(folder / files.volume, Volume(levels, *place, volume.fields))
+    write_volume(folder / files.state, LabelMap(state.astype(np.uint8), *place, {}, STATE_SEGMENTS))
+    outlines = frame_outlines(grid, poses)
     write_polylines(folder / files.outlines, outlines, {"frame": posed.frames.astype(np.float64)})
-    write_transform(folder / files.first, posed.world_from_image[0])
+    write_transform(folder / files.first, poses[0])
 
 
-def _modes_nodes(modes: Sequence[str], title: str) -> Iterator[_Node]:
-    for i, mode in enumerate(modes, start=1):
-        files, name = _Files.of(mode), f"{title} {mode}"
-        visible = "true" if i == 1 else "false"
-        yield from _stored(
-            "Volume", "ScalarVolume", i, name, files.volume, "VolumeArchetypeStorage", "VolumeArchetype",
-            {"UseOrientationFromFile": "1", "centerImage": "0"},
-        )  # fmt: skip
-        yield _displayed("VolumeDisplay", "ScalarVolumeDisplay", i, colorNodeID="vtkMRMLColorTableNodeGrey")
-        yield from _stored(
-            "Segmentation", "Segmentation", i, f"{name} voxels", files.state, "SegmentationStorage", "Segmentation",
-            {}, f"referenceImageGeometryRef:vtkMRMLScalarVolumeNode{i};",
-        )  # fmt: skip
-        yield _displayed("SegmentationDisplay", "SegmentationDisplay", i, visibility="false", opacity="0.5")
-        yield from _stored(
-            "Model", "Model", i, f"{name} frames", files.outlines, "ModelStorage", "Model",
-            {"coordinateSystem": "LPS"},
-        )  # fmt: skip
-        yield _displayed(
-            "ModelDisplay", "ModelDisplay", i, color=_COLOURS[(i - 1) % len(_COLOURS)], lineWidth="1",
-            representation="1", lighting="false", visibility=visible, scalarVisibility="false",
-        )  # fmt: skip
-        yield from _stored(
-            "LinearTransform", "LinearTransform", i, f"{name} first frame", files.first, "TransformStorage",
-            "Transform", {}, has_display=False,
-        )  # fmt: skip
-    ...
+def _mode_nodes(i: int, mode: str, title: str) -> Iterator[_Node]:
+    """Nodes of one mode, counted from 1; those that others refer to come first."""
+    files, name = _Files.of(mode), f"{title}, {mode}"
+    yield from _stored(
+        "Volume", f"vtkMRMLScalarVolumeNode{i}", name,
+        _storage("VolumeArchetypeStorage", i, files.volume, centerImage="0", UseOrientationFromFile="1"),
+        _Node("VolumeDisplay", {
+            "id": f"vtkMRMLScalarVolumeDisplayNode{i}", "colorNodeID": "vtkMRMLColorTableNodeGrey",
+            "interpolate": "1", "autoWindowLevel": "0", "window": "255", "level": "127.5",
+        }),
+    )  # fmt: skip
+    yield from _stored(
+        "Segmentation", f"vtkMRMLSegmentationNode{i}", f"{name}: voxels measured and filled",
+        _storage("SegmentationStorage", i, files.state),
+        _Node("SegmentationDisplay", {
+            "id": f"vtkMRMLSegmentationDisplayNode{i}", "visibility": "false", "opacity": "0.5",
+        }),
+        referenceImageGeometryRef=f"vtkMRMLScalarVolumeNode{i}",
+    )  # fmt: skip
+    yield from _stored(
+        "Model", f"vtkMRMLModelNode{i}", f"{name}: frames",
+        _storage("ModelStorage", i, files.outlines, coordinateSystem="LPS"),
+        _Node("ModelDisplay", {
+            "id": f"vtkMRMLModelDisplayNode{i}", "color": _COLOURS[(i - 1) % len(_COLOURS)],
+            "lineWidth": "1", "representation": "1", "lighting": "false", "scalarVisibility": "false",
+            "visibility": "true" if i == 1 else "false",
+        }),
+    )  # fmt: skip
+    yield from _stored(
+        "LinearTransform", f"vtkMRMLLinearTransformNode{i}", f"{name}: first frame",
+        _storage("TransformStorage", i, files.first), None,
+    )  # fmt: skip
+
+
+def _view_nodes() -> Iterator[_Node]:
+    """What the three slice views show: the first volume."""
+    for view in _VIEWS:
+        attributes = {
+            "id": f"vtkMRMLSliceCompositeNode{view}", "singletonTag": view, "layoutName": view,
+            "backgroundVolumeID": "vtkMRMLScalarVolumeNode1", "linkedControl": "1",
+        }  # fmt: skip
+        yield _Node("SliceComposite", attributes)
+
+
+def _storage(tag: str, i: int, file: str, **attributes: str) -> _Node:
+    # Names of files in a scene are URLs.
+    place = {"id": f"vtkMRML{tag}Node{i}", "fileName": quote(file), "useCompression": "1"}
+    return _Node(tag, {**place, **attributes})
+
+
+def _stored(
+    tag: str, identity: str, name: str, storage: _Node, display: _Node | None, **references: str
+) -> Iterator[_Node]:
+    """A node with its storage, its display and what else it refers to."""
+    yield storage
+    roles = {"storage": storage.attributes["id"], **references}
+    if display is not None:
+        yield display
+        roles = {"display": display.attributes["id"], **roles}
+    told = "".join(f"{role}:{to};" for role, to in roles.items())
+    yield _Node(tag, {"id": identity, "name": name, "references": told})
