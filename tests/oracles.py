@@ -42,7 +42,7 @@ def reslice_nearest(
 
 
 def bin_mean(images, image_points_world, world_from_grid, spacing_mm, shape):
-    """Twin of `speckle3d.kernels.compounding.add_samples`: mean of the samples nearest each voxel centre.
+    """Twin of `speckle3d.kernels.splatting.count_nearest`: mean of the samples nearest each voxel centre.
 
     images: (n, vector, sample); image_points_world: (n, vector, sample, 3). NaN where a voxel has none.
     """

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,14 +12,14 @@ from scipy.optimize import fmin
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import require_poses
 
 BYTES_PER_VOXEL = 16
-"""Sum, count and hole distance at four bytes each, and as much again of passing masks and copies."""
+"""Sum and count, or sums of shares and of levels, at eight bytes each: what compounding holds at most."""
 
 MAX_VOXELS_ALONG = 1_000_000
 """Most voxels along an axis, to catch wrong units: 100 m at 0.1 mm."""
@@ -59,28 +61,31 @@ class VoxelGrid:
         start = self.world_from_grid * RigidTransform.from_translation([0, 0, first * self.spacing_mm[2]])
         return VoxelGrid((*self.shape[:2], stop - first), self.spacing_mm, start)
 
-    @property
-    def memory_gb(self) -> float:
-        """Memory that compounding on this grid takes, GB."""
-        return float(np.prod(np.asarray(self.shape, dtype=float)) * BYTES_PER_VOXEL / 1e9)
+    def size_gb(self, voxel_type: str) -> float:
+        """Size of the voxels alone, GB."""
+        return math.prod(float(n) for n in self.shape) * np.dtype(voxel_type).itemsize / 1e9
+
+    def __str__(self) -> str:
+        voxels = " x ".join(str(n) for n in self.shape)
+        return f"{voxels} voxels of {' x '.join(f'{step:g}' for step in self.spacing_mm)} mm"
 
 
 @dataclass(frozen=True)
 class Slab:
     """Some planes of a volume.
 
-    Parameters
+    Attributes
     ----------
     first : int
-        Number of the first plane along k.
-    voxels : ndarray of float32, shape (planes, n_j, n_i)
-        NaN where empty.
+        The first plane's number along k.
+    voxels : ndarray, shape (planes, n_j, n_i)
+        Of the type asked for; empty ones are NaN in float32 and 0 in whole numbers.
     state : ndarray of uint8, shape (planes, n_j, n_i)
-        `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.imaging.holes`.
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.imaging.holes`.
     """
 
     first: int
-    voxels: Float32Array
+    voxels: npt.NDArray[Any]
     state: ByteArray
 
 
