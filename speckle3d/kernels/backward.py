@@ -45,7 +45,11 @@ def keep_nearest_in_planes(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def blend_planes(
-    distance_mm: Float32Array, grey: Float32Array, half_voxel_mm: float, voxels: Float32Array, state: ByteArray
+    distance_mm: Float32Array,
+    grey: Float32Array,
+    half_voxel_mm: float,
+    voxels: Float32Array,
+    state: ByteArray,
 ) -> None:
     """Interpolate voxels between the nearest images of either side.
 
