@@ -18,6 +18,9 @@ from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSam
 INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 """Vectors that an orientation sensor may measure beside its orientation, each of shape (m, 3)."""
 
+LARGEST_SKEW_RAD = 0.2
+"""Of an image's axes: those of published calibrations lean by 0.05."""
+
 _UNCALIBRATED = "the sensor is not calibrated to the image: {} lacks the attribute {}"
 
 
@@ -163,13 +166,21 @@ class BModeSettings:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Where the samples of a frame lie in the image plane P, mm."""
+    """Where the samples of a frame lie in the image plane P, mm.
+
+    Attributes
+    ----------
+    shear : float
+        Lateral mm by which a sample lies beside its vector's first one, per mm of depth: of images whose
+        measured calibration is not square, when they are compounded; else zero.
+    """
 
     vectors: int
     samples: int
     vector_pitch_mm: float
     sample_spacing_mm: float
     first_sample_depth_mm: float = 0.0
+    shear: float = 0.0
 
     def __post_init__(self) -> None:
         _require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
@@ -177,6 +188,8 @@ class ImageGrid:
             raise InvalidInputError(
                 f"first_sample_depth_mm: expected a finite value, got {self.first_sample_depth_mm}"
             )
+        if not np.isfinite(self.shear):
+            raise InvalidInputError(f"shear: expected a finite value, got {self.shear}")
 
     @property
     def width_mm(self) -> float:
@@ -191,13 +204,24 @@ class ImageGrid:
     @property
     def centre_mm(self) -> FloatArray:
         """The image's centre in P, shape (3,), mm."""
-        return np.array([self.width_mm / 2, (self.first_sample_depth_mm + self.depth_mm) / 2, 0.0])
+        beside_mm = self.shear * (self.depth_mm - self.first_sample_depth_mm)
+        middle_mm = (self.first_sample_depth_mm + self.depth_mm) / 2
+        return np.array([(self.width_mm + beside_mm) / 2, middle_mm, 0.0])
 
     @property
     def corners_mm(self) -> FloatArray:
         """The image's corners in P, clockwise from the top left, shape (4, 3), mm."""
         x, top, bottom = self.width_mm, self.first_sample_depth_mm, self.depth_mm
-        return np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
+        corners = np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
+        corners[:, 0] += self.shear * (corners[:, 1] - self.first_sample_depth_mm)
+        return corners
+
+    @property
+    def image_from_sample(self) -> FloatArray:
+        """Linear map from (vector, sample, 1) to (x, y, z) in P, mm, shape (3, 3)."""
+        down = self.sample_spacing_mm
+        across = [self.vector_pitch_mm, self.shear * down, 0.0]
+        return np.array([across, [0.0, down, self.first_sample_depth_mm], [0.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -243,11 +267,26 @@ class OrientationSensor(_Sensor[Rotation]):
 
 @dataclass(frozen=True)
 class Tracker(_Sensor[RigidTransform]):
-    """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
+    """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`.
+
+    Attributes
+    ----------
+    image_skew_rad : float
+        What a measured calibration of pixels has beyond the rigid `sensor_from_image`, which is the nearest
+        to it: its columns and its rows lean towards each other by so much in all, half of it each. Only
+        compounding looks at it.
+    """
 
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")
 
     readings: TimedPoses
+    image_skew_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not abs(self.image_skew_rad) <= LARGEST_SKEW_RAD:
+            raise InvalidInputError(
+                f"image_skew_rad: expected at most {LARGEST_SKEW_RAD:g} either way, got {self.image_skew_rad}"
+            )
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -83,10 +83,35 @@ class PosedImages:
 
     def index_from_image(self) -> FloatArray:
         """Affine map from image coordinates (x, y, z, 1) in mm to (vector, sample, z in mm), shape (3, 4)."""
-        pitch, spacing = self.grid.vector_pitch_mm, self.grid.sample_spacing_mm
+        pitch, spacing, shear = self.grid.vector_pitch_mm, self.grid.sample_spacing_mm, self.grid.shear
         scaled = np.diag([1.0 / pitch, 1.0 / spacing, 1.0, 1.0])[:3]
-        scaled[1, 3] = -self.grid.first_sample_depth_mm / spacing
+        scaled[0, 1] = -shear / pitch
+        scaled[:2, 3] = self.grid.first_sample_depth_mm * np.array([shear / pitch, -1.0 / spacing])
         return scaled
+
+
+def skewed(grid: ImageGrid, poses: RigidTransform, skew_rad: float) -> tuple[ImageGrid, RigidTransform]:
+    """Place images whose columns and rows lean towards each other by an angle, half of it each.
+
+    That is what a measured calibration of pixels has beyond the nearest rigid pose. The same place is a
+    sheared grid whose columns lie along x, turned by half the angle.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+        With the distances of columns and of rows as they were calibrated.
+    poses : RigidTransform, length n
+        The nearest rigid ones; the first sample of the first vector stays where they put it.
+    skew_rad : float
+    """
+    leaning = replace(
+        grid,
+        sample_spacing_mm=float(grid.sample_spacing_mm * np.cos(skew_rad)),
+        shear=float(np.tan(skew_rad)),
+    )
+    first = np.array([0.0, grid.first_sample_depth_mm, 0.0])
+    turn = Rotation.from_rotvec([0.0, 0.0, skew_rad / 2])
+    return leaning, poses * RigidTransform.from_components(first - turn.apply(first), turn)
 
 
 @dataclass(frozen=True)

@@ -128,12 +128,10 @@ def _bin_mean(voxel_grid: VoxelGrid, source: PosedImages) -> Float32Array:
 
 def _index_from_sample(voxel_grid: VoxelGrid, source: PosedImages) -> FloatArray:
     """Per image, the map from (vector, sample, 1) to fractional (i, j, k), shape (n, 3, 3)."""
-    grid_from_image = (voxel_grid.world_from_grid.inv() * source.world_from_image).as_matrix()
-    image_from_sample = np.zeros((4, 3))
-    image_from_sample[0, 0] = source.grid.vector_pitch_mm
-    image_from_sample[1, 1:] = source.grid.sample_spacing_mm, source.grid.first_sample_depth_mm
-    image_from_sample[3, 2] = 1.0
-    maps = (grid_from_image @ image_from_sample)[:, :3] / np.asarray(voxel_grid.spacing_mm)[:, None]
+    grid_from_image = voxel_grid.world_from_grid.inv() * source.world_from_image
+    maps = grid_from_image.rotation.as_matrix() @ source.grid.image_from_sample
+    maps[:, :, 2] += grid_from_image.translation
+    maps /= np.asarray(voxel_grid.spacing_mm)[:, None]
     return np.ascontiguousarray(maps)
 
 
