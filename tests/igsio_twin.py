@@ -42,7 +42,7 @@ class Clip:
     """Column and row of its origin, least and greatest radius, least and greatest angle in degrees."""
 
     def spans(self, width, height):
-        """First and last column of each of two pieces of every row, shape (height, 2, 2); empty if last < first."""
+        """First and last column of the two pieces of every row, shape (height, 2, 2); empty if last < first."""
         spans = np.tile([0, -1], (height, 2, 1))
         left, right = max(self.columns[0], 0), min(self.columns[1], width - 1)
         for row in range(max(self.rows[0], 0), min(self.rows[1], height - 1) + 1):
@@ -148,7 +148,11 @@ def _linear(image, axes, spans, volume, weight, rule):
                 share[:, 0] = one - share[:, 1]
                 if i < 0 or j < 0 or k < 0:
                     continue
-                if i + (share[0, 1] != 0) >= n_i or j + (share[1, 1] != 0) >= n_j or k + (share[2, 1] != 0) >= n_k:
+                if (
+                    i + (share[0, 1] != 0) >= n_i
+                    or j + (share[1, 1] != 0) >= n_j
+                    or k + (share[2, 1] != 0) >= n_k
+                ):
                     continue
                 level = int(image[row, column])
                 for corner in range(7, -1, -1):
@@ -187,7 +191,11 @@ def _across(volume, weight, sticks, longest, filled):
                     for side in range(2):
                         sign = 1 - 2 * side
                         for steps in range(1, longest - reach[0]):
-                            x, y, z = i + sign * steps * step[0], j + sign * steps * step[1], k + sign * steps * step[2]
+                            x, y, z = (
+                                i + sign * steps * step[0],
+                                j + sign * steps * step[1],
+                                k + sign * steps * step[2],
+                            )
                             if not (0 <= x < n_i and 0 <= y < n_j and 0 <= z < n_k):
                                 break
                             if weight[x, y, z]:
@@ -211,7 +219,7 @@ def _across(volume, weight, sticks, longest, filled):
 
 
 def fill_with_sticks(volume, weight, longest=9):
-    """Fill each hole across the shortest stick between two measured voxels; equally short ones count alike."""
+    """Fill each hole across the shortest stick between measured voxels; equally short ones count alike."""
     filled = volume.copy()
     _across(volume, weight, STICKS, longest, filled)
     return filled

@@ -170,9 +170,9 @@ class ImageGrid:
 
     Attributes
     ----------
-    shear : float
-        Lateral mm by which a sample lies beside its vector's first one, per mm of depth: of images whose
-        measured calibration is not square, when they are compounded; else zero.
+    skew_rad : float
+        Angle by which rows and vectors lean towards each other, half of it each, about the first sample: in
+        images whose measured calibration is not square, when they are compounded; else zero.
     """
 
     vectors: int
@@ -180,7 +180,7 @@ class ImageGrid:
     vector_pitch_mm: float
     sample_spacing_mm: float
     first_sample_depth_mm: float = 0.0
-    shear: float = 0.0
+    skew_rad: float = 0.0
 
     def __post_init__(self) -> None:
         _require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
@@ -188,8 +188,7 @@ class ImageGrid:
             raise InvalidInputError(
                 f"first_sample_depth_mm: expected a finite value, got {self.first_sample_depth_mm}"
             )
-        if not np.isfinite(self.shear):
-            raise InvalidInputError(f"shear: expected a finite value, got {self.shear}")
+        require_skew(self.skew_rad, "skew_rad")
 
     @property
     def width_mm(self) -> float:
@@ -204,24 +203,33 @@ class ImageGrid:
     @property
     def centre_mm(self) -> FloatArray:
         """The image's centre in P, shape (3,), mm."""
-        beside_mm = self.shear * (self.depth_mm - self.first_sample_depth_mm)
-        middle_mm = (self.first_sample_depth_mm + self.depth_mm) / 2
-        return np.array([(self.width_mm + beside_mm) / 2, middle_mm, 0.0])
+        if self.skew_rad:
+            return np.asarray(self.corners_mm.mean(axis=0))
+        return np.array([self.width_mm / 2, (self.first_sample_depth_mm + self.depth_mm) / 2, 0.0])
 
     @property
     def corners_mm(self) -> FloatArray:
         """The image's corners in P, clockwise from the top left, shape (4, 3), mm."""
+        if self.skew_rad:
+            v, s = self.vectors - 1, self.samples - 1
+            corners = np.array([[0, 0, 1], [v, 0, 1], [v, s, 1], [0, s, 1]])
+            return np.asarray(corners @ self.image_from_sample[:3].T)
         x, top, bottom = self.width_mm, self.first_sample_depth_mm, self.depth_mm
-        corners = np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
-        corners[:, 0] += self.shear * (corners[:, 1] - self.first_sample_depth_mm)
-        return corners
+        return np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
 
     @property
     def image_from_sample(self) -> FloatArray:
-        """Linear map from (vector, sample, 1) to (x, y, z) in P, mm, shape (3, 3)."""
-        down = self.sample_spacing_mm
-        across = [self.vector_pitch_mm, self.shear * down, 0.0]
-        return np.array([across, [0.0, down, self.first_sample_depth_mm], [0.0, 0.0, 0.0]])
+        """Affine map from (vector, sample, 1) to (x, y, z, 1) in P, mm, shape (4, 3)."""
+        along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
+        across, down = self.vector_pitch_mm, self.sample_spacing_mm
+        return np.array(
+            [
+                [along * across, beside * down, 0.0],
+                [beside * across, along * down, self.first_sample_depth_mm],
+                [0.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0],
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -283,10 +291,7 @@ class Tracker(_Sensor[RigidTransform]):
     image_skew_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        if not abs(self.image_skew_rad) <= LARGEST_SKEW_RAD:
-            raise InvalidInputError(
-                f"image_skew_rad: expected at most {LARGEST_SKEW_RAD:g} either way, got {self.image_skew_rad}"
-            )
+        require_skew(self.image_skew_rad, "image_skew_rad")
 
 
 @dataclass(frozen=True)
@@ -372,6 +377,12 @@ def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.Arr
     """Orientation ``world_from_image`` at each frame time, by either kind of sensor."""
     measured = sensor.world_from_image(frame_time_s)
     return measured.rotation if isinstance(measured, RigidTransform) else measured
+
+
+def require_skew(skew_rad: float, name: str) -> None:
+    """Raise `InvalidInputError` unless an image's axes are about square."""
+    if not abs(skew_rad) <= LARGEST_SKEW_RAD:
+        raise InvalidInputError(f"{name}: expected at most {LARGEST_SKEW_RAD:g} either way, got {skew_rad}")
 
 
 def _require_kind(sweep: Sweep) -> None:

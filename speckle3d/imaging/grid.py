@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import require_poses
-
-BYTES_PER_VOXEL = 16
-"""Sum, count and hole distance at four bytes each, and as much again of passing masks and copies."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +36,13 @@ class VoxelGrid:
         start = self.world_from_grid * RigidTransform.from_translation([0, 0, first * self.spacing_mm[2]])
         return VoxelGrid((*self.shape[:2], stop - first), self.spacing_mm, start)
 
-    @property
-    def memory_gb(self) -> float:
-        """Memory that compounding on this grid takes, GB."""
-        return float(np.prod(np.asarray(self.shape, dtype=float)) * BYTES_PER_VOXEL / 1e9)
+    def size_gb(self, voxel_type: str) -> float:
+        """Size of the voxels alone, GB."""
+        return math.prod(float(n) for n in self.shape) * np.dtype(voxel_type).itemsize / 1e9
+
+    def __str__(self) -> str:
+        voxels = " x ".join(str(n) for n in self.shape)
+        return f"{voxels} voxels of {' x '.join(f'{step:g}' for step in self.spacing_mm)} mm"
 
 
 def grid_around(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -63,7 +63,12 @@ class PosedImages:
         return len(self.world_from_image)
 
     def read(self, index: int) -> Float32Array:
-        """Image number `index`, shape (vector, sample), contiguous.
+        """Image number `index`, shape (vector, sample), contiguous; raises what `read_as_stored` does."""
+        # Writeable, so that read-only sources do not compile the kernels a second time.
+        return np.require(self.read_as_stored(index), np.float32, ["C", "W"])
+
+    def read_as_stored(self, index: int) -> npt.NDArray[Any]:
+        """Image number `index` in the type and the order in memory that it has, shape (vector, sample).
 
         Raises
         ------
@@ -78,40 +83,16 @@ class PosedImages:
             raise MismatchError(f"images[{index}]: expected shape {expected}, got {image.shape}")
         if np.iscomplexobj(image):
             raise InvalidInputError(f"images[{index}]: expected grey levels, got type {image.dtype}")
-        # Writeable, so that read-only sources do not compile the kernels a second time.
-        return np.require(image, np.float32, ["C", "W"])
+        return image
 
     def index_from_image(self) -> FloatArray:
         """Affine map from image coordinates (x, y, z, 1) in mm to (vector, sample, z in mm), shape (3, 4)."""
-        pitch, spacing, shear = self.grid.vector_pitch_mm, self.grid.sample_spacing_mm, self.grid.shear
-        scaled = np.diag([1.0 / pitch, 1.0 / spacing, 1.0, 1.0])[:3]
-        scaled[0, 1] = -shear / pitch
-        scaled[:2, 3] = self.grid.first_sample_depth_mm * np.array([shear / pitch, -1.0 / spacing])
-        return scaled
-
-
-def skewed(grid: ImageGrid, poses: RigidTransform, skew_rad: float) -> tuple[ImageGrid, RigidTransform]:
-    """Place images whose columns and rows lean towards each other by an angle, half of it each.
-
-    That is what a measured calibration of pixels has beyond the nearest rigid pose. The same place is a
-    sheared grid whose columns lie along x, turned by half the angle.
-
-    Parameters
-    ----------
-    grid : ImageGrid
-        With the distances of columns and of rows as they were calibrated.
-    poses : RigidTransform, length n
-        The nearest rigid ones; the first sample of the first vector stays where they put it.
-    skew_rad : float
-    """
-    leaning = replace(
-        grid,
-        sample_spacing_mm=float(grid.sample_spacing_mm * np.cos(skew_rad)),
-        shear=float(np.tan(skew_rad)),
-    )
-    first = np.array([0.0, grid.first_sample_depth_mm, 0.0])
-    turn = Rotation.from_rotvec([0.0, 0.0, skew_rad / 2])
-    return leaning, poses * RigidTransform.from_components(first - turn.apply(first), turn)
+        plane = np.zeros((3, 4))
+        image_from_sample = self.grid.image_from_sample
+        plane[:2, :2] = np.linalg.inv(image_from_sample[:2, :2])
+        plane[:2, 3] = -plane[:2, :2] @ image_from_sample[:2, 2]
+        plane[2, 2] = 1.0
+        return plane
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.imaging.images import ChosenImages, Images, PosedImages, skewed
+from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.settings import Levels
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
@@ -96,8 +96,8 @@ class PosedSweep:
         chosen = levels or usual_levels(self.sweep)
         self._require_range(chosen)
         every = grey_images(self.sweep, dynamic_range_db, progress, self.reconstruction, chosen)
-        grid, poses = skewed(every.grid, self.world_from_image, self.skew_rad)
-        return PosedImages(ChosenImages(every, self.frames), grid, poses), every.meaning
+        grid = replace(every.grid, skew_rad=self.skew_rad)
+        return PosedImages(ChosenImages(every, self.frames), grid, self.world_from_image), every.meaning
 
     @property
     def skew_rad(self) -> float:
