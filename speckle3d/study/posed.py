@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,8 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.settings import Levels
+from speckle3d.io.calibrations import apply_calibrations
+from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.reconstructions import FORMAT
@@ -124,6 +126,7 @@ def open_posed(
     mode: str | None = None,
     sweep_file: Path | None = None,
     settings: ImportSettings | None = None,
+    calibrations: Sequence[PathLike] = (),
 ) -> PosedSweep:
     """Open a reconstruction with its sweep, or a recording whose poses are known.
 
@@ -138,6 +141,8 @@ def open_posed(
         The reconstruction's sweep, if it moved.
     settings : ImportSettings, optional
         What the recording does not say; of a reconstruction, its sweep's are those it was made with.
+    calibrations : sequence of path
+        Calibration files to use in place of what the recording says of its sensors.
 
     Raises
     ------
@@ -147,7 +152,7 @@ def open_posed(
         If the recording does not say where its frames are.
     """
     if kind_of(path) == FORMAT:
-        if settings is not None and settings.model_fields_set:
+        if calibrations or (settings is not None and settings.model_fields_set):
             raise InvalidInputError(
                 f"{path}: expected a recording with what it does not say, got a reconstruction"
             )
@@ -164,6 +169,7 @@ def open_posed(
             "make its reconstruction first (speckle3d reconstruct)"
         )
     sweep, known = load_images(path, settings)
+    sweep, _ = apply_calibrations(sweep, calibrations)
     return replace(posed_by_itself(sweep, mode), range_is_known=known)
 
 
