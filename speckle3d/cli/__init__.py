@@ -29,8 +29,10 @@ from speckle3d.cli import (  # noqa: F401
     files,
     imu,
     imu_accuracy,
+    measure,
     reconstruction,
     reslices,
+    surfaces,
     trajectory,
     volumes,
 )
