@@ -67,7 +67,7 @@ class Surface:
     def normals(self) -> FloatArray:
         """Outward unit normal of each triangle, shape (m, 3); zero where it has no area."""
         normals = self.normals_mm2
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300))
 
     @property
     def area_mm2(self) -> float:
