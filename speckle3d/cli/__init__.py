@@ -32,6 +32,7 @@ from speckle3d.cli import (  # noqa: F401
     measure,
     reconstruction,
     reslices,
+    scenes,
     surfaces,
     trajectory,
     volumes,

@@ -44,3 +44,6 @@ class CompoundingSettings(BaseModel):
         gt=0,
         description="Memory to work in; a larger volume is made in slabs, written as they are done.",
     )
+    max_file_gb: float = Field(
+        64.0, gt=0, description="Largest volume to make: larger ones are more often due to a wrong unit."
+    )

@@ -178,7 +178,9 @@ def _add_tracker(
                 f"the tracker's {len(tracker.readings)} readings, of which {np.count_nonzero(covered)} "
                 f"interpolated ones are at the times of {len(frames)} frames"
             )
-    _add_calibration(sweep, tracker.sensor_from_image, f"{IMAGE}To{tool}", record, frames)
+    _add_calibration(
+        sweep, tracker.sensor_from_image, f"{IMAGE}To{tool}", record, frames, tracker.image_skew_rad
+    )
     return left_out
 
 
@@ -203,6 +205,7 @@ def _add_calibration(
     name: str,
     record: SequenceRecord,
     frames: list[dict[str, str]],
+    skew_rad: float = 0.0,
 ) -> None:
     if mounting is None:
         return
@@ -211,7 +214,7 @@ def _add_calibration(
     if held is not None and _same(sensor_from_image(held, grid.first_sample_depth_mm, name), mounting):
         return
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
-    matrix = image_matrix(mounting, *sizes)
+    matrix = image_matrix(mounting, *sizes, skew_rad)
     _add(frames, name, np.tile(matrix, (len(frames), 1, 1)), np.ones(len(frames), dtype=bool))
 
 
