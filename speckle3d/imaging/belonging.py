@@ -57,7 +57,8 @@ def require_inside(
         Naming the first point that lies outside.
     """
     found = belonging_of(points_mm, grid, world_from_image)
-    outside = np.flatnonzero((found.gap_mm > reach_mm) & (found.weights[:, 1] == 0.0))
+    far = (found.gap_mm > reach_mm) & (found.weights[:, 1] == 0.0)
+    outside = np.flatnonzero(far | np.isinf(found.gap_mm))
     if outside.size:
         row = int(outside[0])
         x, y, z = points_mm[row]
