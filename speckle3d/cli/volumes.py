@@ -75,6 +75,14 @@ def volume(
     state: Annotated[
         Path | None, typer.Option(help="Write which voxels are measured and filled, as labels.")
     ] = None,
+    deviation: Annotated[
+        Path | None,
+        typer.Option(help="Write each voxel's standard deviation of position along the sweep, mm."),
+    ] = None,
+    backward_mm: Annotated[
+        float | None,
+        typer.Option(help="For sparse sweeps: voxels between the nearest images, at most so far away."),
+    ] = None,
     max_memory_gb: Annotated[
         float | None, typer.Option(help="Memory to work in (2.5); larger volumes are made in slabs.")
     ] = None,
@@ -95,7 +103,7 @@ def volume(
     from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
-    for place in (out, state):
+    for place in (out, state, deviation):
         if place is not None:
             require_own_place(place, "volume", source, sweep_file, like, *(calibration or ()))
     base = load_settings(config_file).volume.model_dump()
@@ -107,6 +115,7 @@ def volume(
         GridRequest(axes, spacing_mm, origin_mm, shape, like),
         None if region is None else Region.from_text(region),
         state,
+        deviation,
     )
     imported = {name: options[name] for name in _OF_RECORDINGS}
     posed = open_as_told(source, mode, sweep_file, imported, calibration, dynamic_range_db)
