@@ -30,8 +30,8 @@ class CompoundingSettings(BaseModel):
     backward_mm: float = Field(
         0.0,
         ge=0,
-        description="If above zero, look each voxel up between the images nearest on either side, at most this far away, in "
-        "place of sharing out samples: for sparse sweeps.",
+        description="If above zero, look each voxel up between the images nearest on either side, at most this "
+        "far away, in place of sharing out samples: for sparse sweeps.",
     )
     fill_radius: int = Field(
         3,
@@ -41,8 +41,8 @@ class CompoundingSettings(BaseModel):
     voxel_type: VoxelType = Field("uint8", description="Type of the voxels; in float32 empty ones are NaN.")
     levels: Levels | Literal["auto"] = Field(
         "auto",
-        description="log (compressed to 0-255), linear (echo amplitude), or stored; auto: as stored for B-mode "
-        "and log for RF and I/Q.",
+        description="log (compressed to 0-255), linear (echo amplitude), or stored; auto: stored for B-mode, "
+        "log for RF and I/Q.",
     )
     dynamic_range_db: float = Field(60.0, gt=0, description="Range of the log-compressed grey levels.")
     max_memory_gb: float = Field(
