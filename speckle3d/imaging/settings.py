@@ -30,8 +30,8 @@ class CompoundingSettings(BaseModel):
     backward_mm: float = Field(
         0.0,
         ge=0,
-        description="If above zero, look each voxel up between the images nearest on either side, at most this "
-        "far away, in place of sharing out samples: for sparse sweeps.",
+        description="If above zero, look each voxel up between the images nearest on either side, at most "
+        "this far away, in place of sharing out samples: for sparse sweeps.",
     )
     fill_radius: int = Field(
         3,

@@ -17,8 +17,9 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.labels import STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.backward import backward_slabs
-from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, principal_axes, sweep_axes
+from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
