@@ -9,7 +9,16 @@ from typing import Literal
 from speckle3d.core.errors import FileError, InvalidInputError
 
 Kind = Literal[
-    "calibration", "curves", "log", "picture", "sequence", "simulation", "sweep", "trajectory", "volume"
+    "calibration",
+    "curves",
+    "log",
+    "picture",
+    "sequence",
+    "simulation",
+    "sweep",
+    "trajectory",
+    "transform",
+    "volume",
 ]
 
 _FIRST_BYTES = 4096
@@ -106,6 +115,17 @@ def _is_trajectory(path: Path) -> bool:
     return is_tum(path)
 
 
+def _is_transform(path: Path) -> bool:
+    """Whether a file is a transform of ITK, as text or HDF5."""
+    from speckle3d.io.hdf5 import SIGNATURE, open_hdf5
+
+    start = _start(path)
+    if not start.startswith(SIGNATURE):
+        return start.startswith(b"#Insight Transform File")
+    with open_hdf5(path) as file:
+        return "TransformGroup" in file
+
+
 _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "calibration": ("a calibration", _of_format("speckle3d.calibration")),
     "curves": ("curves", _of_format("speckle3d.curves")),
@@ -115,5 +135,6 @@ _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "simulation": ("a simulated sweep", _is_simulation),
     "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
     "trajectory": ("TUM text", _is_trajectory),
+    "transform": ("a transform", _is_transform),
     "volume": ("a volume", _is_volume),
 }
