@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperOption
 
-from speckle3d.cli.calibrations import fitted_pixels, mount, resize
 from speckle3d.cli.common import (
     CalibrationFiles,
     Json,
@@ -21,6 +19,7 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
+from speckle3d.cli.importing import Importing, Number, PlusConfig, Told, TransformName
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -128,22 +127,7 @@ def _write(path: Path, simulated: SimulatedSweep) -> None:
         write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
 
 
-Number = Annotated[float | None, typer.Option()]
-
-
-class _Importing(TyperCommand):
-    """A command with options of `ImportSettings`, whose help texts are those of its fields."""
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        from speckle3d.io.import_settings import ImportSettings
-
-        for param in self.params:
-            if isinstance(param, TyperOption) and param.name in ImportSettings.model_fields:
-                param.help = param.help or ImportSettings.model_fields[param.name].description
-        super().format_help(ctx, formatter)
-
-
-@app.command(cls=_Importing)
+@app.command(cls=Importing)
 def convert(
     source: Annotated[
         Path, typer.Argument(metavar="IN", help="Any recording that holds a sweep: a file, or a folder.")
@@ -167,9 +151,9 @@ def convert(
     dynamic_range_db: Number = None,
     frame_rate_hz: Number = None,
     probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
-    plus_config: Annotated[str | None, typer.Option(metavar="FILE")] = None,
+    plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: Annotated[str | None, typer.Option(metavar="NAME")] = None,
+    reference_transform: TransformName = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
         str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
@@ -188,8 +172,6 @@ def convert(
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
     """
-    from speckle3d.cli.recordings import require_sequence, require_unsaid
-    from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import import_notes, load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
@@ -209,16 +191,9 @@ def convert(
             raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    options["tracker_transform"] = transform
-    for name in ("transform", "reference_transform", "plus_config"):
-        require_sequence(source, options[name], f"--{name.replace('_', '-')}")
-    given = from_options(ImportSettings, options)
-    require_unsaid(source, given)
-    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
-    settings = given.model_copy(update=fitted)
-    sweep = resize(load_sweep(source, settings), fitted)
-    sweep = mount(sweep, calibration or ())
-    for each in import_notes(source, settings):
+    told = Told.of(source, options, calibration)
+    sweep = told.on(load_sweep(source, told.settings))
+    for each in import_notes(source, told.settings):
         note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:

@@ -63,8 +63,8 @@ def compound(
     With "nearest" a sample counts in the voxel it lies in; with "linear" in the eight whose centres are
     around it, by trilinear shares. A voxel becomes the mean of its samples by their shares, their maximum,
     the mean of those of the latest image that has any there, or their mean by weight; with "linear", shares
-    below 1/8 do not count for the maximum and the latest. An empty voxel is then the mean of those that are not in the
-    smallest cube around it that holds any; measured voxels stay as they are.
+    below 1/8 do not count for the maximum and the latest. An empty voxel is then the mean of those that are
+    not in the smallest cube around it that holds any; measured voxels stay as they are.
 
     Parameters
     ----------

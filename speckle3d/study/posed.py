@@ -124,6 +124,8 @@ def open_posed(
     mode: str | None = None,
     sweep_file: Path | None = None,
     settings: ImportSettings | None = None,
+    dynamic_range_db: float | None = None,
+    prepared: Callable[[Sweep], Sweep] | None = None,
 ) -> PosedSweep:
     """Open a reconstruction with its sweep, or a recording whose poses are known.
 
@@ -137,7 +139,11 @@ def open_posed(
     sweep_file : path, optional
         The reconstruction's sweep, if it moved.
     settings : ImportSettings, optional
-        What the recording does not say; of a reconstruction, its sweep's are those it was made with.
+        What the recording does not say; not of a reconstruction, whose sweep is as it was then.
+    dynamic_range_db : float, optional
+        Of B-mode that does not say its own, and only of that.
+    prepared : callable, optional
+        Changes the recording's sweep before poses are taken from it, as a calibration does.
 
     Raises
     ------
@@ -147,10 +153,6 @@ def open_posed(
         If the recording does not say where its frames are.
     """
     if kind_of(path) == FORMAT:
-        if settings is not None and settings.model_fields_set:
-            raise InvalidInputError(
-                f"{path}: expected a recording with what it does not say, got a reconstruction"
-            )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
         chosen = mode or "image"
         return PosedSweep(
@@ -163,19 +165,20 @@ def open_posed(
             f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
             "make its reconstruction first (speckle3d reconstruct)"
         )
-    sweep, known = load_images(path, settings)
-    return replace(posed_by_itself(sweep, mode), range_is_known=known)
+    sweep, known = _load(path, settings or ImportSettings(), dynamic_range_db)
+    return replace(posed_by_itself(prepared(sweep) if prepared else sweep, mode), range_is_known=known)
 
 
-def load_images(path: Path, settings: ImportSettings | None = None) -> tuple[Sweep, bool]:
+def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
     """Read a sweep whose grey levels may do as they are, and tell whether their dynamic range is known."""
     try:
         return load_sweep(path, settings), True
     except MissingSettingsError as error:
         if error.settings != (_RANGE,):
-            raise
-    given = (settings or ImportSettings()).model_copy(update={_RANGE: USUAL_RANGE_DB})
-    return load_sweep(path, given), False
+            lacking = tuple(name for name in error.settings if name != _RANGE)
+            raise MissingSettingsError(path, lacking) from None
+    given = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
+    return load_sweep(path, given), dynamic_range_db is not None
 
 
 def posed_by_itself(sweep: Sweep, mode: str | None = None) -> PosedSweep:
