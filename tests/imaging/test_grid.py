@@ -9,14 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.grid import (
-    grid_around,
-    grid_as_asked,
-    grid_like,
-    principal_axes,
-    spacing_within,
-    sweep_axes,
-)
+from speckle3d.imaging.axes import principal_axes, sweep_axes
+from speckle3d.imaging.grid import grid_around, grid_as_asked, grid_like, spacing_within
 
 GRID = ImageGrid(
     vectors=41, samples=60, vector_pitch_mm=0.5, sample_spacing_mm=0.4, first_sample_depth_mm=2.0
@@ -203,7 +197,7 @@ def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     found = spacing_within(GRID, poses, gigabytes, axes)
 
     def memory(spacing):
-        return grid_around(GRID, poses, spacing, axes).memory_gb
+        return grid_around(GRID, poses, spacing, axes).size_gb("uint8")
 
     steps = ("1.0", "1.2", "1.5", "2.0", "2.5", "3.0", "4.0", "5.0", "6.0", "8.0")
     assert f"{found:.1e}".split("e")[0] in steps
@@ -234,7 +228,7 @@ def test_wrong_input_is_refused():
         grid_around(GRID, poses, 1.0, Rotation.identity(2))
     with pytest.raises(InvalidInputError, match="up to 1000000 along"):
         grid_around(GRID, poses, 1e-6)
-    with pytest.raises(InvalidInputError, match="max_memory_gb"):
+    with pytest.raises(InvalidInputError, match="max_gb"):
         spacing_within(GRID, poses, 0.0)
     with pytest.raises(InvalidInputError, match="world_from_image"):
         sweep_axes(RigidTransform.identity(0))
