@@ -9,6 +9,7 @@ from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
 from .corrections import correct as correct
 from .crossing_sweeps import cross_sweeps as cross_sweeps
+from .imaging.surface import surface_of as surface_of
 from .imaging.volume import compound as compound
 from .io.calibrations import load_calibration as load_calibration
 from .io.calibrations import write_calibration as write_calibration
@@ -18,6 +19,8 @@ from .io.import_settings import ImportSettings as ImportSettings
 from .io.load import load_sweep as load_sweep
 from .io.readers import Reader as Reader
 from .io.reconstructions import read_reconstruction as read_reconstruction
+from .io.surfaces import read_surface as read_surface
+from .io.surfaces import write_surface as write_surface
 from .io.sweep_writer import write_sweep as write_sweep
 from .io.volumes import read_volume as read_volume
 from .io.volumes import write_volume as write_volume
@@ -31,5 +34,6 @@ from .simulation.presets import simulate as simulate
 from .study.images import grey_images as grey_images
 from .study.job import JobResult as JobResult
 from .study.job import run_job as run_job
+from .study.pose_errors import measure as measure
 
 __version__: str
