@@ -50,6 +50,13 @@ def volume(
     fill_radius: Annotated[
         int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
     ] = None,
+    reach_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="For sparse sweeps: interpolate each voxel between the images nearest on either side, up to "
+            "this far away, instead of splat, rule and fill."
+        ),
+    ] = None,
     voxel_type: Annotated[
         str | None, typer.Option(help="uint8, int16, uint16 or float32, in which empty voxels are NaN.")
     ] = None,

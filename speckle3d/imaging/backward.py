@@ -16,8 +16,8 @@ from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.grid import Slab, VoxelGrid
 from speckle3d.imaging.images import PosedImages
 
-BYTES_PER_VOXEL = 21
-"""Distance and level of an image on either side, the voxel, and its state."""
+BYTES_PER_VOXEL = 25
+"""Distance and level of an image on either side, the voxel, its state, and its copy of another type."""
 
 MAX_MEMORY_GB = 2.5
 """Default memory of a slab."""

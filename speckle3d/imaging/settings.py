@@ -32,6 +32,12 @@ class CompoundingSettings(BaseModel):
         ge=0,
         description="Half the edge, in voxels, of the largest cube from which a hole is filled; 0: none.",
     )
+    reach_mm: float | None = Field(
+        None,
+        gt=0,
+        description="For sparse sweeps: instead of splatting and filling, each voxel is interpolated between "
+        "the images nearest on either side, no farther from it than this.",
+    )
     voxel_type: VoxelType = Field("uint8", description="Type of the voxels; in float32 empty ones are NaN.")
     levels: Levels | None = Field(
         None,

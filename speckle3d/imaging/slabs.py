@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.imaging.backward import BYTES_PER_VOXEL, backward_slabs
 from speckle3d.imaging.grid import Slab, VoxelGrid
 from speckle3d.imaging.holes import EMPTY, fill_holes
 from speckle3d.imaging.images import PosedImages
@@ -39,7 +40,8 @@ def compound_slabs(
     source : PosedImages
     voxel_grid : VoxelGrid
     settings : CompoundingSettings, optional
-        `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have them.
+        `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have them. With
+        `reach_mm` neither are `splat`, `rule` and `fill_radius`.
     weights : ndarray of shape (n,), or images of weights, optional
         For the rule "weighted"; samples whose weight is 0 or NaN do not count.
     region : ndarray of bool, shape (vector, sample), optional
@@ -62,6 +64,10 @@ def compound_slabs(
             f"volume: expected at most {chosen.max_file_gb:g} GB, got {size:.3g} GB for {voxel_grid}: take "
             "larger voxels, or check the poses"
         )
+    if chosen.reach_mm is not None:
+        for slab in backward_slabs(source, voxel_grid, chosen.reach_mm, region, chosen.max_memory_gb):
+            yield Slab(slab.first, as_type(slab.voxels, slab.state, chosen.voxel_type), slab.state)
+        return
     placed = Placed.on(voxel_grid, source, weights, region)
     planes = planes_per_slab(voxel_grid, chosen)
     for first in range(0, voxel_grid.shape[2], planes):
@@ -100,7 +106,8 @@ def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
 def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
     size = np.dtype(settings.voxel_type).itemsize
     n_i, n_j, _ = voxel_grid.shape
-    return n_i * n_j * (bytes_per_voxel(settings.splat, settings.rule) + size) / 1e9
+    splatting = bytes_per_voxel(settings.splat, settings.rule)
+    return n_i * n_j * ((splatting if settings.reach_mm is None else BYTES_PER_VOXEL) + size) / 1e9
 
 
 def _slab(

@@ -212,7 +212,8 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
 
 def _slabs(posed: PosedSweep, source: PosedImages, grid: VoxelGrid, request: VolumeRequest) -> Iterator[Slab]:
     mask: BoolArray | None = None if request.region is None else request.region.mask(source.grid)
-    weights = confidence(posed, request.settings.voxel_mm) if request.settings.rule == "weighted" else None
+    weighted = request.settings.rule == "weighted" and request.settings.reach_mm is None
+    weights = confidence(posed, request.settings.voxel_mm) if weighted else None
     return compound_slabs(source, grid, request.settings, weights, mask)
 
 
@@ -236,12 +237,15 @@ def confidence(posed: PosedSweep, voxel_mm: float) -> FloatArray:
 def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[str, str]:
     """What a volume's file says of it."""
     settings = request.settings
+    if settings.reach_mm is not None:
+        made = {"interpolated": f"between the images nearest on either side, up to {settings.reach_mm:g} mm"}
+    else:
+        filled = f"{settings.fill_radius} voxels"
+        made = {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}
     return {
         "levels": meaning,
         "poses": posed.mode,
-        "splat": settings.splat,
-        "rule": settings.rule,
-        "fill_radius": f"{settings.fill_radius} voxels",
+        **made,
         "recording": posed.sweep.name,
         "made_by": f"speckle3d {version('speckle3d')}",
     }

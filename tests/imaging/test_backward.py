@@ -14,6 +14,7 @@ from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
+from speckle3d.imaging.volume import compound
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -115,7 +116,7 @@ def test_slabs_equal_the_whole_to_the_last_bit(order):
     source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.3)
     whole = joined(backward_slabs(source, grid, 1.5))
     images_gb = 16 * 9 * 14 * 4 / 1e9
-    plane_gb = grid.shape[0] * grid.shape[1] * 21 / 1e9
+    plane_gb = grid.shape[0] * grid.shape[1] * 25 / 1e9
     slabs = list(backward_slabs(source, grid, 1.5, max_memory_gb=images_gb + 4.5 * plane_gb))
     assert len(slabs) > 3
     assert max(len(slab.voxels) for slab in slabs) <= 4
@@ -131,7 +132,7 @@ def test_images_are_read_once_for_each_slab_they_reach():
         return np.full((9, 14), number)
 
     grid = grid_around(GRID, poses, 0.5)
-    memory_gb = 16 * 9 * 14 * 4 / 1e9 + grid.shape[0] * grid.shape[1] * 21 * 20.5 / 1e9
+    memory_gb = 16 * 9 * 14 * 4 / 1e9 + grid.shape[0] * grid.shape[1] * 25 * 20.5 / 1e9
     slabs = list(backward_slabs(PosedImages(image, GRID, poses), grid, 1.2, max_memory_gb=memory_gb))
     assert len(slabs) == 4
     # 79 planes of 0.5 mm in four slabs; images within 1.2 mm of either end are read for the next one, too.
@@ -174,6 +175,17 @@ def test_only_the_region_counts():
     inside = (y[:, None] >= 1.0) & (y[:, None] < 2.8) & (x >= 1.0) & (x < 3.0)
     np.testing.assert_array_equal(state != EMPTY, np.broadcast_to(inside, state.shape))
     assert (voxels[state != EMPTY] == 1.0).all()
+
+
+def test_compounding_by_reach_is_this_in_any_type():
+    rng = np.random.default_rng(5)
+    poses, images = shaken(rng, 6, 1.1), rng.uniform(0.0, 255.0, (6, 9, 14)).astype(np.float32)
+    grid = grid_around(GRID, poses, 0.4)
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 1.7))
+    for voxel_type, expected in (("float32", voxels), ("uint8", np.nan_to_num(np.rint(voxels)))):
+        volume = compound(images, GRID, poses, 0.4, reach_mm=1.7, voxel_type=voxel_type)
+        np.testing.assert_array_equal(volume.voxels, expected.T)
+        np.testing.assert_array_equal(volume.state, state.T)
 
 
 def test_one_image_and_none_near():
