@@ -42,7 +42,7 @@ class Clip:
     """Column and row of its origin, least and greatest radius, least and greatest angle in degrees."""
 
     def spans(self, width, height):
-        """First and last column of the two pieces of every row, shape (height, 2, 2); empty if last < first."""
+        """First and last column of both pieces of every row, shape (height, 2, 2); none if last < first."""
         spans = np.tile([0, -1], (height, 2, 1))
         left, right = max(self.columns[0], 0), min(self.columns[1], width - 1)
         for row in range(max(self.rows[0], 0), min(self.rows[1], height - 1) + 1):

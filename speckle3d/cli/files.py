@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.calibrations import fitted_pixels, mount, resize
 from speckle3d.cli.common import (
     CalibrationFiles,
     Json,
+    SweepFile,
     Transform,
     app,
     emit,
@@ -19,14 +19,7 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.importing import (
-    Importing,
-    Number,
-    PlusConfig,
-    ReferenceTransform,
-    files_of,
-    given_settings,
-)
+from speckle3d.cli.importing import Importing, Number, PlusConfig, Told, TransformName
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -160,13 +153,21 @@ def convert(
     probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
     plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: ReferenceTransform = None,
+    reference_transform: TransformName = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
         str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
     ] = "gzip",
+    mode: Annotated[
+        str | None,
+        typer.Option(help="IN a reconstruction: write its grey images with the poses of a mode (image)."),
+    ] = None,
+    sweep_file: SweepFile = None,
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
+
+    A reconstruction becomes a sequence of grey images with its poses as ImageToWorldTransform, which 3D
+    Slicer (.seq.nrrd) and SlicerIGSIO (.seq.mha) play in their world: axes lead right, anterior, superior.
 
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
@@ -180,16 +181,19 @@ def convert(
     if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
         known = ", ".join((".h5", ".hdf5", *SUFFIXES))
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
-    named = files_of(plus_config, calibration)
-    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *named)
+    given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
+    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
+    if _is_reconstruction(source):
+        _convert_posed(source, out, options)
+        return
+    for name, value in (("--mode", mode), ("--sweep", sweep_file)):
+        if value is not None:
+            raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    given = given_settings(source, options)
-    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
-    settings = given.model_copy(update=fitted)
-    sweep = resize(load_sweep(source, settings), fitted)
-    sweep = mount(sweep, calibration or ())
-    for each in import_notes(source, settings):
+    told = Told.of(source, options, calibration)
+    sweep = told.on(load_sweep(source, told.settings))
+    for each in import_notes(source, told.settings):
         note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
@@ -198,3 +202,29 @@ def convert(
         left_out = write_sequence(out, sweep, progress, compression != "none")
     for each in left_out:
         note(f"{out}: does not hold {each}")
+
+
+def _is_reconstruction(path: Path) -> bool:
+    from speckle3d.io.load import kind_of
+    from speckle3d.io.reconstructions import FORMAT
+
+    return path.is_file() and kind_of(path) == FORMAT
+
+
+def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
+    """Write a reconstruction's images with its poses; other options than those of that have no effect."""
+    from speckle3d.io.import_settings import ImportSettings
+    from speckle3d.io.plus.write import SUFFIXES
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.sequences import write_posed_sequence
+
+    if out.suffix.lower() not in SUFFIXES:
+        raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")
+    of_recordings = {*ImportSettings.model_fields, "transform", "plus_config", "calibration"}
+    unused = [name for name in of_recordings - {"dynamic_range_db"} if options.get(name) is not None]
+    if unused:
+        raise InvalidInputError(f"--{unused[0].replace('_', '-')}: is of recordings, got a reconstruction")
+    posed = open_posed(source, options["mode"], options["sweep_file"])
+    range_db, packs = options["dynamic_range_db"] or 60.0, options["compression"] != "none"
+    with progress_bar(f"writing {out.name}") as progress:
+        write_posed_sequence(out, posed, range_db, progress, packs)

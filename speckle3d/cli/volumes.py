@@ -22,17 +22,14 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.importing import (
-    Importing,
-    Number,
-    PlusConfig,
-    ReferenceTransform,
-    files_of,
-    given_settings,
-)
+from speckle3d.cli.importing import Importing, Number, PlusConfig, TransformName, open_as_told
 from speckle3d.cli.outputs import require_own_place
 
 Three = tuple[float, float, float]
+
+_OF_RECORDINGS = (
+    "plus_config", "transform", "reference_transform", "column_pitch_mm", "row_spacing_mm", "frame_rate_hz",
+)  # fmt: skip
 
 
 @app.command(cls=Importing)
@@ -49,13 +46,6 @@ def volume(
     ] = None,
     fill_radius: Annotated[
         int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
-    ] = None,
-    reach_mm: Annotated[
-        float | None,
-        typer.Option(
-            help="For sparse sweeps: interpolate each voxel between the images nearest on either side, up to "
-            "this far away, instead of splat, rule and fill."
-        ),
     ] = None,
     voxel_type: Annotated[
         str | None, typer.Option(help="uint8, int16, uint16 or float32, in which empty voxels are NaN.")
@@ -75,15 +65,29 @@ def volume(
     shape: Annotated[
         tuple[int, int, int] | None, typer.Option(help="Number of voxels along each axis.")
     ] = None,
+    size_mm: Annotated[Three | None, typer.Option(help="Instead: size along each axis, mm.")] = None,
+    within_gb: Annotated[
+        float | None,
+        typer.Option(help="Instead of a spacing: the finest round one of a volume no larger than this."),
+    ] = None,
     like: Annotated[Path | None, typer.Option(help="A volume whose grid to take.")] = None,
     region: Annotated[
         str | None,
         typer.Option(
-            help='What counts of an image: "rectangle x,y x,y", "fan ..." or "polygon x,y ..." in mm.'
+            help="What counts of an image, in mm and degrees: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' "
+            "or 'fan x,y angle,angle radius,radius'; several joined by ' and '."
         ),
     ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Write which voxels are measured and filled, as labels.")
+    ] = None,
+    deviation: Annotated[
+        Path | None,
+        typer.Option(help="Write each voxel's standard deviation of position along the sweep, mm."),
+    ] = None,
+    backward_mm: Annotated[
+        float | None,
+        typer.Option(help="For sparse sweeps: voxels between the nearest images, at most so far away."),
     ] = None,
     max_memory_gb: Annotated[
         float | None, typer.Option(help="Memory to work in (2.5); larger volumes are made in slabs.")
@@ -92,7 +96,7 @@ def volume(
     calibration: CalibrationFiles = None,
     plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: ReferenceTransform = None,
+    reference_transform: TransformName = None,
     column_pitch_mm: Number = None,
     row_spacing_mm: Number = None,
     frame_rate_hz: Number = None,
@@ -102,28 +106,25 @@ def volume(
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
     from speckle3d.imaging.settings import CompoundingSettings
-    from speckle3d.study.posed import open_posed
     from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
-    for place in (out, state):
+    for place in (out, state, deviation):
         if place is not None:
-            require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
+            require_own_place(place, "volume", source, sweep_file, like, *(calibration or ()))
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
     settings = from_options(CompoundingSettings, base | given)
     request = VolumeRequest(
         out,
         settings,
-        GridRequest(axes, spacing_mm, origin_mm, shape, like),
+        GridRequest(axes, spacing_mm, origin_mm, shape, size_mm, within_gb, like),
         None if region is None else Region.from_text(region),
         state,
+        deviation,
     )
-    # The range is that of the volume's levels; a recording's own is said beside it.
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    posed = open_posed(source, mode, sweep_file, imported, calibration or ())
-    for line in posed.notes():
-        note(line)
+    imported = {name: options[name] for name in _OF_RECORDINGS}
+    posed = open_as_told(source, mode, sweep_file, imported, calibration, dynamic_range_db)
     with progress_bar(f"compounding {out.name}") as progress:
         report = write_voxels(posed, request, progress)
     if as_json:

@@ -41,7 +41,7 @@ def compound_slabs(
     voxel_grid : VoxelGrid
     settings : CompoundingSettings, optional
         `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have them. With
-        `reach_mm` neither are `splat`, `rule` and `fill_radius`.
+        `backward_mm` neither are `splat`, `rule` and `fill_radius`.
     weights : ndarray of shape (n,), or images of weights, optional
         For the rule "weighted"; samples whose weight is 0 or NaN do not count.
     region : ndarray of bool, shape (vector, sample), optional
@@ -64,8 +64,8 @@ def compound_slabs(
             f"volume: expected at most {chosen.max_file_gb:g} GB, got {size:.3g} GB for {voxel_grid}: take "
             "larger voxels, or check the poses"
         )
-    if chosen.reach_mm is not None:
-        for slab in backward_slabs(source, voxel_grid, chosen.reach_mm, region, chosen.max_memory_gb):
+    if chosen.backward_mm > 0:
+        for slab in backward_slabs(source, voxel_grid, chosen.backward_mm, region, chosen.max_memory_gb):
             yield Slab(slab.first, as_type(slab.voxels, slab.state, chosen.voxel_type), slab.state)
         return
     placed = Placed.on(voxel_grid, source, weights, region)
@@ -107,7 +107,7 @@ def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
     size = np.dtype(settings.voxel_type).itemsize
     n_i, n_j, _ = voxel_grid.shape
     splatting = bytes_per_voxel(settings.splat, settings.rule)
-    return n_i * n_j * ((splatting if settings.reach_mm is None else BYTES_PER_VOXEL) + size) / 1e9
+    return n_i * n_j * ((BYTES_PER_VOXEL if settings.backward_mm > 0 else splatting) + size) / 1e9
 
 
 def _slab(

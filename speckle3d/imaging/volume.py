@@ -54,7 +54,7 @@ def compound(
     weights: Weights | None = None,
     region: BoolArray | None = None,
     fill_radius: int = DEFAULT_FILL_RADIUS,
-    reach_mm: float | None = None,
+    backward_mm: float = 0.0,
     voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
     max_memory_gb: float = MAX_MEMORY_GB,
@@ -86,9 +86,10 @@ def compound(
     fill_radius : int
         Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
         stay empty. The volume also grows by so many voxels beyond the first and the last frame.
-    reach_mm : float, optional
-        For sparse sweeps: without `splat`, `rule` and `fill_radius`, each voxel is interpolated between the
-        images nearest on either side, up to this far from it; see `speckle3d.imaging.backward`.
+    backward_mm : float
+        For sparse sweeps: if above zero, each voxel is interpolated between the images nearest on either
+        side, up to this far from it, without `splat`, `rule` and `fill_radius`; see
+        `speckle3d.imaging.backward`.
     voxel_type : {"float32", "uint8", "int16", "uint16"}
         With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
         are 0.
@@ -136,7 +137,7 @@ def compound(
             splat=splat,
             rule=rule,
             fill_radius=fill_radius,
-            reach_mm=reach_mm,
+            backward_mm=backward_mm,
             voxel_type=voxel_type,
             max_memory_gb=max_memory_gb,
         )

@@ -25,7 +25,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.volume import VOXEL_TYPES, require_spacing
 from speckle3d.io.pixels import meta_type
 
-PREFIX = "speckle3d_"
+PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
 
 SIZE_FIELD = b"CompressedDataSize = "

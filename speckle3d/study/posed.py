@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,8 +15,6 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.settings import Levels
-from speckle3d.io.calibrations import apply_calibrations
-from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.reconstructions import FORMAT
@@ -126,7 +124,8 @@ def open_posed(
     mode: str | None = None,
     sweep_file: Path | None = None,
     settings: ImportSettings | None = None,
-    calibrations: Sequence[PathLike] = (),
+    dynamic_range_db: float | None = None,
+    prepared: Callable[[Sweep], Sweep] | None = None,
 ) -> PosedSweep:
     """Open a reconstruction with its sweep, or a recording whose poses are known.
 
@@ -140,9 +139,11 @@ def open_posed(
     sweep_file : path, optional
         The reconstruction's sweep, if it moved.
     settings : ImportSettings, optional
-        What the recording does not say; of a reconstruction, its sweep's are those it was made with.
-    calibrations : sequence of path
-        Calibration files to use in place of what the recording says of its sensors.
+        What the recording does not say; not of a reconstruction, whose sweep is as it was then.
+    dynamic_range_db : float, optional
+        Of B-mode that does not say its own, and only of that.
+    prepared : callable, optional
+        Changes the recording's sweep before poses are taken from it, as a calibration does.
 
     Raises
     ------
@@ -152,10 +153,6 @@ def open_posed(
         If the recording does not say where its frames are.
     """
     if kind_of(path) == FORMAT:
-        if calibrations or (settings is not None and settings.model_fields_set):
-            raise InvalidInputError(
-                f"{path}: expected a recording with what it does not say, got a reconstruction"
-            )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
         chosen = mode or "image"
         return PosedSweep(
@@ -168,20 +165,20 @@ def open_posed(
             f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
             "make its reconstruction first (speckle3d reconstruct)"
         )
-    sweep, known = load_images(path, settings)
-    sweep, _ = apply_calibrations(sweep, calibrations)
-    return replace(posed_by_itself(sweep, mode), range_is_known=known)
+    sweep, known = _load(path, settings or ImportSettings(), dynamic_range_db)
+    return replace(posed_by_itself(prepared(sweep) if prepared else sweep, mode), range_is_known=known)
 
 
-def load_images(path: Path, settings: ImportSettings | None = None) -> tuple[Sweep, bool]:
+def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
     """Read a sweep whose grey levels may do as they are, and tell whether their dynamic range is known."""
     try:
         return load_sweep(path, settings), True
     except MissingSettingsError as error:
         if error.settings != (_RANGE,):
-            raise
-    given = (settings or ImportSettings()).model_copy(update={_RANGE: USUAL_RANGE_DB})
-    return load_sweep(path, given), False
+            lacking = tuple(name for name in error.settings if name != _RANGE)
+            raise MissingSettingsError(path, lacking) from None
+    given = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
+    return load_sweep(path, given), dynamic_range_db is not None
 
 
 def posed_by_itself(sweep: Sweep, mode: str | None = None) -> PosedSweep:

@@ -177,13 +177,13 @@ def test_only_the_region_counts():
     assert (voxels[state != EMPTY] == 1.0).all()
 
 
-def test_compounding_by_reach_is_this_in_any_type():
+def test_compounding_backward_is_this_in_any_type():
     rng = np.random.default_rng(5)
     poses, images = shaken(rng, 6, 1.1), rng.uniform(0.0, 255.0, (6, 9, 14)).astype(np.float32)
     grid = grid_around(GRID, poses, 0.4)
     voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 1.7))
     for voxel_type, expected in (("float32", voxels), ("uint8", np.nan_to_num(np.rint(voxels)))):
-        volume = compound(images, GRID, poses, 0.4, reach_mm=1.7, voxel_type=voxel_type)
+        volume = compound(images, GRID, poses, 0.4, backward_mm=1.7, voxel_type=voxel_type)
         np.testing.assert_array_equal(volume.voxels, expected.T)
         np.testing.assert_array_equal(volume.state, state.T)
 
