@@ -47,7 +47,7 @@ def sweep_axes(world_from_image: RigidTransform) -> Rotation:
     require_poses(world_from_image)
     images = world_from_image.rotation
     matrices = images.as_matrix()
-    lateral, elevational = (matrices[:, :, axis] @ _line_along(matrices[:, :, axis]) for axis in (0, 2))
+    lateral, elevational = (matrices[:, :, axis] @ line_along(matrices[:, :, axis]) for axis in (0, 2))
     half_turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
     turned = (lateral < 0) & (elevational < 0)
     facing = Rotation.concatenate([images[~turned], images[turned] * half_turn])
@@ -107,8 +107,19 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
     return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
 
 
-def _line_along(directions: FloatArray) -> FloatArray:
-    """Line that directions, shape (n, 3), lie along best, whichever way they point; as the first points."""
+def line_along(directions: FloatArray) -> FloatArray:
+    """Line that directions lie along best, whichever way along it they point.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (n, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        Unit vector along the line, as the first direction points.
+    """
     line = np.asarray(np.linalg.eigh(directions.T @ directions)[1][:, -1], dtype=float)
     return line if directions[0] @ line >= 0 else -line
 

@@ -204,7 +204,7 @@ def test_wrong_input_is_refused():
     source = PosedImages(np.ones((1, 9, 14)), GRID, RigidTransform.identity(1))
     grid = VoxelGrid((300, 300, 3), (0.5, 0.5, 0.5), RigidTransform.identity())
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(InvalidInputError, match="reach_mm"):
+        with pytest.raises(InvalidInputError, match="max_distance_mm"):
             next(iter(backward_slabs(source, grid, bad)))
     with pytest.raises(InvalidInputError, match="region"):
         next(iter(backward_slabs(source, grid, 1.0, np.ones((3, 3), bool))))
