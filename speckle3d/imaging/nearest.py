@@ -18,6 +18,9 @@ BATCH = 16
 BYTES_PER_POINT = 16
 """Distance and level of an image on either side."""
 
+_CACHED_BYTES = 2**20
+"""Points that all images of a batch are tried on before the next points: they stay in a core's cache."""
+
 _GRAIN = 32
 """Lines below which a slice is not worth another thread's while."""
 
@@ -119,15 +122,17 @@ class NearestImages:
         distance_mm = np.full((2, len(lines), points), reach_mm, dtype=np.float32)
         grey = np.full(distance_mm.shape, np.nan, dtype=np.float32)
         near = np.flatnonzero(self._reach(hull_mm))
+        few = max(1, _CACHED_BYTES // (BYTES_PER_POINT * points))
         for batch in np.split(near, range(BATCH, len(near), BATCH)):
             images = [self._read(int(index)) for index in batch]
             maps = np.ascontiguousarray(self._index_from_world[batch])
 
             def look_up(first: int, stop: int) -> None:
-                band = slice(first, stop)
-                for image, index_from_world in zip(images, maps, strict=True):  # noqa: B023 (within the batch)
-                    kept = distance_mm[:, band], grey[:, band]
-                    keep_nearest(image, index_from_world, lines[band], reach_mm, *kept)
+                for low in range(first, stop, few):
+                    band = slice(low, min(low + few, stop))
+                    for image, index_from_world in zip(images, maps, strict=True):  # noqa: B023 (in the batch)
+                        kept = distance_mm[:, band], grey[:, band]
+                        keep_nearest(image, index_from_world, lines[band], reach_mm, *kept)
 
             in_parallel(look_up, len(lines), _GRAIN)
         return Sides(distance_mm, grey)
