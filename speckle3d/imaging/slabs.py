@@ -15,10 +15,8 @@ from speckle3d.imaging.grid import VoxelGrid
 from speckle3d.imaging.holes import EMPTY, fill_holes
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, VoxelType
-from speckle3d.imaging.splatting import Placed, Weights, bytes_per_voxel, splat_block
+from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
 
-_BATCH_GB = 0.1
-"""Frames in hand."""
 _LEAST_PLANES = 8
 """Thinner slabs read frames too often, and work more on their neighbours' planes than on their own."""
 
@@ -83,13 +81,13 @@ def compound_slabs(
             "larger voxels, or check the poses"
         )
     placed = Placed.on(voxel_grid, source, weights, region)
-    planes = planes_per_slab(voxel_grid, chosen)
+    planes = planes_per_slab(voxel_grid, chosen, batch_gb(source))
     for first in range(0, voxel_grid.shape[2], planes):
         yield _slab(placed, voxel_grid, chosen, first, min(first + planes, voxel_grid.shape[2]))
 
 
-def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> int:
-    """Planes of one slab, so that work on it stays within `max_memory_gb`.
+def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float) -> int:
+    """Planes of one slab, so that work on it stays within `max_memory_gb` beside the frames in hand.
 
     Raises
     ------
@@ -98,12 +96,12 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> int
     """
     n_i, n_j, n_k = voxel_grid.shape
     around, most = 2 * settings.fill_radius, settings.max_memory_gb
-    if working_gb(voxel_grid, settings) <= most:
+    if working_gb(voxel_grid, settings, frames_gb) <= most:
         return n_k
     plane_gb = _plane_gb(voxel_grid, settings)
-    planes = int((most - _BATCH_GB) / plane_gb) - around
+    planes = int((most - frames_gb) / plane_gb) - around
     if planes < min(_LEAST_PLANES, n_k):
-        needed = (min(_LEAST_PLANES, n_k) + around) * plane_gb + _BATCH_GB
+        needed = (min(_LEAST_PLANES, n_k) + around) * plane_gb + frames_gb
         raise InvalidInputError(
             f"volume: expected to work within {most:g} GB of memory, but a slab of {n_i} x {n_j} voxels "
             f"takes {needed:.3g} GB: take larger voxels, or allow more memory"
@@ -112,9 +110,9 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> int
     return -(-n_k // -(-n_k // planes))
 
 
-def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
-    """Memory to make all of a volume at once, the volume included, GB."""
-    return voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + _BATCH_GB
+def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float) -> float:
+    """Memory to make all of a volume at once, the volume and frames in hand included, GB."""
+    return voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + frames_gb
 
 
 def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:

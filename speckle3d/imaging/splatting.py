@@ -142,7 +142,7 @@ def _batches(source: PosedImages, frames: IntArray) -> Iterator[_Batch]:
     kind = first.dtype if first.dtype.name in _DIRECT and first.dtype.isnative else np.dtype(np.float32)
     turned = first.flags.f_contiguous and not first.flags.c_contiguous
     shape = first.shape[::-1] if turned else first.shape
-    size = int(np.clip(_BATCH_BYTES // max(first.size * kind.itemsize, 1), 1, _BATCH_FRAMES))
+    size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES)
     stored = first.dtype
     del first
     images = np.empty((min(size, frames.size), *shape), kind)
@@ -155,6 +155,13 @@ def _batches(source: PosedImages, frames: IntArray) -> Iterator[_Batch]:
             images[n] = image.T if turned else image
             del image
         yield _Batch(images[: some.size], some, turned)
+
+
+def batch_gb(source: PosedImages) -> float:
+    """Memory for frames and their weights in hand, GB."""
+    samples = source.grid.vectors * source.grid.samples
+    frames = min(len(source), max(_BATCH_BYTES // samples, 1), _BATCH_FRAMES)
+    return 2 * 4 * samples * (frames + 1) / 1e9
 
 
 def _spans(source: PosedImages, mask: BoolArray | None, turned: bool) -> IntArray:
