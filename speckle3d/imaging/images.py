@@ -37,8 +37,6 @@ class PosedImages:
     grid : ImageGrid
     world_from_image : RigidTransform, length n
         Translation in mm.
-    shear : float
-        Lateral mm per mm of depth: how far the vectors lean, in images whose axes are not at right angles.
 
     Raises
     ------
@@ -51,12 +49,9 @@ class PosedImages:
     images: Images
     grid: ImageGrid
     world_from_image: RigidTransform
-    shear: float = 0.0
 
     def __post_init__(self) -> None:
         require_poses(self.world_from_image)
-        if not np.isfinite(self.shear):
-            raise InvalidInputError(f"shear: expected a finite number, got {self.shear}")
         shape = getattr(self.images, "shape", None) or [len(self)]
         known = len(self.images) if isinstance(self.images, Sized) else shape[0]
         if known != len(self):
@@ -90,24 +85,14 @@ class PosedImages:
             raise InvalidInputError(f"images[{index}]: expected grey levels, got type {image.dtype}")
         return image
 
-    @property
-    def image_from_sample(self) -> FloatArray:
-        """Affine map from (vector, sample, 1) to image coordinates (x, y, z, 1) in mm, shape (4, 3)."""
-        grid = self.grid
-        scaled = np.zeros((4, 3))
-        scaled[1, 1:] = grid.sample_spacing_mm, grid.first_sample_depth_mm
-        scaled[0] = self.shear * scaled[1]
-        scaled[0, 0] = grid.vector_pitch_mm
-        scaled[3, 2] = 1.0
-        return scaled
-
     def index_from_image(self) -> FloatArray:
         """Affine map from image coordinates (x, y, z, 1) in mm to (vector, sample, z in mm), shape (3, 4)."""
-        pitch, spacing = self.grid.vector_pitch_mm, self.grid.sample_spacing_mm
-        scaled = np.diag([1.0 / pitch, 1.0 / spacing, 1.0, 1.0])[:3]
-        scaled[0, 1] = -self.shear / pitch
-        scaled[1, 3] = -self.grid.first_sample_depth_mm / spacing
-        return scaled
+        plane = np.zeros((3, 4))
+        image_from_sample = self.grid.image_from_sample
+        plane[:2, :2] = np.linalg.inv(image_from_sample[:2, :2])
+        plane[:2, 3] = -plane[:2, :2] @ image_from_sample[:2, 2]
+        plane[2, 2] = 1.0
+        return plane
 
 
 @dataclass(frozen=True)

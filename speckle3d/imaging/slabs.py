@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.grid import VoxelGrid
+from speckle3d.imaging.grid import Slab, VoxelGrid
 from speckle3d.imaging.holes import EMPTY, fill_holes
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, VoxelType
@@ -19,25 +18,6 @@ from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_vox
 
 _LEAST_PLANES = 8
 """Thinner slabs read frames too often, and work more on their neighbours' planes than on their own."""
-
-
-@dataclass(frozen=True)
-class Slab:
-    """Some planes of a volume.
-
-    Attributes
-    ----------
-    first : int
-        The first plane's number along k.
-    voxels : ndarray, shape (planes, n_j, n_i)
-        Of the type asked for; empty ones are NaN in float32 and 0 in whole numbers.
-    state : ndarray of uint8, shape (planes, n_j, n_i)
-        `EMPTY`, `MEASURED` or `FILLED`.
-    """
-
-    first: int
-    voxels: npt.NDArray[Any]
-    state: ByteArray
 
 
 def compound_slabs(

@@ -70,7 +70,7 @@ class Placed:
             If a pose or a weight is not finite, or no sample counts.
         """
         grid_from_image = (voxel_grid.world_from_grid.inv() * source.world_from_image).as_matrix()
-        maps = (grid_from_image @ source.image_from_sample)[:, :3]
+        maps = (grid_from_image @ source.grid.image_from_sample)[:, :3]
         maps = maps / np.asarray(voxel_grid.spacing_mm)[:, None]
         if not np.isfinite(maps).all():
             bad = int(np.flatnonzero(~np.isfinite(maps).all(axis=(1, 2)))[0])

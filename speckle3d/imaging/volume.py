@@ -56,7 +56,6 @@ def compound(
     fill_radius: int = DEFAULT_FILL_RADIUS,
     voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
-    shear: float = 0.0,
     max_memory_gb: float = MAX_MEMORY_GB,
 ) -> CompoundedVolume:
     """Compound a sweep's images into voxels, cubic ones that hold all of it or those of a grid.
@@ -91,8 +90,6 @@ def compound(
         are 0.
     world_from_axes : Rotation, optional
         Directions of the axes of cubic voxels; without it, the world's.
-    shear : float
-        Lateral mm per mm of depth, of images whose axes are not at right angles.
     max_memory_gb : float
         For the volume and the work on it.
 
@@ -125,7 +122,7 @@ def compound(
     >>> volume.shape, volume.voxels[0, 0].tolist()
     ((4, 5, 4), [0.0, 1.0, 2.0, 3.0])
     """
-    source = PosedImages(images, grid, world_from_image, shear)
+    source = PosedImages(images, grid, world_from_image)
     if (voxel_mm is None) == (voxel_grid is None):
         raise InvalidInputError("compound: expected either voxel_mm or voxel_grid")
     if voxel_grid is None:
