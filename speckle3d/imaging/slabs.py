@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.grid import Slab, VoxelGrid
-from speckle3d.imaging.holes import EMPTY, fill_holes
+from speckle3d.imaging.holes import fill_holes
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
@@ -116,9 +117,14 @@ def as_type(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> np
     """Voxels rounded and clipped to a type, empty ones 0; as they are in float32, with NaN for empty."""
     if voxel_type == "float32":
         return voxels
+    from speckle3d.kernels.splatting import round_voxels
+
     limits = np.iinfo(voxel_type)
     out = np.empty(voxels.shape, voxel_type)
-    for plane, (levels, marks) in enumerate(zip(voxels, state, strict=True)):
-        whole = np.clip(np.rint(levels), limits.min, limits.max)
-        out[plane] = np.where(marks == EMPTY, np.float32(0), whole)
+
+    def work(first: int, stop: int) -> None:
+        part = slice(first, stop)
+        round_voxels(voxels[part], state[part], float(limits.min), float(limits.max), out[part])
+
+    in_parallel(work, len(voxels))
     return out

@@ -217,7 +217,7 @@ class Accumulator:
         from speckle3d.kernels import splatting as kernels
 
         whole = np.array([[0, n] for n in self.shape[::-1]], dtype=np.int64)
-        # Threads share out voxels, not images, along the axis that each image crosses most of.
+        # Threads share out voxels, not images: what is added to one comes in the same order.
         axis = _common_axis(maps, images.shape[1:], whole)
         tag = first_tag if self.rule == "latest" else 0
 
@@ -273,8 +273,8 @@ def fixed_maps(index_from_sample: FloatArray, splat: Splat, first_plane: int, tu
 
 
 def _common_axis(maps: IntArray, shape: tuple[int, ...], box: IntArray) -> int:
-    """Axis of the voxels along which images extend most."""
-    extent = np.abs(maps[:, :, :2]).astype(float) @ np.asarray(shape, dtype=float) / 2.0**_POSITION_BITS
+    """Axis of the voxels along which the lines of images follow each other most: few are cut there."""
+    extent = np.abs(maps[:, :, 0]).astype(float) * shape[0] / 2.0**_POSITION_BITS
     shared = np.minimum(extent / box[:, 1], 1.0).mean(axis=0)
     return int(np.argmax(shared * np.minimum(box[:, 1], _LEAST_BLOCK * 4)))
 

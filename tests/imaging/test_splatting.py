@@ -40,14 +40,15 @@ def any_scene(rng, kind):
     return images, poses, voxel_grid
 
 
-def index_of(voxel_grid, poses, shear=0.0):
+def index_of(voxel_grid, poses, skew=0.0):
     """Fractional voxel of every sample, shape (n, vector, sample, 3)."""
     v, s = np.mgrid[: GRID.vectors, : GRID.samples]
-    y = GRID.first_sample_depth_mm + s * GRID.sample_spacing_mm
-    local = np.stack([v * GRID.vector_pitch_mm + shear * y, y, 0 * y], axis=-1).reshape(-1, 3)
+    u, v, half = v * GRID.vector_pitch_mm, s * GRID.sample_spacing_mm, skew / 2
+    x, y = np.cos(half) * u + np.sin(half) * v, np.sin(half) * u + np.cos(half) * v
+    local = np.stack([x, GRID.first_sample_depth_mm + y, 0 * y], axis=-1).reshape(-1, 3)
     grid_from_world = voxel_grid.world_from_grid.inv()
     points = np.stack([(grid_from_world * pose).apply(local) for pose in poses])
-    return (points / voxel_grid.spacing_mm).reshape(len(poses), *v.shape, 3)
+    return (points / voxel_grid.spacing_mm).reshape(len(poses), GRID.vectors, GRID.samples, 3)
 
 
 def sweep_of(frames, step_mm, kind=np.uint8):
@@ -71,18 +72,20 @@ def sweep_of(frames, step_mm, kind=np.uint8):
 def test_matches_brute_force(seed, splat, rule, kind, turned):
     rng = np.random.default_rng(seed)
     images, poses, voxel_grid = any_scene(rng, kind)
-    shear, region = rng.normal(0, 0.2), rng.random((GRID.vectors, GRID.samples)) < 0.8
+    skew, region = rng.uniform(-0.2, 0.2), rng.random((GRID.vectors, GRID.samples)) < 0.8
     weights = (
         rng.uniform(0, 2, FRAMES) * (rng.random(FRAMES) < 0.8) if rule == "weighted" else np.ones(FRAMES)
     )
     each = weights[:, None, None] * region
-    index = index_of(voxel_grid, poses, shear)
+    index = index_of(voxel_grid, poses, skew)
     expected = oracles.splat(images, index, voxel_grid.shape, splat, rule, each)
     if np.isnan(expected).all():
         return
     stored = [np.asfortranarray(image) for image in images] if turned else images
-    chosen = {"splat": splat, "rule": rule, "weights": weights, "region": region, "shear": shear}
-    volume = compound(stored, GRID, poses, voxel_grid=voxel_grid, fill_radius=0, **chosen)
+    chosen = {"splat": splat, "rule": rule, "weights": weights, "region": region}
+    volume = compound(
+        stored, replace(GRID, skew_rad=skew), poses, voxel_grid=voxel_grid, fill_radius=0, **chosen
+    )
     # Sums in double precision, means in single.
     np.testing.assert_allclose(volume.voxels, expected, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(volume.state, ~np.isnan(expected))
