@@ -50,6 +50,9 @@ def volume(
     fill_radius: Annotated[
         int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
     ] = None,
+    fill_mm: Annotated[
+        float | None, typer.Option(help="Instead, in mm along each axis, whatever the voxels' shape.")
+    ] = None,
     voxel_type: Annotated[
         str | None, typer.Option(help="uint8, int16, uint16 or float32, in which empty voxels are NaN.")
     ] = None,

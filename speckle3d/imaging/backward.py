@@ -16,8 +16,8 @@ from speckle3d.imaging.grid import Slab, VoxelGrid
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.nearest import BATCH, BYTES_PER_POINT, NearestImages
 
-BYTES_PER_VOXEL = BYTES_PER_POINT + 9
-"""Images on either side, the voxel, its state, and its copy of another type."""
+BYTES_PER_VOXEL = BYTES_PER_POINT + 14
+"""Images on either side; voxel, state and a copy of another type; voxel and state of the slab before."""
 
 MAX_MEMORY_GB = 2.5
 """Default memory of a slab."""

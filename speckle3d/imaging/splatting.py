@@ -142,7 +142,7 @@ def _batches(source: PosedImages, frames: IntArray) -> Iterator[_Batch]:
     kind = first.dtype if first.dtype.name in _DIRECT and first.dtype.isnative else np.dtype(np.float32)
     turned = first.flags.f_contiguous and not first.flags.c_contiguous
     shape = first.shape[::-1] if turned else first.shape
-    size = int(np.clip(_BATCH_BYTES // max(first.size * kind.itemsize, 1), 1, _BATCH_FRAMES))
+    size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES)
     stored = first.dtype
     del first
     images = np.empty((min(size, frames.size), *shape), kind)
@@ -155,6 +155,13 @@ def _batches(source: PosedImages, frames: IntArray) -> Iterator[_Batch]:
             images[n] = image.T if turned else image
             del image
         yield _Batch(images[: some.size], some, turned)
+
+
+def batch_gb(source: PosedImages) -> float:
+    """Memory for frames and their weights in hand, GB."""
+    samples = source.grid.vectors * source.grid.samples
+    frames = min(len(source), max(_BATCH_BYTES // samples, 1), _BATCH_FRAMES)
+    return 2 * 4 * samples * (frames + 1) / 1e9
 
 
 def _spans(source: PosedImages, mask: BoolArray | None, turned: bool) -> IntArray:
@@ -210,7 +217,7 @@ class Accumulator:
         from speckle3d.kernels import splatting as kernels
 
         whole = np.array([[0, n] for n in self.shape[::-1]], dtype=np.int64)
-        # Threads share out voxels, not images, along the axis that each image crosses most of.
+        # Threads share out voxels, not images: what is added to one comes in the same order.
         axis = _common_axis(maps, images.shape[1:], whole)
         tag = first_tag if self.rule == "latest" else 0
 
@@ -266,8 +273,8 @@ def fixed_maps(index_from_sample: FloatArray, splat: Splat, first_plane: int, tu
 
 
 def _common_axis(maps: IntArray, shape: tuple[int, ...], box: IntArray) -> int:
-    """Axis of the voxels along which images extend most."""
-    extent = np.abs(maps[:, :, :2]).astype(float) @ np.asarray(shape, dtype=float) / 2.0**_POSITION_BITS
+    """Axis of the voxels along which the lines of images follow each other most: few are cut there."""
+    extent = np.abs(maps[:, :, 0]).astype(float) * shape[0] / 2.0**_POSITION_BITS
     shared = np.minimum(extent / box[:, 1], 1.0).mean(axis=0)
     return int(np.argmax(shared * np.minimum(box[:, 1], _LEAST_BLOCK * 4)))
 

@@ -20,7 +20,7 @@ from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, Rule, Splat, VoxelType
 from speckle3d.imaging.slabs import compound_slabs, working_gb
-from speckle3d.imaging.splatting import Weights
+from speckle3d.imaging.splatting import Weights, batch_gb
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
@@ -144,10 +144,14 @@ def compound(
     except ValidationError as error:
         found = error.errors()[0]
         raise InvalidInputError(f"{found['loc'][0]}: {found['msg']}, got {found['input']!r}") from None
-    return _joined(source, voxel_grid, _within_memory(voxel_grid, settings), weights, region)
+    return _joined(
+        source, voxel_grid, _within_memory(voxel_grid, settings, batch_gb(source)), weights, region
+    )
 
 
-def _within_memory(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> CompoundingSettings:
+def _within_memory(
+    voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float
+) -> CompoundingSettings:
     """Settings whose memory is what slabs may take beside the whole volume.
 
     Raises
@@ -155,7 +159,7 @@ def _within_memory(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> Comp
     InvalidInputError
         If nothing is left.
     """
-    if working_gb(voxel_grid, settings) <= settings.max_memory_gb:
+    if working_gb(voxel_grid, settings, frames_gb) <= settings.max_memory_gb:
         return settings
     # The type that the levels have, and a byte of state.
     most, held = settings.max_memory_gb, voxel_grid.size_gb(settings.voxel_type) + voxel_grid.size_gb("uint8")

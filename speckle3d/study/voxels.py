@@ -301,4 +301,5 @@ def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[s
 def _method(settings: CompoundingSettings) -> dict[str, str]:
     if settings.backward_mm > 0:
         return {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
-    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": f"{settings.fill_radius} voxels"}
+    filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
+    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}
