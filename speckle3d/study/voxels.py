@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.labels import STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
@@ -69,8 +70,10 @@ class GridRequest:
     within_gb: float | None = None
     like: Path | None = None
 
-    def grid(self, source: PosedImages, settings: CompoundingSettings) -> VoxelGrid:
-        """Grid for a sweep's images.
+    def grid(
+        self, images: ImageGrid, world_from_image: RigidTransform, settings: CompoundingSettings
+    ) -> VoxelGrid:
+        """Grid for a sweep's images, or for a part of each.
 
         Raises
         ------
@@ -84,14 +87,13 @@ class GridRequest:
             return grid_like(read_volume(self.like))
         if self.spacing_mm is not None and self.within_gb is not None:
             raise InvalidInputError("--within-gb: expected no --spacing-mm beside it")
-        axes = self._axes(source)
+        axes = self._axes(images, world_from_image)
         spacing: float | tuple[float, float, float] = self.spacing_mm or settings.voxel_mm
         if self.within_gb is not None:
-            images = source.grid, source.world_from_image
-            spacing = spacing_within(*images, self.within_gb, axes, settings.voxel_type)
+            spacing = spacing_within(images, world_from_image, self.within_gb, axes, settings.voxel_type)
         return grid_as_asked(
-            source.grid,
-            source.world_from_image,
+            images,
+            world_from_image,
             spacing,
             world_from_axes=axes,
             origin_mm=self.origin_mm,
@@ -99,12 +101,12 @@ class GridRequest:
             size_mm=self.size_mm,
         )
 
-    def _axes(self, source: PosedImages) -> Rotation:
+    def _axes(self, images: ImageGrid, world_from_image: RigidTransform) -> Rotation:
         if self.axes == "world":
             return Rotation.identity()
         if self.axes == "principal":
-            return principal_axes(source.grid, source.world_from_image)
-        return sweep_axes(source.world_from_image)
+            return principal_axes(images, world_from_image)
+        return sweep_axes(world_from_image)
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,8 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     began, settings = time.perf_counter(), request.settings
     levels = None if settings.levels == "auto" else settings.levels
     source, meaning = posed.source(levels, settings.dynamic_range_db)
-    grid = request.grid.grid(source, settings)
+    images = source.grid, source.world_from_image
+    grid = request.grid.grid(*(request.region.part(*images) if request.region else images), settings)
     counts = np.zeros(3, dtype=np.int64)
     place = grid.shape, grid.spacing_mm, grid.world_from_grid
     fields = fields_of(posed, request, meaning)
