@@ -23,11 +23,9 @@ def sweep(rng, frames, passes=1, turned=False):
     shaken = Rotation.from_rotvec(rng.normal(0.0, 0.08, moved.shape))
     poses = RigidTransform.from_components(moved, shaken)
     if turned:
-        about_middle = RigidTransform.from_translation([20.0, 0.0, 0.0]) * RigidTransform.from_rotation(
-            HALF_TURN
-        )
-        back = RigidTransform.concatenate([poses[:frames], poses[frames:] * about_middle])
-        poses = back
+        middle = RigidTransform.from_translation([20.0, 0.0, 0.0])
+        back = poses[frames:] * (middle * RigidTransform.from_rotation(HALF_TURN))
+        poses = RigidTransform.concatenate([poses[:frames], back])
     somewhere = RigidTransform.from_components(rng.normal(0.0, 50.0, 3), Rotation.random(rng=rng))
     return somewhere * poses, somewhere.rotation
 
