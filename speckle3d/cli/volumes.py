@@ -121,7 +121,7 @@ def volume(
         state,
         deviation,
     )
-    # The option is the range of the volume's levels; of B-mode that says none of its own, it is that one, too.
+    # The option is the range of the volume's levels, and of B-mode that says none of its own.
     imported = given_settings(source, {**options, "dynamic_range_db": None})
     posed = open_posed(source, mode, sweep_file, imported, calibration or (), dynamic_range_db)
     for line in posed.notes():
