@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,7 @@ from speckle3d.cli.calibrations import mount
 from speckle3d.cli.common import (
     CalibrationFiles,
     Json,
+    SweepFile,
     Transform,
     app,
     emit,
@@ -165,8 +166,16 @@ def convert(
     compression: Annotated[
         str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
     ] = "gzip",
+    mode: Annotated[
+        str | None,
+        typer.Option(help="IN a reconstruction: write its grey images with the poses of a mode (image)."),
+    ] = None,
+    sweep_file: SweepFile = None,
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
+
+    A reconstruction becomes a sequence of grey images with its poses as ImageToWorldTransform, which 3D
+    Slicer (.seq.nrrd) and SlicerIGSIO (.seq.mha) play in their world: axes lead right, anterior, superior.
 
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
@@ -183,6 +192,12 @@ def convert(
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
     named = files_of(plus_config, calibration)
     require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *named)
+    if _is_reconstruction(source):
+        _convert_posed(source, out, options)
+        return
+    for name, value in (("--mode", mode), ("--sweep", sweep_file)):
+        if value is not None:
+            raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
     given = given_settings(source, options)
@@ -199,3 +214,29 @@ def convert(
         left_out = write_sequence(out, sweep, progress, compression != "none")
     for each in left_out:
         note(f"{out}: does not hold {each}")
+
+
+def _is_reconstruction(path: Path) -> bool:
+    from speckle3d.io.load import kind_of
+    from speckle3d.io.reconstructions import FORMAT
+
+    return path.is_file() and kind_of(path) == FORMAT
+
+
+def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
+    """Write a reconstruction's images with its poses; other options than those of that have no effect."""
+    from speckle3d.io.import_settings import ImportSettings
+    from speckle3d.io.plus.write import SUFFIXES
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.sequences import write_posed_sequence
+
+    if out.suffix.lower() not in SUFFIXES:
+        raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")
+    of_recordings = {*ImportSettings.model_fields, "transform", "plus_config", "calibration"}
+    unused = [name for name in of_recordings - {"dynamic_range_db"} if options.get(name) is not None]
+    if unused:
+        raise InvalidInputError(f"--{unused[0].replace('_', '-')}: is of recordings, got a reconstruction")
+    posed = open_posed(source, options["mode"], options["sweep_file"])
+    range_db, packs = options["dynamic_range_db"] or 60.0, options["compression"] != "none"
+    with progress_bar(f"writing {out.name}") as progress:
+        write_posed_sequence(out, posed, range_db, progress, packs)

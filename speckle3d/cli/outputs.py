@@ -15,6 +15,7 @@ Kind = Literal[
     "picture",
     "sequence",
     "simulation",
+    "surface",
     "sweep",
     "trajectory",
     "transform",
@@ -92,7 +93,7 @@ def _is_log(path: Path) -> bool:
     return next(lines, b"").startswith(b"time_s,")
 
 
-def _is_volume(path: Path) -> bool:
+def is_volume(path: Path) -> bool:
     """Whether a file is a NIfTI, MetaImage or NRRD image that is no sequence of frames."""
     from speckle3d.io.headers import is_metaimage, is_nrrd
 
@@ -107,6 +108,15 @@ def _is_sequence(path: Path) -> bool:
 
     start = _start(path)
     return (is_metaimage(start) or is_nrrd(start)) and b"Seq_Frame" in start
+
+
+def _is_surface(path: Path) -> bool:
+    """Whether a file is a surface: STL by its size, PLY and VTK by how they begin."""
+    start = _start(path)
+    if start.startswith(b"ply") or start.startswith(b"# vtk DataFile"):
+        return True
+    count = int.from_bytes(start[80:84], "little")
+    return path.stat().st_size == 84 + 50 * count or start.startswith(b"solid")
 
 
 def _is_trajectory(path: Path) -> bool:
@@ -133,8 +143,9 @@ _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "picture": ("a PNG", _is_picture),
     "sequence": ("an image sequence", _is_sequence),
     "simulation": ("a simulated sweep", _is_simulation),
+    "surface": ("a surface", _is_surface),
     "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
     "trajectory": ("TUM text", _is_trajectory),
     "transform": ("a transform", _is_transform),
-    "volume": ("a volume", _is_volume),
+    "volume": ("a volume", is_volume),
 }

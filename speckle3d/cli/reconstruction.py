@@ -87,6 +87,7 @@ def reconstruct(
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
+    from speckle3d.io.volume_writer import require_suffix
     from speckle3d.study.job import run_job
 
     settings = load_settings(config_file).with_choices(
@@ -106,7 +107,9 @@ def reconstruct(
         read = (sweep_file, crossing[1], config_file, used, *(calibration or ()))
         require_own_place(save_curves, "curves", *read)
     if volume is not None:
-        require_own_place(volume, "volume", sweep_file, crossing_file, used, *(calibration or ()))
+        require_suffix(volume)
+        if volume.parent.exists() or volume.parent != out:
+            require_own_place(volume, "volume", sweep_file, crossing_file, used, *(calibration or ()))
         _require_mode(volume_mode, modes)
     elif volume_mode is not None:
         raise InvalidInputError("--volume-mode: expected --volume beside it, got none")

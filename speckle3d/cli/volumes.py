@@ -78,6 +78,14 @@ def volume(
     state: Annotated[
         Path | None, typer.Option(help="Write which voxels are measured and filled, as labels.")
     ] = None,
+    deviation: Annotated[
+        Path | None,
+        typer.Option(help="Write each voxel's standard deviation of position along the sweep, mm."),
+    ] = None,
+    backward_mm: Annotated[
+        float | None,
+        typer.Option(help="For sparse sweeps: voxels between the nearest images, at most so far away."),
+    ] = None,
     max_memory_gb: Annotated[
         float | None, typer.Option(help="Memory to work in (2.5); larger volumes are made in slabs.")
     ] = None,
@@ -99,7 +107,7 @@ def volume(
     from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
-    for place in (out, state):
+    for place in (out, state, deviation):
         if place is not None:
             require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
     base = load_settings(config_file).volume.model_dump()
@@ -111,10 +119,11 @@ def volume(
         GridRequest(axes, spacing_mm, origin_mm, shape, like),
         None if region is None else Region.from_text(region),
         state,
+        deviation,
     )
-    # The range is that of the volume's levels; a recording's own is said beside it.
+    # The option is the range of the volume's levels, and of B-mode that says none of its own.
     imported = given_settings(source, {**options, "dynamic_range_db": None})
-    posed = open_posed(source, mode, sweep_file, imported, calibration or ())
+    posed = open_posed(source, mode, sweep_file, imported, calibration or (), dynamic_range_db)
     for line in posed.notes():
         note(line)
     with progress_bar(f"compounding {out.name}") as progress:

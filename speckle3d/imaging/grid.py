@@ -8,32 +8,20 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import fmin
-from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import ByteArray, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import require_poses
-
-BYTES_PER_VOXEL = 16
-"""Sum and count, or sums of shares and of levels, at eight bytes each: what compounding holds at most."""
+from speckle3d.imaging.settings import VoxelType
 
 MAX_VOXELS_ALONG = 1_000_000
 """Most voxels along an axis, to catch wrong units: 100 m at 0.1 mm."""
 
 _ROUND_SPACINGS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 """Between a power of ten and the next."""
-
-_LEAST_COMMON = 0.5
-"""Length of a mean of unit vectors that makes it a direction: as of a spread of 110 degrees either way."""
-
-_STARTS = Rotation.from_rotvec(0.4 * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]))
-"""Turns from which the smallest box is looked for, since it is not the only minimum."""
-_SIMPLEX = np.vstack([np.zeros(3), 0.15 * np.eye(3)])
-"""Turns with which each search begins, rad."""
 
 Triple = tuple[float, float, float]
 
@@ -180,11 +168,11 @@ def grid_like(volume: Volume) -> VoxelGrid:
 def spacing_within(
     grid: ImageGrid,
     world_from_image: RigidTransform,
-    max_memory_gb: float,
+    max_gb: float,
     world_from_axes: Rotation | None = None,
-    bytes_per_voxel: float = BYTES_PER_VOXEL,
+    voxel_type: VoxelType = "uint8",
 ) -> float:
-    """Finest round spacing of cubic voxels with which the grid around the images stays within a memory.
+    """Finest round spacing of cubic voxels with which the volume around the images stays within a size.
 
     Spacings are 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 and 8 times a power of ten. None is finer than the images'
     own samples: finer voxels would show no more.
@@ -193,11 +181,12 @@ def spacing_within(
     ----------
     grid : ImageGrid
     world_from_image : RigidTransform, length n
-    max_memory_gb : float
+    max_gb : float
+        Of the voxels: what a file, unpacked, and a viewer hold. To work on them takes `max_memory_gb` of the
+        settings, whatever the volume.
     world_from_axes : Rotation, optional
         Directions of the voxel axes; without it, the world's.
-    bytes_per_voxel : float
-        By default what compounding takes; the size of the voxel's type bounds the file instead.
+    voxel_type : {"uint8", "int16", "uint16", "float32"}
 
     Returns
     -------
@@ -207,112 +196,24 @@ def spacing_within(
     Raises
     ------
     InvalidInputError
-        If `max_memory_gb` is not enough for any spacing up to 800 mm, or there are no poses.
+        If `max_gb` is not enough for any spacing up to 800 mm, or there are no poses.
 
     Examples
     --------
-    >>> spacing_within(ImageGrid(400, 400, 0.1, 0.1), RigidTransform.identity(1), 1e-4, bytes_per_voxel=1)
+    >>> spacing_within(ImageGrid(400, 400, 0.1, 0.1), RigidTransform.identity(1), max_gb=1e-4)
     0.15
     """
     finest = min(grid.vector_pitch_mm, grid.sample_spacing_mm) * (1 - 1e-9)
-    axes = _single(world_from_axes)
-    low, high = _bounds(grid, world_from_image, axes)
+    low, high = _bounds(grid, world_from_image, _single(world_from_axes))
+    most = max_gb * 1e9 / np.dtype(voxel_type).itemsize
     # As decimal text, so that 0.3 is 0.3 and not 3 x 0.1.
     for spacing in (float(f"{step}e{power}") for power in range(-6, 3) for step in _ROUND_SPACINGS):
-        if (
-            spacing >= finest
-            and np.prod(_counts(low, high, spacing)) * bytes_per_voxel <= max_memory_gb * 1e9
-        ):
+        if spacing >= finest and np.prod(_counts(low, high, spacing)) <= most:
             return spacing
-    raise InvalidInputError(f"max_memory_gb: expected enough for some voxels, got {max_memory_gb:g} GB")
+    raise InvalidInputError(f"max_gb: expected enough for some voxels, got {max_gb:g} GB")
 
 
-def sweep_axes(world_from_image: RigidTransform) -> Rotation:
-    """Mean orientation of a sweep's images: axes that are lateral, axial and elevational.
-
-    Images of a probe that was turned about its depth axis between two passes count as turned back: lateral
-    and elevational are those of the first image.
-
-    Parameters
-    ----------
-    world_from_image : RigidTransform, length n
-
-    Raises
-    ------
-    InsufficientDataError
-        If the images have no lateral, axial or elevational direction in common, as when the probe turned
-        through half a circle.
-    InvalidInputError
-        If there are no poses.
-
-    References
-    ----------
-    .. [1] F. L. Markley et al., "Averaging quaternions", J. Guidance, Control, and Dynamics, 2007.
-    """
-    require_poses(world_from_image)
-    images = world_from_image.rotation
-    matrices = images.as_matrix()
-    lateral, elevational = (matrices[:, :, axis] @ _line_along(matrices[:, :, axis]) for axis in (0, 2))
-    half_turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
-    turned = (lateral < 0) & (elevational < 0)
-    facing = Rotation.concatenate([images[~turned], images[turned] * half_turn])
-    common = np.linalg.norm(facing.as_matrix().mean(axis=0), axis=0)
-    if common.min() < _LEAST_COMMON:
-        which = ("lateral", "axial", "elevational")[int(common.argmin())]
-        raise InsufficientDataError(
-            f"the images have no {which} direction in common: expected one sweep, or axes as asked for"
-        )
-    return facing.mean()
-
-
-def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotation:
-    """Axes of the smallest box around a sweep's images, nearest to lateral, axial and elevational.
-
-    The volume of the box is minimised from several orientations. Unless another is smaller by 0.01 %, it is
-    `sweep_axes`, then the world's axes.
-
-    Parameters
-    ----------
-    grid : ImageGrid
-    world_from_image : RigidTransform, length n
-
-    Returns
-    -------
-    Rotation
-        World from the box's axes, right-handed: i is nearest to lateral, j to axial, k to elevational, of the
-        mean image or, where the images have no mean, of the first.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are no poses.
-    """
-    points = _extreme_points(_corners(grid, world_from_image))
-    try:
-        lateral_first = sweep_axes(world_from_image)
-    except InsufficientDataError:
-        lateral_first = world_from_image[0].rotation
-    # A sheet has no volume: a sample's width more on all sides makes of two sheets the smaller one.
-    skin = min(grid.vector_pitch_mm, grid.sample_spacing_mm)
-
-    def log_volume(turn_rad: FloatArray, start: Rotation) -> float:
-        axes = start * Rotation.from_rotvec(turn_rad)
-        return float(np.log(np.ptp(points @ axes.as_matrix(), axis=0) + skin).sum())
-
-    def smallest_near(start: Rotation) -> Rotation:
-        best = fmin(log_volume, np.zeros(3), (start,), 1e-6, 1e-7, initial_simplex=_SIMPLEX, disp=False)
-        return start * Rotation.from_rotvec(best)
-
-    found = [lateral_first, Rotation.identity()]
-    starts = (*found, _spread_axes(points), *(lateral_first * turn for turn in _STARTS))
-    found += [smallest_near(start) for start in starts]
-    volume = np.array([log_volume(np.zeros(3), axes) for axes in found])
-    smallest = found[int(np.flatnonzero(volume <= volume.min() + 1e-4)[0])]
-    alike = smallest * Rotation.create_group("O")
-    return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
-
-
-def _corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
+def image_corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
     """Corners of all images in the world, shape (4 n, 3)."""
     require_poses(world_from_image)
     return np.concatenate([world_from_image.apply(corner) for corner in grid.corners_mm])
@@ -322,7 +223,7 @@ def _bounds(
     grid: ImageGrid, world_from_image: RigidTransform, world_from_axes: Rotation
 ) -> tuple[FloatArray, FloatArray]:
     """Least and greatest coordinates along the axes of the images' corners."""
-    along = world_from_axes.inv().apply(_corners(grid, world_from_image))
+    along = world_from_axes.inv().apply(image_corners(grid, world_from_image))
     return along.min(axis=0), along.max(axis=0)
 
 
@@ -330,27 +231,6 @@ def _counts(low: FloatArray, high: FloatArray, spacing: float | Triple) -> Float
     """Voxels from a corner to another."""
     # A corner half a voxel past the last centre would round up, and so may one a rounding error short of it.
     return np.asarray(np.floor((high - low) / np.asarray(spacing) + 0.5 + 1e-6) + 1)
-
-
-def _line_along(directions: FloatArray) -> FloatArray:
-    """Line that directions, shape (n, 3), lie along best, whichever way they point; as the first points."""
-    line = np.asarray(np.linalg.eigh(directions.T @ directions)[1][:, -1], dtype=float)
-    return line if directions[0] @ line >= 0 else -line
-
-
-def _extreme_points(points: FloatArray) -> FloatArray:
-    """Corners of the convex hull; all points if they lie in a plane."""
-    try:
-        return np.asarray(points[ConvexHull(points).vertices])
-    except QhullError:
-        return points
-
-
-def _spread_axes(points: FloatArray) -> Rotation:
-    """Axes along which points spread most, and least."""
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2].T
-    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
-    return Rotation.from_matrix(axes)
 
 
 def _single(world_from_axes: Rotation | None) -> Rotation:

@@ -117,8 +117,8 @@ class Polygon:
 
     def mask(self, grid: ImageGrid) -> BoolArray:
         """Which samples are inside or on a side, shape (vector, sample)."""
-        first = (0.0, grid.first_sample_depth_mm)
-        corners = (np.asarray(self.corners_mm) - first) / _steps_mm(grid)
+        image_from_sample = grid.image_from_sample[:2]
+        corners = np.linalg.solve(image_from_sample[:, :2], (self.corners_mm - image_from_sample[:, 2]).T).T
         # Rounded, so that a sample on a side counts whatever the size of a pixel.
         return polygon_mask((grid.vectors, grid.samples), np.round(corners, 6))
 
@@ -179,9 +179,12 @@ class Region:
 
 
 def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray]:
-    """Where the samples lie: x, shape (vector, 1), and y, shape (1, sample)."""
-    x = np.arange(float(grid.vectors))[:, None] * grid.vector_pitch_mm
-    y = grid.first_sample_depth_mm + np.arange(float(grid.samples))[None, :] * grid.sample_spacing_mm
+    """Where the samples lie: x and y, each of shape (vector, sample)."""
+    sample = np.arange(float(grid.samples))
+    x, y = (
+        along * np.arange(float(grid.vectors))[:, None] + (down * sample + first)
+        for along, down, first in grid.image_from_sample[:2].tolist()
+    )
     return x, y
 
 

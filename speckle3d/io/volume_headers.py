@@ -25,7 +25,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.volume import VOXEL_TYPES, require_spacing
 from speckle3d.io.pixels import meta_type
 
-PREFIX = "speckle3d_"
+PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
 
 SIZE_FIELD = b"CompressedDataSize = "
@@ -138,6 +138,8 @@ def meta_header(header: VolumeHeader, is_packed: bool) -> bytes:
             f"AnatomicalOrientation = {_anatomical_orientation(header.axes)}",
             f"ElementSpacing = {_texts(header.spacing_mm)}",
             f"DimSize = {_texts(header.shape)}",
+            # As PLUS tells a volume from a sequence of frames.
+            "Kinds = domain domain domain",
             *(f"{name} = {value}" for name, value in header.all_fields),
             f"ElementType = MET_{meta_type(np.dtype(header.dtype))}",
             "ElementDataFile = LOCAL",

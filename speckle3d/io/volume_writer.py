@@ -94,7 +94,7 @@ class VolumeWriter:
         segments: Sequence[Segment] | None = None,
     ) -> None:
         self._path = Path(path)
-        suffix = _suffix(self._path, segments is not None)
+        suffix = require_suffix(self._path, segments is not None)
         with naming(str(path)):
             kind, plain = np.dtype(dtype), dict[str, str]()
             if segments is not None:
@@ -232,7 +232,14 @@ def _crc32() -> Callable[[bytes | memoryview, int], int]:
     return found
 
 
-def _suffix(path: Path, is_labels: bool) -> str:
+def require_suffix(path: Path, is_labels: bool = False) -> str:
+    """Suffix of a volume's name, which chooses the format.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is none of `SUFFIXES`, or is of labels where there are none.
+    """
     name = path.name.lower()
     suffix = next((each for each in SUFFIXES if name.endswith(each)), None)
     if suffix is None:

@@ -61,6 +61,22 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         writer.append(volume.voxels.T)
 
 
+def is_volume(path: PathLike) -> bool:
+    """Whether a file says that it is a volume: NIfTI, or an image whose axes are all of space.
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        If it cannot be read, or its header does not make sense.
+    """
+    with reading(path), open_regular(path) as stream:
+        start = stream.read(_SNIFFED_BYTES)
+    if is_metaimage(start) or is_nrrd(start):
+        header = read_header(path)
+        return header.is_volume or (header.kinds == 3 * ["domain"] and not header.frames)
+    return is_nifti(start) or (start.startswith(GZIP_SIGNATURE) and str(path).lower().endswith(".nii.gz"))
+
+
 @dataclass(frozen=True)
 class _Stored:
     """Voxels as a file holds them.

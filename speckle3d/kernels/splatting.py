@@ -39,11 +39,12 @@ def _cut(start: int, stop: int, at: int, step: int, low: int, high: int) -> tupl
     first, last = at + start * step, at + (stop - 1) * step
     if min(first, last) >= low and max(first, last) < high:
         return start, stop
-    if step > 0:
-        return max(start, -((at - low) // step)), min(stop, -((at - high) // step))
+    if max(first, last) < low or min(first, last) >= high:
+        return start, start
     if step < 0:
-        return max(start, (at - high) // -step + 1), min(stop, (at - low) // -step + 1)
-    return start, start
+        # Seen from the other side, where the last position inside is the first.
+        at, step, low, high = -at, -step, 1 - high, 1 - low
+    return max(start, -((at - low) // step)), min(stop, -((at - high) // step))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -59,6 +60,12 @@ def _cut_to_box(
     if start < stop:
         start, stop = _cut(start, stop, z, m[2, 1], (box[2, 0] - reach) * _WHOLE, box[2, 1] * _WHOLE)
     return line, start, stop, x + start * m[0, 1], y + start * m[1, 1], z + start * m[2, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
+    """Whether a position is in a voxel, or between the same eight."""
+    return (((x >> POSITION_BITS) ^ i) | ((y >> POSITION_BITS) ^ j) | ((z >> POSITION_BITS) ^ k)) == 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -87,8 +94,8 @@ def count_nearest(
     for n in range(images.shape[0]):
         m = maps[n]
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
-        for span in spans:
-            line, start, stop, x, y, z = _cut_to_box(span, m, box, 0)
+        for span in range(spans.shape[0]):
+            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
             if start >= stop:
                 continue
             # Several samples in a row lie in one voxel: memory is touched when it changes.
@@ -102,18 +109,6 @@ def count_nearest(
                 held += _ONE_SAMPLE + np.uint64(np.int64(images[n, line, sample]) + offset)
                 x, y, z = x + dx, y + dy, z + dz
             words[at] += held
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _give(sums: FloatArray, tags: Tags, tag: int, at: int, total: float, weight: float) -> None:
-    """Add to a voxel; with a tag, in place of what frames of other tags gave."""
-    if weight > 0.0:
-        if tag > 0 and tags[at] != tag:
-            tags[at] = tag
-            sums[at, 0], sums[at, 1] = total, weight
-        else:
-            sums[at, 0] += total
-            sums[at, 1] += weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -151,23 +146,25 @@ def add_nearest(
         m = maps[n]
         tag = first_tag + n if first_tag > 0 else 0
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
-        for span in spans:
-            line, start, stop, x, y, z = _cut_to_box(span, m, box, 0)
-            if start >= stop:
-                continue
-            total, weight = 0.0, 0.0
-            at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
-            for sample in range(start, stop):
-                here = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
-                if here != at:
-                    _give(sums, marks, tag, at, total, weight)
-                    at, total, weight = here, 0.0, 0.0
-                level, share = float(images[n, line, sample]), float(weights[n, line, sample])
-                if level == level and share > 0.0:
-                    total += share * level
-                    weight += share
-                x, y, z = x + dx, y + dy, z + dz
-            _give(sums, marks, tag, at, total, weight)
+        for span in range(spans.shape[0]):
+            line, sample, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            while sample < stop:
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                total, weight = 0.0, 0.0
+                inside = True
+                while inside:
+                    level, share = float(images[n, line, sample]), float(weights[n, line, sample])
+                    if level == level and share > 0.0:
+                        total += share * level
+                        weight += share
+                    x, y, z, sample = x + dx, y + dy, z + dz, sample + 1
+                    inside = sample < stop and _same_cell(x, y, z, i, j, k)
+                at = np.uint64((k * n_j + j) * n_i + i)
+                if weight > 0.0 and tag > 0 and marks[at] != tag:
+                    marks[at] = tag
+                    sums[at, 0], sums[at, 1] = 0.0, 0.0
+                sums[at, 0] += total
+                sums[at, 1] += weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -187,8 +184,8 @@ def raise_nearest(
     levels = table.reshape(-1)
     for n in range(images.shape[0]):
         m = maps[n]
-        for span in spans:
-            line, start, stop, x, y, z = _cut_to_box(span, m, box, 0)
+        for span in range(spans.shape[0]):
+            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
             for sample in range(start, stop):
                 at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
                 level = np.float32(images[n, line, sample])
@@ -198,38 +195,15 @@ def raise_nearest(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _share_out(
-    table: FloatArray,
-    tags: Tags,
-    tag: int,
-    box: IntArray,
-    cell: tuple[int, int, int],
-    totals: tuple[float, ...],
-    weights: tuple[float, ...],
-) -> None:
-    """Give the eight voxels around a cell, where they are in the box, what its samples amount to."""
-    n_j, n_i = table.shape[1:3]
-    sums, marks = table.reshape(-1, 2), tags.reshape(-1)
-    i, j, k = cell
-    at = (k * n_j + j) * n_i + i
-    plane = n_j * n_i
-    if box[0, 0] <= i < box[0, 1] - 1 and box[1, 0] <= j < box[1, 1] - 1 and box[2, 0] <= k < box[2, 1] - 1:
-        _give(sums, marks, tag, at, totals[0], weights[0])
-        _give(sums, marks, tag, at + 1, totals[1], weights[1])
-        _give(sums, marks, tag, at + n_i, totals[2], weights[2])
-        _give(sums, marks, tag, at + n_i + 1, totals[3], weights[3])
-        _give(sums, marks, tag, at + plane, totals[4], weights[4])
-        _give(sums, marks, tag, at + plane + 1, totals[5], weights[5])
-        _give(sums, marks, tag, at + plane + n_i, totals[6], weights[6])
-        _give(sums, marks, tag, at + plane + n_i + 1, totals[7], weights[7])
-        return
-    for corner in range(8):
-        a, b, c = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
-        if box[0, 0] <= a < box[0, 1] and box[1, 0] <= b < box[1, 1] and box[2, 0] <= c < box[2, 1]:
-            _give(sums, marks, tag, (c * n_j + b) * n_i + a, totals[corner], weights[corner])
+def _fraction(x: int) -> float:
+    """How far a position is from the voxel below to the one above."""
+    return (x >> _DROPPED & _SHARES) * _SHARE
 
 
-_NONE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _large(share: float) -> float:
+    """Drop a share that is too small to count."""
+    return share if share >= _LEAST_SHARE else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -255,64 +229,79 @@ def add_linear(
     first_tag : int
         As for `add_nearest`; with tags, shares below 1/8 do not count.
     """
+    n_j, n_i = table.shape[1:3]
+    row, plane, one = np.uint64(n_i), np.uint64(n_j * n_i), np.uint64(1)
+    sums, marks = table.reshape(-1, 2), tags.reshape(-1)
+    low_i, low_j, low_k = box[0, 0], box[1, 0], box[2, 0]
+    last_i, last_j, last_k = box[0, 1] - 1, box[1, 1] - 1, box[2, 1] - 1
     for n in range(images.shape[0]):
         m = maps[n]
         tag = first_tag + n if first_tag > 0 else 0
-        least = _LEAST_SHARE if tag > 0 else 0.0
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
-        for span in spans:
-            line, start, stop, x, y, z = _cut_to_box(span, m, box, 1)
-            if start >= stop:
-                continue
-            t, w = _NONE, _NONE
-            i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
-            for sample in range(start, stop):
-                a, b, c = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
-                if ((a ^ i) | (b ^ j) | (c ^ k)) != 0:
-                    _share_out(table, tags, tag, box, (i, j, k), t, w)
-                    i, j, k = a, b, c
-                    t, w = _NONE, _NONE
-                level, share = float(images[n, line, sample]), float(weights[n, line, sample])
-                if level == level and share > 0.0:
-                    s = _shares(x, y, z, least, share)
-                    w = (w[0] + s[0], w[1] + s[1], w[2] + s[2], w[3] + s[3],
-                         w[4] + s[4], w[5] + s[5], w[6] + s[6], w[7] + s[7])  # fmt: skip
-                    t = (t[0] + s[0] * level, t[1] + s[1] * level, t[2] + s[2] * level, t[3] + s[3] * level,
-                         t[4] + s[4] * level, t[5] + s[5] * level, t[6] + s[6] * level,
-                         t[7] + s[7] * level)  # fmt: skip
-                x, y, z = x + dx, y + dy, z + dz
-            _share_out(table, tags, tag, box, (i, j, k), t, w)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _shares(
-    x: int, y: int, z: int, least: float, weight: float
-) -> tuple[float, float, float, float, float, float, float, float]:
-    """Shares of a sample that the eight voxels around it get, x fastest; those below `least` are none."""
-    fx, fy, fz = (
-        (x >> _DROPPED & _SHARES) * _SHARE,
-        (y >> _DROPPED & _SHARES) * _SHARE,
-        (z >> _DROPPED & _SHARES) * _SHARE,
-    )
-    gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
-    near, far = gz, fz
-    a, b, c, d = gy * near, fy * near, gy * far, fy * far
-    s = (gx * a, fx * a, gx * b, fx * b, gx * c, fx * c, gx * d, fx * d)
-    if least > 0.0:
-        s = (
-            s[0] if s[0] >= least else 0.0,
-            s[1] if s[1] >= least else 0.0,
-            s[2] if s[2] >= least else 0.0,
-            s[3] if s[3] >= least else 0.0,
-            s[4] if s[4] >= least else 0.0,
-            s[5] if s[5] >= least else 0.0,
-            s[6] if s[6] >= least else 0.0,
-            s[7] if s[7] >= least else 0.0,
-        )
-    return (
-        s[0] * weight, s[1] * weight, s[2] * weight, s[3] * weight,
-        s[4] * weight, s[5] * weight, s[6] * weight, s[7] * weight,
-    )  # fmt: skip
+        for span in range(spans.shape[0]):
+            line, sample, stop, x, y, z = _cut_to_box(spans[span], m, box, 1)
+            while sample < stop:
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                # Sums of samples in a row between the same eight voxels, x fastest, in registers: arrays or
+                # tuples take several times as long.
+                t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
+                w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = 0.0
+                inside = True
+                while inside:
+                    level, share = float(images[n, line, sample]), float(weights[n, line, sample])
+                    if level == level and share > 0.0:
+                        fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
+                        gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
+                        a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
+                        s0, s1, s2, s3 = gx * a, fx * a, gx * b, fx * b
+                        s4, s5, s6, s7 = gx * c, fx * c, gx * d, fx * d
+                        if tag > 0:
+                            s0, s1, s2, s3 = _large(s0), _large(s1), _large(s2), _large(s3)
+                            s4, s5, s6, s7 = _large(s4), _large(s5), _large(s6), _large(s7)
+                        w0, w1, w2, w3 = w0 + share * s0, w1 + share * s1, w2 + share * s2, w3 + share * s3
+                        w4, w5, w6, w7 = w4 + share * s4, w5 + share * s5, w6 + share * s6, w7 + share * s7
+                        level *= share
+                        t0, t1, t2, t3 = t0 + level * s0, t1 + level * s1, t2 + level * s2, t3 + level * s3
+                        t4, t5, t6, t7 = t4 + level * s4, t5 + level * s5, t6 + level * s6, t7 + level * s7
+                    x, y, z, sample = x + dx, y + dy, z + dz, sample + 1
+                    inside = sample < stop and _same_cell(x, y, z, i, j, k)
+                if tag == 0 and low_i <= i < last_i and low_j <= j < last_j and low_k <= k < last_k:
+                    at = np.uint64((k * n_j + j) * n_i + i)
+                    sums[at, 0] += t0
+                    sums[at, 1] += w0
+                    sums[at + one, 0] += t1
+                    sums[at + one, 1] += w1
+                    at += row
+                    sums[at, 0] += t2
+                    sums[at, 1] += w2
+                    sums[at + one, 0] += t3
+                    sums[at + one, 1] += w3
+                    at += plane
+                    sums[at, 0] += t6
+                    sums[at, 1] += w6
+                    sums[at + one, 0] += t7
+                    sums[at + one, 1] += w7
+                    at -= row
+                    sums[at, 0] += t4
+                    sums[at, 1] += w4
+                    sums[at + one, 0] += t5
+                    sums[at + one, 1] += w5
+                    continue
+                totals, shares = (t0, t1, t2, t3, t4, t5, t6, t7), (w0, w1, w2, w3, w4, w5, w6, w7)
+                for corner in range(8):
+                    u, v, w = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
+                    if (
+                        shares[corner] > 0.0
+                        and low_i <= u <= last_i
+                        and low_j <= v <= last_j
+                        and low_k <= w <= last_k
+                    ):
+                        at = np.uint64((w * n_j + v) * n_i + u)
+                        if tag > 0 and marks[at] != tag:
+                            marks[at] = tag
+                            sums[at, 0], sums[at, 1] = 0.0, 0.0
+                        sums[at, 0] += totals[corner]
+                        sums[at, 1] += shares[corner]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -330,23 +319,24 @@ def raise_linear(
     """
     for n in range(images.shape[0]):
         m = maps[n]
-        for span in spans:
-            line, start, stop, x, y, z = _cut_to_box(span, m, box, 1)
+        for span in range(spans.shape[0]):
+            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 1)
             for sample in range(start, stop):
                 level = np.float32(images[n, line, sample])
-                if level == level:
-                    i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
-                    s = _shares(x, y, z, 0.0, 1.0)
-                    for corner in range(8):
-                        a, b, c = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
-                        if (
-                            s[corner] >= _LEAST_SHARE
-                            and box[0, 0] <= a < box[0, 1]
-                            and box[1, 0] <= b < box[1, 1]
-                            and box[2, 0] <= c < box[2, 1]
-                            and not table[c, b, a] >= level
-                        ):
-                            table[c, b, a] = level
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
+                for corner in range(8):
+                    u, v, w = corner & 1, corner >> 1 & 1, corner >> 2
+                    share = (fx if u else 1.0 - fx) * (fy if v else 1.0 - fy) * (fz if w else 1.0 - fz)
+                    if (
+                        share >= _LEAST_SHARE
+                        and box[0, 0] <= i + u < box[0, 1]
+                        and box[1, 0] <= j + v < box[1, 1]
+                        and box[2, 0] <= k + w < box[2, 1]
+                        and level == level
+                        and not table[k + w, j + v, i + u] >= level
+                    ):
+                        table[k + w, j + v, i + u] = level
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
 
 

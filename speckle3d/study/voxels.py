@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -15,16 +15,21 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.labels import STATE_SEGMENTS
-from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, principal_axes, sweep_axes
+from speckle3d.core.labels import STATE_SEGMENTS, Segment
+from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.imaging.axes import principal_axes, sweep_axes
+from speckle3d.imaging.backward import backward_slabs
+from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.settings import CompoundingSettings
-from speckle3d.imaging.slabs import compound_slabs
+from speckle3d.imaging.slabs import as_type, compound_slabs
+from speckle3d.imaging.uncertainty import DeviationField
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.volume_writer import VolumeWriter
 from speckle3d.io.volumes import read_volume
+from speckle3d.study.pose_errors import posed_errors_of
 from speckle3d.study.posed import PosedSweep
 
 BEST_FIRST = ("fused", "crossed", "pose", "inertial", "orientation", "image")
@@ -101,6 +106,8 @@ class VolumeRequest:
         Of the images; samples outside it do not count.
     state_path : path, optional
         Where to write which voxels are measured and filled, as labels.
+    deviation_path : path, optional
+        Where to write each voxel's standard deviation of position along the sweep, mm.
     """
 
     path: Path
@@ -108,6 +115,7 @@ class VolumeRequest:
     grid: GridRequest = GridRequest()
     region: Region | None = None
     state_path: Path | None = None
+    deviation_path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -185,24 +193,28 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
         If a file cannot be written.
     """
     began, settings = time.perf_counter(), request.settings
-    source, meaning = posed.source(settings.levels, settings.dynamic_range_db)
+    levels = None if settings.levels == "auto" else settings.levels
+    source, meaning = posed.source(levels, settings.dynamic_range_db)
     grid = request.grid.grid(source, settings)
     counts = np.zeros(3, dtype=np.int64)
     place = grid.shape, grid.spacing_mm, grid.world_from_grid
     fields = fields_of(posed, request, meaning)
     with ExitStack() as files:
-        voxels = files.enter_context(VolumeWriter(request.path, *place, settings.voxel_type, fields))
-        states = None
-        if request.state_path is not None:
-            writer = VolumeWriter(request.state_path, *place, "uint8", fields, segments=STATE_SEGMENTS)
-            states = files.enter_context(writer)
+        writers = [
+            files.enter_context(VolumeWriter(path, *place, kind, fields | more, segments=segments))
+            for path, kind, more, segments in _outputs(request)
+        ]
+        deviation = _deviation(posed, source, grid) if request.deviation_path else None
         for slab in _slabs(posed, source, grid, request):
-            voxels.append(slab.voxels)
-            if states is not None:
-                states.append(slab.state)
+            stop = slab.first + len(slab.state)
+            made = [slab.voxels, *([slab.state] if request.state_path else [])]
+            if deviation is not None:
+                made.append(deviation.planes(slab.first, stop, slab.state))
+            for writer, planes in zip(writers, made, strict=True):
+                writer.append(planes)
             counts += np.bincount(slab.state.ravel(), minlength=3)
             if progress is not None:
-                progress(slab.first + len(slab.state), grid.shape[2])
+                progress(stop, grid.shape[2])
         if counts[MEASURED] == 0:
             raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
     seconds = time.perf_counter() - began
@@ -210,9 +222,51 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
 
 
 def _slabs(posed: PosedSweep, source: PosedImages, grid: VoxelGrid, request: VolumeRequest) -> Iterator[Slab]:
+    settings = request.settings
     mask: BoolArray | None = None if request.region is None else request.region.mask(source.grid)
-    weights = confidence(posed, request.settings.voxel_mm) if request.settings.rule == "weighted" else None
-    return compound_slabs(source, grid, request.settings, weights, mask)
+    if settings.backward_mm > 0:
+        return _backward(source, grid, settings, mask)
+    weights = confidence(posed, settings.voxel_mm) if settings.rule == "weighted" else None
+    return compound_slabs(source, grid, settings, weights, mask)
+
+
+def _backward(
+    source: PosedImages, grid: VoxelGrid, settings: CompoundingSettings, mask: BoolArray | None
+) -> Iterator[Slab]:
+    """Slabs of voxels looked up in the images, in the type asked for."""
+    for slab in backward_slabs(source, grid, settings.backward_mm, mask, settings.max_memory_gb):
+        yield replace(slab, voxels=as_type(slab.voxels, slab.state, settings.voxel_type))
+
+
+def _outputs(
+    request: VolumeRequest,
+) -> Iterator[tuple[Path, str, dict[str, str], tuple[Segment, ...] | None]]:
+    """Files to write: path, type, what else they say, and segments of labels."""
+    yield request.path, request.settings.voxel_type, {}, None
+    if request.state_path is not None:
+        yield request.state_path, "uint8", {}, STATE_SEGMENTS
+    if request.deviation_path is not None:
+        said = {"levels": "standard deviation of position along the sweep, mm"}
+        yield request.deviation_path, "float32", said, None
+
+
+def _deviation(posed: PosedSweep, source: PosedImages, grid: VoxelGrid) -> DeviationField:
+    return DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
+
+
+def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
+    """Claimed errors of a reconstruction's poses.
+
+    Raises
+    ------
+    InsufficientDataError
+        If nothing says how well the frames' places are known.
+    """
+    if posed.reconstruction is None:
+        raise InsufficientDataError(
+            f"{posed.sweep.name}: {purpose}: expected a reconstruction with claimed errors, got a recording"
+        )
+    return posed_errors_of(posed.reconstruction, posed.mode)
 
 
 def confidence(posed: PosedSweep, voxel_mm: float) -> FloatArray:
@@ -223,12 +277,8 @@ def confidence(posed: PosedSweep, voxel_mm: float) -> FloatArray:
     InsufficientDataError
         If nothing says how well the frames' places are known.
     """
-    trust = None if posed.reconstruction is None else posed.reconstruction.trust
-    if trust is None:
-        raise InsufficientDataError(
-            f"{posed.sweep.name}: rule weighted: expected a reconstruction with claimed errors, got none"
-        )
-    place = trust.covariance[posed.frames, 2, 2] + voxel_mm**2 / 12
+    errors = _errors(posed, "rule weighted").errors
+    place = (errors.factors[:, :, 2] ** 2).sum(axis=0) + voxel_mm**2 / 12
     return np.asarray(place.min() / place)
 
 
@@ -238,9 +288,13 @@ def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[s
     return {
         "levels": meaning,
         "poses": posed.mode,
-        "splat": settings.splat,
-        "rule": settings.rule,
-        "fill_radius": f"{settings.fill_radius} voxels",
+        **_method(settings),
         "recording": posed.sweep.name,
         "made_by": f"speckle3d {version('speckle3d')}",
     }
+
+
+def _method(settings: CompoundingSettings) -> dict[str, str]:
+    if settings.backward_mm > 0:
+        return {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
+    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": f"{settings.fill_radius} voxels"}

@@ -9,14 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.grid import (
-    grid_around,
-    grid_as_asked,
-    grid_like,
-    principal_axes,
-    spacing_within,
-    sweep_axes,
-)
+from speckle3d.imaging.axes import principal_axes, sweep_axes
+from speckle3d.imaging.grid import grid_around, grid_as_asked, grid_like, spacing_within
 
 GRID = ImageGrid(
     vectors=41, samples=60, vector_pitch_mm=0.5, sample_spacing_mm=0.4, first_sample_depth_mm=2.0
@@ -96,15 +90,15 @@ def test_the_principal_box_is_the_smallest(seed, kind):
 def test_the_principal_box_of_an_oblique_sweep_is_known():
     # Images shifted laterally as they advance: a sheared box, whose smallest box leans with it.
     z = np.linspace(0.0, 400.0, 30)
-    poses = RigidTransform.from_translation(np.outer(z, [1.0, 0.0, 1.0]))
+    poses = RigidTransform.from_translation(np.outer(z, [0.75, 0.0, 1.0]))
     axes = principal_axes(GRID, poses)
     sizes = np.ptp(
         axes.inv().apply(np.concatenate([poses.apply(corner) for corner in GRID.corners_mm])), axis=0
     )
     width, height = GRID.width_mm, GRID.depth_mm - GRID.first_sample_depth_mm
-    expected = [width * np.sqrt(0.5), height, 400.0 * np.sqrt(2.0) + width * np.sqrt(0.5)]
+    expected = [0.8 * width, height, 500.0 + 0.6 * width]
     np.testing.assert_allclose(sizes, expected, rtol=1e-4)
-    np.testing.assert_allclose(axes.apply([1.0, 0.0, 0.0]), [np.sqrt(0.5), 0.0, -np.sqrt(0.5)], atol=1e-4)
+    np.testing.assert_allclose(axes.apply([1.0, 0.0, 0.0]), [0.8, 0.0, -0.6], atol=1e-5)
 
 
 def test_a_translated_sweep_keeps_its_own_axes():
@@ -203,7 +197,7 @@ def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     found = spacing_within(GRID, poses, gigabytes, axes)
 
     def memory(spacing):
-        return grid_around(GRID, poses, spacing, axes).memory_gb
+        return grid_around(GRID, poses, spacing, axes).size_gb("uint8")
 
     steps = ("1.0", "1.2", "1.5", "2.0", "2.5", "3.0", "4.0", "5.0", "6.0", "8.0")
     assert f"{found:.1e}".split("e")[0] in steps
@@ -234,7 +228,7 @@ def test_wrong_input_is_refused():
         grid_around(GRID, poses, 1.0, Rotation.identity(2))
     with pytest.raises(InvalidInputError, match="up to 1000000 along"):
         grid_around(GRID, poses, 1e-6)
-    with pytest.raises(InvalidInputError, match="max_memory_gb"):
+    with pytest.raises(InvalidInputError, match="max_gb"):
         spacing_within(GRID, poses, 0.0)
     with pytest.raises(InvalidInputError, match="world_from_image"):
         sweep_axes(RigidTransform.identity(0))
