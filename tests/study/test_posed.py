@@ -40,10 +40,17 @@ def test_bmode_as_it_is_stored_needs_no_dynamic_range(tmp_path):
     assert stored.dtype == np.uint8
     np.testing.assert_array_equal(stored, grey(4)[2].T)
     for levels in ("log", "linear"):
-        with pytest.raises(MissingSettingsError, match="--dynamic-range-db"):
+        with pytest.raises(InvalidInputError, match=f"levels {levels}.*give --dynamic-range-db"):
             posed.source(levels)
-    with pytest.raises(MissingSettingsError, match="--dynamic-range-db"):
-        posed.images()
+
+
+@pytest.mark.parametrize("range_db", [40.0, 60.0])
+def test_pictures_of_bmode_of_unknown_range_show_its_levels(tmp_path, range_db):
+    images, _ = open_posed(sequence(tmp_path)).images(range_db)
+    stored = grey(4)[1].T.astype(float)
+    lit = (images[1] > 0) & (images[1] < 255)
+    assert lit.sum() > 5
+    assert np.ptp((images[1] - stored)[lit]) < 1e-2
 
 
 @pytest.mark.parametrize(
