@@ -118,9 +118,9 @@ class PosedSweep:
     def _require_range(self, levels: Levels) -> None:
         if not self.range_is_known and levels != "stored":
             raise InvalidInputError(
-                f"{self.sweep.name}: levels {levels}: expected the dynamic range of its B-mode, got none: give "
-                "--dynamic-range-db (decibels from black to white, beside the image on the scanner's screen), "
-                "or take levels stored"
+                f"{self.sweep.name}: levels {levels}: expected the dynamic range of its B-mode, got none: "
+                "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
+                "screen), or take levels stored"
             )
 
 
