@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Tracker
+from speckle3d.io.describe import describe
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_notes, load_sweep
@@ -260,6 +261,7 @@ def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
     assert np.rad2deg(sweep.tracker.image_skew_rad) == pytest.approx(-2.745, abs=1e-3)
     write_sweep(tmp_path / "a.h5", sweep)
     held = load_sweep(tmp_path / "a.h5")
+    assert ("image axes off square", "-2.74", "deg") in describe(tmp_path / "a.h5")
     assert held.tracker.image_skew_rad == sweep.tracker.image_skew_rad
     write_sequence(tmp_path / "b.mha", held)
     back = load_sweep(tmp_path / "b.mha", ImportSettings(dynamic_range_db=60.0)).tracker
