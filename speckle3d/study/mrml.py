@@ -1,7 +1,7 @@
 """Scenes of 3D Slicer (.mrml): nodes that refer to each other, and to files beside the scene.
 
-A node that has a file refers to a storage node, which names the file relative to the scene's folder as part of
-a URL [1]_. Nodes are read in order; those that others refer to come first.
+A node that has a file refers to a storage node, which names the file relative to the scene's folder, as part
+of a URL [1]_. Nodes are read in order; those that others refer to come first.
 
 References
 ----------

@@ -1,9 +1,9 @@
-"""A folder that opens in 3D Slicer as one scene: volumes, where voxels are from, frames' outlines and poses."""
+"""A folder that opens in 3D Slicer as one scene: volumes, states of voxels, frames' outlines and poses."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,7 @@ class SceneRequest:
     """
 
     settings: CompoundingSettings = field(default_factory=CompoundingSettings)
-    grid: GridRequest = GridRequest()
+    grid: GridRequest = field(default_factory=GridRequest)
     with_images: bool = False
     with_deviation: bool = False
 
@@ -63,10 +63,11 @@ class _Files:
 
     @classmethod
     def of(cls, mode: str) -> _Files:
-        return cls(
-            f"volume-{mode}.nrrd", f"state-{mode}.seg.nrrd", f"outlines-{mode}.vtk", f"first-frame-{mode}.tfm",
-            f"deviation-{mode}.nrrd", f"images-{mode}.seq.nrrd", f"poses-{mode}.seq.mha",
+        names = (
+            "volume-{}.nrrd", "state-{}.seg.nrrd", "outlines-{}.vtk", "first-frame-{}.tfm",
+            "deviation-{}.nrrd", "images-{}.seq.nrrd", "poses-{}.seq.mha",
         )  # fmt: skip
+        return cls(*(name.format(mode) for name in names))
 
     def written(self, request: SceneRequest) -> list[str]:
         deviation = [self.deviation] if request.with_deviation else []
@@ -114,7 +115,8 @@ def write_scene(
         scene, reports = Scene(), []
         for i, each in enumerate(posed):
             shown = _part_of(progress, i, len(posed))
-            reports.append(_write_mode(part, each, asked, shown))
+            report = _write_mode(part, each, asked, shown)
+            reports.append(replace(report, path=target / report.path.name))
             _add_mode(scene, each, asked, i)
         scene.show("vtkMRMLScalarVolumeNode1")
         (part / SCENE).write_text(scene.text(), encoding="utf-8")

@@ -48,8 +48,8 @@ class PosedSequence:
     sweep : Sweep
         Of B-mode, read one at a time.
     world_from_pixels : ndarray, shape (n, 4, 4)
-        From pixels (column, row, 0, 1) to mm. Unlike in other files of this package, axes lead right, anterior
-        and superior, as Slicer takes them: a sequence cannot say where its axes lead.
+        From pixels (column, row, 0, 1) to mm. Unlike in other files of this package, axes lead right,
+        anterior and superior, as Slicer takes them: a sequence cannot say where its axes lead.
     """
 
     sweep: Sweep
