@@ -6,7 +6,7 @@ Written from what its sources do, `vtkIGSIOPasteSliceIntoVolume` and `vtkIGSIOFi
 - Places are whole multiples of 2^-14 voxel, and so are the steps between pixels: over a row of 820 pixels
   the place is off by up to 0.025 voxel.
 - Nearest: a voxel's mean is kept in whole grey levels and cut to one after every pixel, so it falls.
-- Linear: it is rounded after every pixel, so a pixel that differs by less than half the weight so far
+- Linear: it is rounded after every pixel, so one that differs from it by less than half the pixels so far
   does not count at all. The weight is kept in steps of 1/256 and stays at 256 from there on.
 - Nearest: from the 256th pixel on, the mean moves 1/256 of the way to each, cut to whole levels.
 """
@@ -50,6 +50,12 @@ class Clip:
             for i, piece in enumerate(pieces):
                 spans[row, i] = piece
         return spans
+
+    def mask(self, width, height):
+        """Whether each pixel counts, shape (height, width)."""
+        columns, spans = np.arange(width), self.spans(width, height)
+        inside = (spans[..., 0, None] <= columns) & (columns <= spans[..., 1, None])
+        return inside.any(axis=1)
 
     def _of_fan(self, row, left, right):
         x, y, inner, outer, low, high = self.fan
@@ -173,6 +179,37 @@ def _linear(image, axes, spans, volume, weight, rule):
                     else:
                         continue
                     weight[i + a, j + b, k + c] = min((new + half) >> POINT, MOST)
+
+
+def exact_mean(images, voxel_from_pixel, shape, clip, linear=False, true_places=False):
+    """Mean of the same pixels without rounding, NaN where there are none, and their weight, both [i, j, k].
+
+    Parameters
+    ----------
+    true_places : bool
+        Take places as they are, not as multiples of 2^-14 voxel.
+    """
+    rows, columns = np.nonzero(clip.mask(images.shape[2], images.shape[1]))
+    pixels = np.stack([columns, rows, np.ones_like(rows)])
+    maps = np.asarray(voxel_from_pixel)[:, :, [0, 1, 3]]
+    if not true_places:
+        maps = np.rint(maps * 2.0**POINT) / 2.0**POINT
+    total, weight = np.zeros(np.prod(shape)), np.zeros(np.prod(shape))
+    for image, axes in zip(images, maps, strict=True):
+        place, level = (axes @ pixels).T, image[rows, columns].astype(float)
+        first = np.floor(place if linear else place + 0.5).astype(int)
+        for corner in np.ndindex(2, 2, 2) if linear else [(0, 0, 0)]:
+            index = first + corner
+            share = np.prod(np.where(corner, place - first, 1 - place + first), axis=1) if linear else 1.0
+            # A pixel near the border counts in none of the eight, as in IGSIO, not in those inside.
+            reach = np.ceil(place).astype(int) if linear else index
+            inside = ((first >= 0) & (reach < shape)).all(axis=1) & (share > 0)
+            flat = np.ravel_multi_index(tuple(index[inside].T), shape)
+            share = np.broadcast_to(share, level.shape)[inside]
+            total += np.bincount(flat, share * level[inside], total.size)
+            weight += np.bincount(flat, share, total.size)
+    with np.errstate(invalid="ignore"):
+        return (total / weight).reshape(shape), weight.reshape(shape)
 
 
 @njit(cache=True, fastmath=False)

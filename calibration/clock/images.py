@@ -36,7 +36,8 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import ChosenImages, Images
-from speckle3d.imaging.reslice import image_plane, resample_image, reslice_frames
+from speckle3d.imaging.planes import image_plane
+from speckle3d.imaging.reslice import resample_image, reslice_frames
 
 STEP_S = 0.01
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from speckle3d.cli.calibrations import mount
 from speckle3d.cli.common import (
     CalibrationFiles,
     Json,
@@ -19,7 +20,14 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.importing import Importing, Number, PlusConfig, Told, TransformName
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+    given_settings,
+)
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -153,7 +161,7 @@ def convert(
     probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
     plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: TransformName = None,
+    reference_transform: ReferenceTransform = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
         str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
@@ -172,6 +180,7 @@ def convert(
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
     """
+    from speckle3d.io.calibrations import fitted_pixels, resized
     from speckle3d.io.load import import_notes, load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
@@ -181,8 +190,8 @@ def convert(
     if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
         known = ", ".join((".h5", ".hdf5", *SUFFIXES))
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
-    given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
-    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
+    named = files_of(plus_config, calibration)
+    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *named)
     if _is_reconstruction(source):
         _convert_posed(source, out, options)
         return
@@ -191,9 +200,12 @@ def convert(
             raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    told = Told.of(source, options, calibration)
-    sweep = told.on(load_sweep(source, told.settings))
-    for each in import_notes(source, told.settings):
+    given = given_settings(source, options)
+    fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
+    settings = given.model_copy(update=fitted)
+    sweep = resized(load_sweep(source, settings), fitted)
+    sweep = mount(sweep, calibration or ())
+    for each in import_notes(source, settings):
         note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:

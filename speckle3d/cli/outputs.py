@@ -93,7 +93,7 @@ def _is_log(path: Path) -> bool:
     return next(lines, b"").startswith(b"time_s,")
 
 
-def _is_volume(path: Path) -> bool:
+def is_volume(path: Path) -> bool:
     """Whether a file is a NIfTI, MetaImage or NRRD image that is no sequence of frames."""
     from speckle3d.io.headers import is_metaimage, is_nrrd
 
@@ -147,5 +147,5 @@ _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
     "trajectory": ("TUM text", _is_trajectory),
     "transform": ("a transform", _is_transform),
-    "volume": ("a volume", _is_volume),
+    "volume": ("a volume", is_volume),
 }

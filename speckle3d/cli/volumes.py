@@ -22,14 +22,17 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.importing import Importing, Number, PlusConfig, TransformName, open_as_told
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+    given_settings,
+)
 from speckle3d.cli.outputs import require_own_place
 
 Three = tuple[float, float, float]
-
-_OF_RECORDINGS = (
-    "plus_config", "transform", "reference_transform", "column_pitch_mm", "row_spacing_mm", "frame_rate_hz",
-)  # fmt: skip
 
 
 @app.command(cls=Importing)
@@ -90,7 +93,7 @@ def volume(
     calibration: CalibrationFiles = None,
     plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: TransformName = None,
+    reference_transform: ReferenceTransform = None,
     column_pitch_mm: Number = None,
     row_spacing_mm: Number = None,
     frame_rate_hz: Number = None,
@@ -100,12 +103,13 @@ def volume(
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
     from speckle3d.imaging.settings import CompoundingSettings
+    from speckle3d.study.posed import open_posed
     from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
     for place in (out, state, deviation):
         if place is not None:
-            require_own_place(place, "volume", source, sweep_file, like, *(calibration or ()))
+            require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
     settings = from_options(CompoundingSettings, base | given)
@@ -117,8 +121,11 @@ def volume(
         state,
         deviation,
     )
-    imported = {name: options[name] for name in _OF_RECORDINGS}
-    posed = open_as_told(source, mode, sweep_file, imported, calibration, dynamic_range_db)
+    # The option is the range of the volume's levels, and of B-mode that says none of its own.
+    imported = given_settings(source, {**options, "dynamic_range_db": None})
+    posed = open_posed(source, mode, sweep_file, imported, calibration or (), dynamic_range_db)
+    for line in posed.notes():
+        note(line)
     with progress_bar(f"compounding {out.name}") as progress:
         report = write_voxels(posed, request, progress)
     if as_json:

@@ -1,4 +1,4 @@
-"""Outlines of a sweep's frames in the world."""
+"""Outlines of a sweep's frames in the world, and the lines in which frames cross a plane."""
 
 from __future__ import annotations
 
@@ -22,7 +22,44 @@ def frame_outlines(grid: ImageGrid, world_from_image: RigidTransform) -> FloatAr
     -------
     ndarray, shape (n, 5, 3)
         Top left, top right, bottom right, bottom left and top left again, mm in the world.
+
+    Examples
+    --------
+    >>> grid = ImageGrid(3, 5, 1.0, 0.5)
+    >>> frame_outlines(grid, RigidTransform.identity(1))[0, :, :2].tolist()
+    [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]]
     """
     require_poses(world_from_image)
     corners = grid.corners_mm[[0, 1, 2, 3, 0]]
     return np.stack([world_from_image.apply(corner) for corner in corners], axis=1)
+
+
+def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> FloatArray:
+    """Lines in which frames cross a plane.
+
+    Parameters
+    ----------
+    outlines_mm : ndarray, shape (n, 5, 3)
+        From `frame_outlines`.
+    world_from_plane : RigidTransform, single
+        The plane is its x and y.
+
+    Returns
+    -------
+    ndarray, shape (n, 2, 2)
+        Both ends of each frame's line, x and y in the plane, the end nearer to the probe first; NaN for
+        frames that do not cross it.
+    """
+    n = len(outlines_mm)
+    there = world_from_plane.inv().apply(outlines_mm.reshape(-1, 3)).reshape(n, 5, 3)
+    # Along each edge of the outline from 0 at its first corner; edges count from the top one, clockwise.
+    start, change = there[:, :-1], np.diff(there, axis=1)
+    # A corner on the plane counts as in front of it, so that every line has two ends.
+    crossed = (start[..., 2] < 0) != (there[:, 1:, 2] < 0)
+    share = -start[..., 2] / np.where(crossed, change[..., 2], 1.0)
+    at = start[..., :2] + share[..., None] * change[..., :2]
+    depth = np.where(crossed, np.array([0.0, 0.0, 1.0, 1.0]) + share * [0.0, 1.0, 0.0, -1.0], np.inf)
+    nearer = np.argsort(depth, axis=1, kind="stable")[:, :2]
+    ends = np.take_along_axis(at, nearer[..., None], axis=1)
+    ends[crossed.sum(axis=1) != 2] = np.nan
+    return ends

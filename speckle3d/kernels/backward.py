@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
-from speckle3d.kernels.slicing import keep_nearest
+from speckle3d.kernels.cuts import keep_nearest
 
 # States of a voxel, as `speckle3d.imaging.holes` has them.
 _EMPTY, _MEASURED, _FILLED = 0, 1, 2
@@ -35,12 +35,13 @@ def keep_nearest_in_planes(
     distance_mm, grey : ndarray, shape (planes, 2, n_j, n_i), changed in place
         See `keep_nearest`.
     """
-    of_plane = np.empty((3, 3))
+    # The lines of a cut: along i, from (0, j, k), a voxel a step.
+    lines = np.zeros((grey.shape[2], 2, 3))
+    lines[:, 1, 0] = 1.0
+    lines[:, 0, 1] = np.arange(grey.shape[2])
     for plane in range(grey.shape[0]):
-        for row in range(3):
-            of_plane[row, 0], of_plane[row, 1] = index_from_voxel[row, 0], index_from_voxel[row, 1]
-            of_plane[row, 2] = index_from_voxel[row, 2] * (first + plane) + index_from_voxel[row, 3]
-        keep_nearest(image, of_plane, reach_mm, distance_mm[plane], grey[plane])
+        lines[:, 0, 2] = first + plane
+        keep_nearest(image, index_from_voxel, lines, reach_mm, distance_mm[plane], grey[plane])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)

@@ -1,6 +1,6 @@
-"""Reading posed images where other planes meet them: bilinear samples, reslices, patches of crossing sweeps.
+"""Reading posed images where other planes meet them: bilinear samples, patches of crossing sweeps.
 
-A reslice's pixel, and a patch's point, is blended from the two images nearest to it, one on either side.
+A patch's point is blended from the two images nearest to it, one on either side.
 A patch is a rectangle of grid points on one sweep's image; it and what the other sweep shows there are
 compared by their correlation, so that neither brightness nor contrast counts.
 """
@@ -20,9 +20,6 @@ PARAMETERS = 8
 
 LEAST_GAP = 0.1
 """Distance between two images, as part of the largest, from which their difference is taken for a slope."""
-
-EDGE_TOLERANCE = 1e-6
-"""Fraction of a pixel by which a reslice's point may miss the image's border: rounding of poses."""
 
 
 class PlacedImages(NamedTuple):
@@ -96,67 +93,6 @@ def bilinear(image, u, v):  # type: ignore[no-untyped-def]
     left = image[i, j] + a * (image[i + 1, j] - image[i, j])
     right = image[i, j + 1] + a * (image[i + 1, j + 1] - image[i, j + 1])
     return near + a * (far - near), far - near, right - left
-
-
-@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _clip(first: float, last: float, start: float, step: float, low: float, high: float):  # type: ignore[no-untyped-def]
-    """Shrink [first, last] to where ``low <= start + step * k <= high``, rounding aside."""
-    if abs(step) < 1e-12:
-        inside = low - 1e-6 <= start <= high + 1e-6
-        return (first, last) if inside else (1.0, 0.0)
-    a, b = (low - start) / step, (high - start) / step
-    return max(first, min(a, b)), min(last, max(a, b))
-
-
-# One thread: an image takes a fraction of a millisecond, and a team of threads gathered anew for each image
-# waits far longer than that as soon as another process wants a core.
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def keep_nearest(
-    image: Float32Array,
-    index_from_pixel: FloatArray,
-    max_distance_mm: float,
-    distance_mm: Float32Array,
-    grey: Float32Array,
-) -> None:
-    """Let one image replace, on either of its sides, farther images in the pixels of a plane.
-
-    Parameters
-    ----------
-    image : ndarray, shape (vector, sample)
-    index_from_pixel : ndarray, shape (3, 3)
-        From (column, row, 1) to (vector, sample, signed distance from the image's plane in mm).
-    distance_mm, grey : ndarray, shape (2, rows, columns), changed in place
-        Of the nearest image so far behind ([0], distance >= 0) and in front ([1]) of each pixel. Where there
-        is none yet, `distance_mm` holds `max_distance_mm`.
-    """
-    rows, columns = grey.shape[1:]
-    du, dv, dq = index_from_pixel[0, 0], index_from_pixel[1, 0], index_from_pixel[2, 0]
-    for row in range(rows):
-        u = index_from_pixel[0, 1] * row + index_from_pixel[0, 2]
-        v = index_from_pixel[1, 1] * row + index_from_pixel[1, 2]
-        q = index_from_pixel[2, 1] * row + index_from_pixel[2, 2]
-        # Coordinates are linear along a row, so the columns an image can reach are one interval.
-        first, last = _clip(0.0, columns - 1.0, q, dq, -max_distance_mm, max_distance_mm)
-        first, last = _clip(first, last, u, du, 0.0, image.shape[0] - 1.0)
-        first, last = _clip(first, last, v, dv, 0.0, image.shape[1] - 1.0)
-        if first > last + 2.0:
-            continue
-        for column in range(max(int(first) - 1, 0), min(int(last) + 2, columns)):
-            signed = q + dq * column
-            side = 0 if signed >= 0.0 else 1
-            away = np.float32(abs(signed))
-            if away < distance_mm[side, row, column]:
-                at_u, at_v = u + du * column, v + dv * column
-                if not (-EDGE_TOLERANCE <= at_u <= image.shape[0] - 1 + EDGE_TOLERANCE):
-                    continue
-                if not (-EDGE_TOLERANCE <= at_v <= image.shape[1] - 1 + EDGE_TOLERANCE):
-                    continue
-                at_u = min(max(at_u, 0.0), image.shape[0] - 1.0)
-                at_v = min(max(at_v, 0.0), image.shape[1] - 1.0)
-                level, _, _ = bilinear(image, at_u, at_v)
-                if not math.isnan(level):
-                    distance_mm[side, row, column] = away
-                    grey[side, row, column] = level
 
 
 _SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}

@@ -22,13 +22,13 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.imaging.reslice import ReslicePlane
+from speckle3d.imaging.planes import ReslicePlane
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves
-from speckle3d.study.images import PIXEL_MM, cut_frames, grey_images, middle_plane, middle_vectors
+from speckle3d.study.images import PIXEL_MM, cut_frames, grey_images, middle_planes, middle_vectors
 
 Record = Mapping[str, Any]
 
@@ -296,7 +296,7 @@ def cut_modes(view: SweepView) -> Cuts | None:
     chosen = slice(first, first + grid.vectors)
     strip = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(len(view.sweep))]
     poses = {mode: each * left for mode, each in view.poses.items()}
-    planes = {mode: middle_plane(each, grid) for mode, each in poses.items()}
+    planes = middle_planes(poses, grid)
     whole = {mode: cut_frames(strip, grid, poses[mode], planes[mode]) for mode in poses}
     width_mm = min(DETAIL_MM, _DETAIL_SHARE * min(plane.width_mm for plane in planes.values()))
     size_mm = np.array([1.0, 0.8]) * max(width_mm, 10 * DETAIL_PIXEL_MM)

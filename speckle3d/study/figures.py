@@ -19,9 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
-from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import REFERENCES, SweepCurves
 
@@ -174,11 +172,11 @@ def curve_panels(
 def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
     """Draw accumulated length and tilt over the frames, for every mode and the reference."""
     figure = figure_panels(curve_panels(curves, 2), 2, (10.0, 4.2))
-    _name(figure, title)
+    name_figure(figure, title)
     return figure
 
 
-def _name(figure: Figure, title: str) -> None:
+def name_figure(figure: Figure, title: str) -> None:
     """Put a name over a figure as it is: a dollar in the name of a file begins no formula."""
     figure.suptitle(printable(title), parse_math=False)
 
@@ -213,48 +211,6 @@ def draw_panel(axes: Axes, panel: Panel, named_below: bool = True) -> None:
         axes.set_ylim(*panel.limits)
     label_axes(axes, panel.axes[0] if named_below else "", panel.axes[1])
     axes.grid(visible=True, alpha=0.3)
-
-
-def figure_reslice(
-    cuts_db: Mapping[str, tuple[npt.NDArray[np.floating], ReslicePlane]],
-    dynamic_range_db: float = 50.0,
-    title: str = "",
-    axis_labels: tuple[str, str] = ("elevational / mm", "depth / mm"),
-) -> Figure:
-    """Draw grey reslices of every mode side by side, at one scale.
-
-    Parameters
-    ----------
-    cuts_db : mapping of str to (ndarray, ReslicePlane)
-        By mode, the reslice in dB, NaN where no frame reached (drawn in blue-grey), and its plane.
-    dynamic_range_db : float
-        Below the brightest value of all images.
-
-    Raises
-    ------
-    InvalidInputError
-        If no frame reached any reslice.
-    """
-    finite: FloatArray = np.concatenate([image[np.isfinite(image)] for image, _ in cuts_db.values()])
-    if not finite.size:
-        raise InvalidInputError(f"reslices of {', '.join(cuts_db)}: expected a finite value in one, got none")
-    # The 99.9th percentile: a single specular echo must not darken the tissue.
-    brightest = float(np.percentile(finite, 99.9))
-    # Ten inches wide at most and eight high.
-    height = max(plane.height_mm for _, plane in cuts_db.values())
-    widths = [max(plane.width_mm, 0.2 * height) for _, plane in cuts_db.values()]
-    scale = min(9.0 / sum(widths), 6.5 / height)
-    figure = new_figure(max(scale * sum(widths) + 1.2, 4.0), scale * height + 1.3)
-    panels = figure.subplots(1, len(cuts_db), squeeze=False, sharey=True, width_ratios=widths)[0]
-    for panel, (mode, (image, plane)) in zip(panels, cuts_db.items(), strict=True):
-        extent = (0.0, plane.width_mm, plane.height_mm, 0.0)
-        show_grey(panel, image, extent, (brightest - dynamic_range_db, brightest))
-        name = wrapped(label_of(mode), figure.get_figwidth() / len(cuts_db))
-        panel.set_title(name, fontsize="medium", color=colour_of(mode, list(cuts_db)))
-        panel.set_xlabel(axis_labels[0])
-    panels[0].set_ylabel(axis_labels[1])
-    _name(figure, title)
-    return figure
 
 
 def show_grey(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,7 +17,8 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
 from speckle3d.imaging.images import Images
-from speckle3d.imaging.reslice import ReslicePlane, along_sweep_plane, reslice_frames
+from speckle3d.imaging.planes import ReslicePlane, lateral_line, planes_from_first_frame
+from speckle3d.imaging.reslice import reslice_frames
 from speckle3d.imaging.settings import Levels
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
@@ -321,11 +322,9 @@ def middle_vectors(grid: ImageGrid) -> tuple[int, ImageGrid]:
     return (grid.vectors - width) // 2, replace(grid, vectors=width)
 
 
-def middle_plane(world_from_image: RigidTransform, grid: ImageGrid) -> ReslicePlane:
-    """Plane along the sweep through the middle vector, no larger than 400 x 200 mm."""
-    plane = along_sweep_plane(world_from_image, grid, grid.width_mm / 2, PIXEL_MM)
-    width, height = _LARGEST_MM
-    return replace(plane, width_mm=min(plane.width_mm, width), height_mm=min(plane.height_mm, height))
+def middle_planes(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> dict[str, ReslicePlane]:
+    """Planes along the sweep through the middle vector at the poses of every mode, at most 400 x 200 mm."""
+    return planes_from_first_frame(poses, lateral_line(grid, grid.width_mm / 2), PIXEL_MM, _LARGEST_MM)
 
 
 def cut_frames(

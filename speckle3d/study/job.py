@@ -33,11 +33,13 @@ from speckle3d.pipeline import Progress, Tracked, after, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
 from speckle3d.study.crossed import Companion
+from speckle3d.study.cuts import CutPicture, DrawnCut, frame_lines
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
-from speckle3d.study.figures import figure_drift, figure_reslice, save_figure
+from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.folder import BlockFiles
-from speckle3d.study.images import Strip, cut_frames, middle_plane
+from speckle3d.study.images import Strip, cut_frames, middle_planes
 from speckle3d.study.request import SUBSET, Request, require_possible
+from speckle3d.study.reslice_figures import save_reslices
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
 
 
@@ -302,13 +304,16 @@ def _errors(
 def _draw_reslices(
     path: Path, name: str, poses: dict[str, RigidTransform], reference: Reference | None, strip: Strip
 ) -> Path:
-    shown = dict(poses)
-    if reference is not None and reference.covered.all():
-        shown[reference.name] = reference.world_from_image
     left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
+    shown = {mode: each * left for mode, each in poses.items()}
+    compared = reference.name if reference is not None and reference.covered.all() else None
+    if reference is not None and compared:
+        shown[compared] = reference.world_from_image * left
+    planes = middle_planes(shown, strip.grid)
     cuts = {}
     for mode, world_from_image in shown.items():
-        of_strip = world_from_image * left
-        plane = middle_plane(of_strip, strip.grid)
-        cuts[mode] = cut_frames(strip, strip.grid, of_strip, plane), plane
-    return save_figure(figure_reslice(cuts, title=f"{name}: along the sweep, at the middle vector"), path)
+        image = cut_frames(strip, strip.grid, world_from_image, planes[mode])
+        cuts[mode] = DrawnCut(image, planes[mode], frame_lines(planes[mode], strip.grid, world_from_image))
+    first = next(iter(shown)) if len(shown) > 1 else None
+    where = f"at lateral {strip.left_mm + strip.grid.width_mm / 2:.4g} mm"
+    return save_reslices(CutPicture(cuts, place=where, reference=compared or first, name=name), path)

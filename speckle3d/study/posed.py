@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,8 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.settings import Levels
+from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
+from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.reconstructions import FORMAT
@@ -124,8 +126,8 @@ def open_posed(
     mode: str | None = None,
     sweep_file: Path | None = None,
     settings: ImportSettings | None = None,
+    calibrations: Sequence[PathLike] = (),
     dynamic_range_db: float | None = None,
-    prepared: Callable[[Sweep], Sweep] | None = None,
 ) -> PosedSweep:
     """Open a reconstruction with its sweep, or a recording whose poses are known.
 
@@ -139,11 +141,12 @@ def open_posed(
     sweep_file : path, optional
         The reconstruction's sweep, if it moved.
     settings : ImportSettings, optional
-        What the recording does not say; not of a reconstruction, whose sweep is as it was then.
+        What the recording does not say; of a reconstruction, its sweep's are those it was made with.
+    calibrations : sequence of path
+        Calibration files to use in place of what the recording says of its sensors and, unless settings
+        give it, of its pixels' size.
     dynamic_range_db : float, optional
         Of B-mode that does not say its own, and only of that.
-    prepared : callable, optional
-        Changes the recording's sweep before poses are taken from it, as a calibration does.
 
     Raises
     ------
@@ -153,6 +156,10 @@ def open_posed(
         If the recording does not say where its frames are.
     """
     if kind_of(path) == FORMAT:
+        if calibrations or (settings is not None and settings.model_fields_set):
+            raise InvalidInputError(
+                f"{path}: expected a recording with what it does not say, got a reconstruction"
+            )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
         chosen = mode or "image"
         return PosedSweep(
@@ -165,8 +172,11 @@ def open_posed(
             f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
             "make its reconstruction first (speckle3d reconstruct)"
         )
-    sweep, known = _load(path, settings or ImportSettings(), dynamic_range_db)
-    return replace(posed_by_itself(prepared(sweep) if prepared else sweep, mode), range_is_known=known)
+    given = settings or ImportSettings()
+    sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in given.model_fields_set}
+    sweep, known = _load(path, given.model_copy(update=sizes), dynamic_range_db)
+    mounted, _ = apply_calibrations(resized(sweep, sizes), calibrations)
+    return replace(posed_by_itself(mounted, mode), range_is_known=known)
 
 
 def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:

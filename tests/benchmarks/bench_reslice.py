@@ -11,7 +11,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.reslice import along_sweep_plane, reslice_frames, surface_plane
+from speckle3d.imaging.planes import along_sweep_plane, surface_plane
+from speckle3d.imaging.reslice import reslice_frames
 from speckle3d.imaging.volume import compound
 
 GRID = ImageGrid(127, 1000, 0.3, 0.04)

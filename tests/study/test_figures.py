@@ -1,18 +1,15 @@
 import numpy as np
 import pytest
 from drifting import CENTRE_MM, drifted, hand_sweep, tracked
-from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.errors import FileError, MismatchError
 from speckle3d.core.reconstruction import MODES as RECONSTRUCTED
-from speckle3d.imaging.reslice import ReslicePlane
 from speckle3d.scoring.lengths import accumulated
 from speckle3d.scoring.references import Reference, sweep_curves
 from speckle3d.study.figures import (
     colour_of,
     curve_panels,
     figure_drift,
-    figure_reslice,
     label_of,
     save_figure,
     wrapped,
@@ -96,25 +93,6 @@ def test_a_reference_of_other_frames_is_refused(sweep):
     assert len(figure_drift(curves_of({"image": image})).axes[0].lines) == 1
     with pytest.raises(MismatchError, match=r"reference.*60.*60.*59"):
         sweep_curves({"image": image}, CENTRE_MM, Reference("truth", tracker[1:], np.ones(60, dtype=bool)))
-
-
-def test_reslices_share_one_scale_and_keep_their_extents_and_titles():
-    rng = np.random.default_rng(9)
-    planes = [ReslicePlane(RigidTransform.identity(), width, 20.0, 0.5) for width in (15.0, 10.0)]
-    images = rng.normal(0, 5, (40, 30)), rng.normal(0, 5, (40, 20))
-    images[0][:, :3] = np.nan
-    cuts = dict(zip(("image", "pose"), zip(images, planes, strict=True), strict=True))
-    figure = figure_reslice(cuts, dynamic_range_db=40.0, title="s5")
-    assert figure.get_suptitle() == "s5"
-    drawn = [axes.images[0] for axes in figure.axes]
-    assert drawn[0].get_clim() == drawn[1].get_clim()
-    assert np.ptp(drawn[0].get_clim()) == pytest.approx(40.0)
-    assert [tuple(d.get_extent()) for d in drawn] == [(0.0, 15.0, 20.0, 0.0), (0.0, 10.0, 20.0, 0.0)]
-    figure.canvas.draw()
-    widths = [axes.get_position().width for axes in figure.axes]
-    assert widths[0] / widths[1] == pytest.approx(1.5, rel=0.05)
-    with pytest.raises(InvalidInputError, match=r"pose.*finite"):
-        figure_reslice({"pose": (np.full((2, 2), np.nan), planes[0])})
 
 
 def test_a_png_of_150_dots_per_inch_appears_whole(sweep, tmp_path):

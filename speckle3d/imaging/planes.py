@@ -1,0 +1,421 @@
+"""Planes to cut a sweep or a volume: along the sweep, at a depth, in a frame, by points or directions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.images import require_poses
+from speckle3d.imaging.outlines import crossings, frame_outlines
+
+MAX_PIXELS = 100_000_000
+"""Largest reslice, to catch wrong units: 100 mm x 100 mm at 0.01 mm."""
+
+DEFAULT_PIXEL_MM = 0.2
+"""Between the axial and the lateral resolution of a 5-10 MHz probe."""
+
+_LEAST_SINE = 1e-4
+"""Of the angle between two directions that span a plane: six thousandths of a degree."""
+
+
+@dataclass(frozen=True)
+class ReslicePlane:
+    """A rectangle in the world and the pixels it is cut into.
+
+    Parameters
+    ----------
+    world_from_plane : RigidTransform, single
+        The plane's origin is the centre of its first pixel, x runs along a row (columns grow), y down a
+        column (rows grow), z is the normal. Translation in mm.
+    width_mm, height_mm : float
+        Distance between the centres of the first and the last pixel of a row and of a column, to the
+        nearest whole pixel.
+    pixel_mm : float
+        Spacing of the square pixels.
+    first_mm : tuple of float
+        What the axes of a picture say at the centre of the first pixel: x and y.
+
+    Raises
+    ------
+    InvalidInputError
+        If a size is not positive and finite, or the plane has more than `MAX_PIXELS` pixels.
+    """
+
+    world_from_plane: RigidTransform
+    width_mm: float
+    height_mm: float
+    pixel_mm: float
+    first_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.world_from_plane.single:
+            raise InvalidInputError("world_from_plane: expected a single transform, got a row of them")
+        require_pixels(self.width_mm, self.height_mm, self.pixel_mm)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (rows, columns) of the resliced image."""
+        return round(self.height_mm / self.pixel_mm) + 1, round(self.width_mm / self.pixel_mm) + 1
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float, float]:
+        """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
+        rows, columns = self.shape
+        left, top = (first - self.pixel_mm / 2 for first in self.first_mm)
+        return left, left + columns * self.pixel_mm, top + rows * self.pixel_mm, top
+
+    def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
+        """Points of the world by what the picture's axes say, shape (..., 3), mm."""
+        x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
+        local = np.stack([x - self.first_mm[0], y - self.first_mm[1], np.zeros(x.shape)], axis=-1)
+        return np.asarray(self.world_from_plane.apply(local.reshape(-1, 3)).reshape(local.shape))
+
+    def world_from_pixel(self) -> FloatArray:
+        """Affine map from (column, row, 1) to homogeneous world coordinates in mm, shape (4, 3)."""
+        matrix = self.world_from_plane.as_matrix()[:, [0, 1, 3]]
+        return np.asarray(matrix * [self.pixel_mm, self.pixel_mm, 1.0])
+
+    def lines(self) -> FloatArray:
+        """Of each row the first pixel's centre and the step to the next, shape (rows, 2, 3), mm."""
+        across, down, origin = self.world_from_pixel()[:3].T
+        starts = origin + np.arange(self.shape[0])[:, None] * down
+        return np.stack([starts, np.broadcast_to(across, starts.shape)], axis=1)
+
+    along_rows = True
+    """Lines are rows of the picture."""
+
+    @property
+    def hull_mm(self) -> FloatArray:
+        """Corners, shape (4, 3), mm in the world."""
+        rows, columns = self.shape
+        corners = np.array([[0, 0, 1], [columns - 1, 0, 1], [0, rows - 1, 1], [columns - 1, rows - 1, 1]])
+        return np.asarray((corners @ self.world_from_pixel().T)[:, :3])
+
+
+def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
+    """Raise `InvalidInputError` unless sizes are positive and there are at most `MAX_PIXELS` pixels."""
+    for name, value in (("width_mm", width_mm), ("height_mm", height_mm), ("pixel_mm", pixel_mm)):
+        if not (np.isfinite(value) and value > 0):
+            raise InvalidInputError(f"{name}: expected a value above zero, got {value}")
+    if (width_mm / pixel_mm + 1) * (height_mm / pixel_mm + 1) > MAX_PIXELS:
+        raise InvalidInputError(
+            f"reslice of {width_mm:g} x {height_mm:g} mm: expected at most {MAX_PIXELS} "
+            f"pixels, got more with pixels of {pixel_mm:g} mm"
+        )
+
+
+def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:
+    """The plane of one image, as large as the image: what another sweep shows there."""
+    top = RigidTransform.from_translation([0.0, grid.first_sample_depth_mm, 0.0])
+    height = grid.depth_mm - grid.first_sample_depth_mm
+    first = (0.0, grid.first_sample_depth_mm)
+    return ReslicePlane(world_from_image * top, grid.width_mm, height, pixel_mm, first)
+
+
+def along_sweep_plane(
+    world_from_image: RigidTransform,
+    grid: ImageGrid,
+    lateral_mm: float,
+    pixel_mm: float = DEFAULT_PIXEL_MM,
+) -> ReslicePlane:
+    """Plane along the sweep and into the depth, in which its length and tilt are seen.
+
+    Columns follow the sweep's mean elevational travel at the lateral position `lateral_mm`, rows the mean
+    axial direction; the plane covers that line of every image. Its axes count from the first frame's line.
+
+    Parameters
+    ----------
+    world_from_image : RigidTransform, length n
+    grid : ImageGrid
+    lateral_mm : float
+        From the first vector, inside the image.
+    pixel_mm : float
+
+    Raises
+    ------
+    InvalidInputError
+        If `lateral_mm` is outside the image, or there are no poses.
+    InsufficientDataError
+        If the poses have no common axial or elevational direction.
+    """
+    return _mean_plane(world_from_image, lateral_line(grid, lateral_mm), pixel_mm)
+
+
+def surface_plane(
+    world_from_image: RigidTransform,
+    grid: ImageGrid,
+    depth_mm: float,
+    pixel_mm: float = DEFAULT_PIXEL_MM,
+) -> ReslicePlane:
+    """Plane along the sweep at one depth, in which its length and yaw are seen.
+
+    Columns follow the sweep's mean elevational travel at the depth `depth_mm`, rows the mean lateral
+    direction; the plane covers that line of every image. Its axes count from the first frame's line.
+
+    Parameters
+    ----------
+    world_from_image : RigidTransform, length n
+    grid : ImageGrid
+    depth_mm : float
+        Inside the image.
+    pixel_mm : float
+
+    Raises
+    ------
+    InvalidInputError
+        If `depth_mm` is outside the image, or there are no poses.
+    InsufficientDataError
+        If the poses have no common lateral or elevational direction.
+    """
+    return _mean_plane(world_from_image, depth_line(grid, depth_mm), pixel_mm)
+
+
+def lateral_line(grid: ImageGrid, lateral_mm: float) -> FloatArray:
+    """Line of an image down its depth at one lateral position, shape (2, 3), mm."""
+    _require_inside("lateral_mm", lateral_mm, 0.0, grid.width_mm)
+    return np.array([[lateral_mm, grid.first_sample_depth_mm, 0.0], [lateral_mm, grid.depth_mm, 0.0]])
+
+
+def depth_line(grid: ImageGrid, depth_mm: float) -> FloatArray:
+    """Line of an image across its width at one depth, shape (2, 3), mm."""
+    _require_inside("depth_mm", depth_mm, grid.first_sample_depth_mm, grid.depth_mm)
+    return np.array([[0.0, depth_mm, 0.0], [grid.width_mm, depth_mm, 0.0]])
+
+
+def planes_from_first_frame(
+    poses: Mapping[str, RigidTransform],
+    line_mm: FloatArray,
+    pixel_mm: float = DEFAULT_PIXEL_MM,
+    largest_mm: tuple[float, float] = (np.inf, np.inf),
+) -> dict[str, ReslicePlane]:
+    """Planes along one sweep at different poses, one size, with the first frame's line in one place of all.
+
+    What differs between such pictures is where the sweep went after its first frame.
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform, length n
+        World from image by mode, each in a world of its own.
+    line_mm : ndarray, shape (2, 3)
+        Line of every image that the plane is to cover, in the image: `lateral_line` or `depth_line`.
+    pixel_mm : float
+    largest_mm : tuple of float
+        Width and height at most; what lies farthest from the first frame is left out.
+    """
+    placed = {mode: _travelled(each, line_mm, first_down=True) for mode, each in poses.items()}
+    low = reduce(np.minimum, [ends.min(axis=0) for _, ends in placed.values()])
+    high = reduce(np.maximum, [ends.max(axis=0) for _, ends in placed.values()])
+    low, high = np.maximum(low, -np.array(largest_mm)), np.minimum(high, largest_mm)
+    size = np.clip(high - low, pixel_mm, largest_mm)
+    return {mode: _part(axes, low, size, pixel_mm, line_mm) for mode, (axes, _) in placed.items()}
+
+
+def three_point_plane(points_mm: npt.ArrayLike) -> RigidTransform:
+    """Place a plane through three points: x from the first to the second, y on the third's side.
+
+    Raises
+    ------
+    InvalidInputError
+        If they are not three, or lie on one line.
+    """
+    points = np.asarray(points_mm, dtype=float)
+    if points.shape != (3, 3) or not np.isfinite(points).all():
+        raise InvalidInputError(f"points: expected three of x, y, z in mm, got shape {points.shape}")
+    first, second, third = points
+    return spanned_plane(first, second - first, third - first, "three points that are not on one line")
+
+
+def spanned_plane(
+    origin_mm: npt.ArrayLike,
+    right: npt.ArrayLike,
+    down: npt.ArrayLike,
+    expected: str = "two directions that span a plane",
+) -> RigidTransform:
+    """Place a plane by its origin, the direction of its rows and one on the side of its columns.
+
+    Raises
+    ------
+    InvalidInputError
+        If a direction is none, or both are one.
+    """
+    x, y = (np.asarray(each, dtype=float) for each in (right, down))
+    lengths = [float(np.linalg.norm(each)) for each in (x, y)]
+    if min(lengths) == 0 or not np.isfinite(lengths).all():
+        raise InvalidInputError(f"plane: expected {expected}, got directions {_words(x)} and {_words(y)}")
+    x, y = x / lengths[0], y / lengths[1]
+    across = y - (y @ x) * x
+    if np.linalg.norm(across) < _LEAST_SINE:
+        raise InvalidInputError(f"plane: expected {expected}, got directions {_words(x)} and {_words(y)}")
+    y = across / np.linalg.norm(across)
+    turned = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)]))
+    return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), turned)
+
+
+def turned_frame_plane(
+    world_from_image: RigidTransform, lateral_mm: float, angle_deg: float
+) -> RigidTransform:
+    """Place a plane in one frame's depth line, turned about it: at 90 degrees along the sweep."""
+    line = RigidTransform.from_translation([lateral_mm, 0.0, 0.0])
+    # Turned by -y, so that x goes from lateral to elevational.
+    turn = RigidTransform.from_rotation(Rotation.from_euler("Y", -angle_deg, degrees=True))
+    return world_from_image * line * turn
+
+
+def covering_plane(
+    placed: RigidTransform,
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    reach_mm: float,
+    pixel_mm: float = DEFAULT_PIXEL_MM,
+) -> ReslicePlane:
+    """Plane placed anywhere, as large as what the sweep's frames show of it.
+
+    Parameters
+    ----------
+    placed : RigidTransform, single
+        Its x and y are the plane; the picture's axes count from its origin.
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    reach_mm : float
+        Frames farther from a pixel do not count.
+    pixel_mm : float
+
+    Raises
+    ------
+    InvalidInputError
+        If no frame comes near the plane; says where the sweep is.
+    """
+    outlines = frame_outlines(grid, world_from_image)
+    corners = placed.inv().apply(outlines[:, :4].reshape(-1, 3))
+    near = corners[np.abs(corners[:, 2]) < reach_mm, :2]
+    ends = crossings(outlines, placed).reshape(-1, 2)
+    points = np.concatenate([near, ends[np.isfinite(ends[:, 0])]])
+    if not len(points):
+        low, high = outlines.min(axis=(0, 1)), outlines.max(axis=(0, 1))
+        away = float(np.abs(corners[:, 2]).min())
+        raise InvalidInputError(
+            f"plane: expected one that meets a frame within {reach_mm:g} mm, got one {away:.1f} mm from the "
+            f"nearest; the sweep lies between {_words(low)} and {_words(high)} mm"
+        )
+    low, high = points.min(axis=0), points.max(axis=0)
+    return _part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm)
+
+
+def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
+    """Plane placed anywhere, as large as its section of a box.
+
+    Parameters
+    ----------
+    placed : RigidTransform, single
+        Its x and y are the plane; the picture's axes count from its origin.
+    corners_mm : ndarray, shape (8, 3)
+        The box's, in the order of `itertools.product`, in the world.
+    pixel_mm : float
+
+    Raises
+    ------
+    InvalidInputError
+        If the plane misses the box; says where that is.
+    """
+    there = placed.inv().apply(corners_mm)
+    edges = np.array([(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit])
+    start, stop = there[edges[:, 0]], there[edges[:, 1]]
+    near = np.abs(there[:, 2]) <= 1e-6 * np.ptp(there, axis=0).max()
+    crossed = start[:, 2] * stop[:, 2] < 0
+    share = start[crossed, 2] / (start[crossed, 2] - stop[crossed, 2])
+    points = np.concatenate([there[near], start[crossed] + share[:, None] * (stop - start)[crossed]])[:, :2]
+    if not len(points):
+        low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
+        raise InvalidInputError(
+            f"plane: expected one that meets the volume, which lies between {_words(low)} and {_words(high)} "
+            f"mm, got one {np.abs(there[:, 2]).min():.1f} mm from it"
+        )
+    low, high = points.min(axis=0), points.max(axis=0)
+    return _part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm)
+
+
+def _mean_plane(world_from_image: RigidTransform, line_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
+    axes, ends = _travelled(world_from_image, line_mm)
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    return _part(axes, low, np.maximum(high - low, pixel_mm), pixel_mm, line_mm)
+
+
+def _part(
+    placed: RigidTransform,
+    low: FloatArray,
+    size: FloatArray,
+    pixel_mm: float,
+    line_mm: FloatArray | None = None,
+) -> ReslicePlane:
+    """Rectangle of a placed plane, whose axes count from its origin, or go on from a line of the image."""
+    start = RigidTransform.from_translation([*low, 0.0])
+    # Depth counts from the probe, lateral from the first vector.
+    begin = 0.0 if line_mm is None else line_mm[0] @ (line_mm[1] != line_mm[0])
+    first = (float(low[0]), float(low[1] + begin))
+    return ReslicePlane(placed * start, float(size[0]), float(size[1]), pixel_mm, first)
+
+
+def _travelled(
+    world_from_image: RigidTransform, line_mm: FloatArray, first_down: bool = False
+) -> tuple[RigidTransform, FloatArray]:
+    """Place a plane along the travel of a line, and say where on it the ends of that line are.
+
+    Its origin is the first frame's line's first end, but in the mean plane of all lines. Its y is the lines'
+    mean direction, or the first one's own.
+
+    Returns
+    -------
+    (RigidTransform, ndarray, shape (2 n, 2))
+    """
+    require_poses(world_from_image)
+    ends = np.stack([world_from_image.apply(point) for point in line_mm])
+    along = ends[1] - ends[0]
+    down = _unit(along.mean(axis=0), "the line to show")
+    travel = _mean_travel(ends.mean(axis=0), world_from_image)
+    across = _unit(travel - (travel @ down) * down, "travel")
+    normal = np.cross(across, down)
+    if first_down:
+        down = _unit(along[0] - (along[0] @ normal) * normal, "the first frame's line")
+        across = np.cross(down, normal)
+    axes = Rotation.from_matrix(np.column_stack([across, down, normal]))
+    origin = ends[0, 0] + normal * ((ends.reshape(-1, 3).mean(axis=0) - ends[0, 0]) @ normal)
+    placed = RigidTransform.from_components(origin, axes)
+    return placed, placed.inv().apply(ends.reshape(-1, 3))[:, :2]
+
+
+def _mean_travel(points_mm: FloatArray, world_from_image: RigidTransform) -> FloatArray:
+    """Mean travel per mm forward, by regressing position on elevational position; order does not matter."""
+    normal = world_from_image.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
+    forward = _unit(normal, "elevational")
+    moved = points_mm - points_mm.mean(axis=0)
+    elevation = moved @ forward
+    spread = float(elevation @ elevation)
+    if spread <= 1e-6 * len(points_mm):  # a micrometre rms is no travel to take a direction from
+        return forward
+    return np.asarray(elevation @ moved / spread)
+
+
+def _unit(vector: FloatArray, what: str) -> FloatArray:
+    length = float(np.linalg.norm(vector))
+    if length < 1e-6:
+        raise InsufficientDataError(f"the poses have no common direction of {what}: expected one sweep")
+    return np.asarray(vector / length)
+
+
+def _require_inside(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise InvalidInputError(
+            f"{name}: expected a value inside the image, {low:g} to {high:g}, got {value:g}"
+        )
+
+
+def _words(vector: FloatArray) -> str:
+    return "(" + ", ".join(f"{each:.4g}" for each in vector) + ")"
