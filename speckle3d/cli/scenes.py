@@ -19,11 +19,14 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.importing import Importing, Number, PlusConfig, TransformName, open_as_told
-
-_OF_RECORDINGS = (
-    "plus_config", "transform", "reference_transform", "column_pitch_mm", "row_spacing_mm", "frame_rate_hz",
-)  # fmt: skip
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+    given_settings,
+)
 
 
 @app.command(cls=Importing)
@@ -60,7 +63,7 @@ def scene(
     calibration: CalibrationFiles = None,
     plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: TransformName = None,
+    reference_transform: ReferenceTransform = None,
     column_pitch_mm: Number = None,
     row_spacing_mm: Number = None,
     frame_rate_hz: Number = None,
@@ -68,18 +71,22 @@ def scene(
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames."""
     from speckle3d.imaging.settings import CompoundingSettings
+    from speckle3d.study.posed import open_posed
     from speckle3d.study.scene import SceneRequest, require_scene_place, write_scene
 
     options = locals()
-    require_scene_place(out, source, sweep_file, *(calibration or ()))
+    require_scene_place(out, source, sweep_file, *files_of(plus_config, calibration))
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
     settings = from_options(CompoundingSettings, base | given)
-    imported = {name: options[name] for name in _OF_RECORDINGS}
+    # The range is that of the volume's levels; a recording's own is said beside it.
+    imported = given_settings(source, {**options, "dynamic_range_db": None})
     modes: list[str | None] = list(mode) if mode else [None]
     posed = [
-        open_as_told(source, each, sweep_file, imported, calibration, dynamic_range_db) for each in modes
+        open_posed(source, each, sweep_file, imported, calibration or (), dynamic_range_db) for each in modes
     ]
+    for line in posed[0].notes():
+        note(line)
     request = SceneRequest(settings, with_images=images, with_deviation=deviation)
     with progress_bar(f"writing {out.name}") as progress:
         reports = write_scene(out, posed, request, progress)
