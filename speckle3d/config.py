@@ -11,6 +11,7 @@ from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.correction.fused.settings import FusedSettings
 from speckle3d.correction.inertial.settings import InertialSettings
+from speckle3d.imaging.settings import CompoundingSettings
 from speckle3d.io.toml import load_toml, parsed, validated
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
@@ -50,6 +51,7 @@ class Config(BaseModel):
     crossing: CrossingSettings = CrossingSettings()
     inertial: InertialSettings = InertialSettings()
     fused: FusedSettings = FusedSettings()
+    volume: CompoundingSettings = CompoundingSettings()
 
     def with_choices(self, consistent_subset: bool | None, drift_curves: str | None) -> Config:
         """Return a configuration with command-line choices in place of its own; None leaves one as it is."""

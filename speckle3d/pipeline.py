@@ -19,7 +19,7 @@ from speckle3d.core.curves import TISSUE_SIGMA, DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.reconstruction import FramePairs
+from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.blocks import (
@@ -115,6 +115,12 @@ class Tracked:
     slopes: SlopeEvidence
     times: StageTimes
     doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def shared(self) -> SharedErrors:
+        """What `covariance` has all frames have wrong together."""
+        scale = scale_sigma(self.coherence)
+        return SharedErrors(scale, self.curves_sigma, self.slopes.deviation_per_mm)
 
     @property
     def pairs(self) -> int:

@@ -42,7 +42,7 @@ def reslice_nearest(
 
 
 def bin_mean(images, image_points_world, world_from_grid, spacing_mm, shape):
-    """Twin of `speckle3d.kernels.compounding.add_samples`: mean of the samples nearest each voxel centre.
+    """Twin of `speckle3d.kernels.splatting.count_nearest`: mean of the samples nearest each voxel centre.
 
     images: (n, vector, sample); image_points_world: (n, vector, sample, 3). NaN where a voxel has none.
     """
@@ -56,7 +56,7 @@ def bin_mean(images, image_points_world, world_from_grid, spacing_mm, shape):
 
 
 def fill_holes(voxels, cap):
-    """Twin of `speckle3d.kernels.compounding.fill_from_shell`: grow a cube until it holds a value."""
+    """Twin of `speckle3d.imaging.holes.fill_holes`: grow a cube until it holds a value."""
     filled = voxels.copy()
     for at in np.argwhere(np.isnan(voxels)):
         for radius in range(1, cap + 1):

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
-from skimage.draw import polygon2mask
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import require_finite
+from speckle3d.core.polygons import polygon_corners, polygon_mask
 from speckle3d.core.sweep import Frames
 
 _GLANCES = 48
@@ -78,11 +77,7 @@ def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    region = np.asarray(region_px, dtype=float)
-    if region.ndim != 2 or region.shape[0] < 3 or region.shape[1] != 2:
-        raise InvalidInputError(f"region_px: expected shape (k, 2) with k of 3 or more, got {region.shape}")
-    require_finite(region, "region_px")
-    mask = np.asarray(polygon2mask(shape, region))
+    mask = polygon_mask(shape, polygon_corners(region_px, "region_px"))
     if not mask.any():
         raise InvalidInputError(
             f"region_px: expected a polygon that covers part of the {shape[0]} x {shape[1]} pixels, got none"

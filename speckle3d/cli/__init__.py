@@ -29,8 +29,11 @@ from speckle3d.cli import (  # noqa: F401
     files,
     imu,
     imu_accuracy,
+    measure,
     reconstruction,
     reslices,
+    scenes,
+    surfaces,
     trajectory,
     volumes,
 )

@@ -113,34 +113,6 @@ def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
     return mounted
 
 
-def fitted_pixels(paths: Sequence[Path]) -> dict[str, float]:
-    """Return the pixel size of the first calibration that has one, as import settings of B-mode images."""
-    from speckle3d.io.calibrations import read_calibration
-
-    for path in paths:
-        pixel_mm = read_calibration(path).pixel_mm
-        if pixel_mm is not None:
-            return {"column_pitch_mm": float(pixel_mm[0]), "row_spacing_mm": float(pixel_mm[1])}
-    return {}
-
-
-def resize(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
-    """Replace the pixel size of a sweep of B-mode images; names are those of the import settings."""
-    from speckle3d.core.sweep import BModeSettings
-
-    if not isinstance(sweep.signal, BModeSettings):
-        return sweep
-    grid = sweep.grid
-    column_mm = sizes.get("column_pitch_mm", grid.vector_pitch_mm)
-    row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
-    # Rows count from the probe's face, including those above the first stored row.
-    first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
-    resized = replace(
-        grid, vector_pitch_mm=column_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm
-    )
-    return replace(sweep, grid=resized)
-
-
 def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> None:
     from speckle3d.core.calibration import mounting_difference, pixel_difference
     from speckle3d.matching.intensity import IntensityExtractor

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperOption
 
-from speckle3d.cli.calibrations import fitted_pixels, mount, resize
+from speckle3d.cli.calibrations import mount
 from speckle3d.cli.common import (
     CalibrationFiles,
     Json,
+    SweepFile,
     Transform,
     app,
     emit,
@@ -19,6 +19,14 @@ from speckle3d.cli.common import (
     from_options,
     note,
     progress_bar,
+)
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+    given_settings,
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
@@ -127,22 +135,7 @@ def _write(path: Path, simulated: SimulatedSweep) -> None:
         write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
 
 
-Number = Annotated[float | None, typer.Option()]
-
-
-class _Importing(TyperCommand):
-    """A command with options of `ImportSettings`, whose help texts are those of its fields."""
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        from speckle3d.io.import_settings import ImportSettings
-
-        for param in self.params:
-            if isinstance(param, TyperOption) and param.name in ImportSettings.model_fields:
-                param.help = param.help or ImportSettings.model_fields[param.name].description
-        super().format_help(ctx, formatter)
-
-
-@app.command(cls=_Importing)
+@app.command(cls=Importing)
 def convert(
     source: Annotated[
         Path, typer.Argument(metavar="IN", help="Any recording that holds a sweep: a file, or a folder.")
@@ -166,21 +159,28 @@ def convert(
     dynamic_range_db: Number = None,
     frame_rate_hz: Number = None,
     probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
-    plus_config: Annotated[str | None, typer.Option(metavar="FILE")] = None,
+    plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: Annotated[str | None, typer.Option(metavar="NAME")] = None,
+    reference_transform: ReferenceTransform = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
         str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
     ] = "gzip",
+    mode: Annotated[
+        str | None,
+        typer.Option(help="IN a reconstruction: write its grey images with the poses of a mode (image)."),
+    ] = None,
+    sweep_file: SweepFile = None,
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
+
+    A reconstruction becomes a sequence of grey images with its poses as ImageToWorldTransform, which 3D
+    Slicer (.seq.nrrd) and SlicerIGSIO (.seq.mha) play in their world: axes lead right, anterior, superior.
 
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
     """
-    from speckle3d.cli.recordings import require_sequence, require_unsaid
-    from speckle3d.io.import_settings import ImportSettings
+    from speckle3d.io.calibrations import fitted_pixels, resized
     from speckle3d.io.load import import_notes, load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
@@ -190,18 +190,20 @@ def convert(
     if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
         known = ", ".join((".h5", ".hdf5", *SUFFIXES))
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
-    given_by_files = (*(calibration or ()), *([] if plus_config is None else [Path(plus_config)]))
-    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *given_by_files)
+    named = files_of(plus_config, calibration)
+    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *named)
+    if _is_reconstruction(source):
+        _convert_posed(source, out, options)
+        return
+    for name, value in (("--mode", mode), ("--sweep", sweep_file)):
+        if value is not None:
+            raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
     if compression not in COMPRESSIONS:
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    options["tracker_transform"] = transform
-    for name in ("transform", "reference_transform", "plus_config"):
-        require_sequence(source, options[name], f"--{name.replace('_', '-')}")
-    given = from_options(ImportSettings, options)
-    require_unsaid(source, given)
+    given = given_settings(source, options)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
     settings = given.model_copy(update=fitted)
-    sweep = resize(load_sweep(source, settings), fitted)
+    sweep = resized(load_sweep(source, settings), fitted)
     sweep = mount(sweep, calibration or ())
     for each in import_notes(source, settings):
         note(each)
@@ -212,3 +214,29 @@ def convert(
         left_out = write_sequence(out, sweep, progress, compression != "none")
     for each in left_out:
         note(f"{out}: does not hold {each}")
+
+
+def _is_reconstruction(path: Path) -> bool:
+    from speckle3d.io.load import kind_of
+    from speckle3d.io.reconstructions import FORMAT
+
+    return path.is_file() and kind_of(path) == FORMAT
+
+
+def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
+    """Write a reconstruction's images with its poses; other options than those of that have no effect."""
+    from speckle3d.io.import_settings import ImportSettings
+    from speckle3d.io.plus.write import SUFFIXES
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.sequences import write_posed_sequence
+
+    if out.suffix.lower() not in SUFFIXES:
+        raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")
+    of_recordings = {*ImportSettings.model_fields, "transform", "plus_config", "calibration"}
+    unused = [name for name in of_recordings - {"dynamic_range_db"} if options.get(name) is not None]
+    if unused:
+        raise InvalidInputError(f"--{unused[0].replace('_', '-')}: is of recordings, got a reconstruction")
+    posed = open_posed(source, options["mode"], options["sweep_file"])
+    range_db, packs = options["dynamic_range_db"] or 60.0, options["compression"] != "none"
+    with progress_bar(f"writing {out.name}") as progress:
+        write_posed_sequence(out, posed, range_db, progress, packs)

@@ -9,7 +9,17 @@ from typing import Literal
 from speckle3d.core.errors import FileError, InvalidInputError
 
 Kind = Literal[
-    "calibration", "curves", "log", "picture", "sequence", "simulation", "sweep", "trajectory", "volume"
+    "calibration",
+    "curves",
+    "log",
+    "picture",
+    "sequence",
+    "simulation",
+    "surface",
+    "sweep",
+    "trajectory",
+    "transform",
+    "volume",
 ]
 
 _FIRST_BYTES = 4096
@@ -100,10 +110,30 @@ def _is_sequence(path: Path) -> bool:
     return (is_metaimage(start) or is_nrrd(start)) and b"Seq_Frame" in start
 
 
+def _is_surface(path: Path) -> bool:
+    """Whether a file is a surface: STL by its size, PLY and VTK by how they begin."""
+    start = _start(path)
+    if start.startswith(b"ply") or start.startswith(b"# vtk DataFile"):
+        return True
+    count = int.from_bytes(start[80:84], "little")
+    return path.stat().st_size == 84 + 50 * count or start.startswith(b"solid")
+
+
 def _is_trajectory(path: Path) -> bool:
     from speckle3d.io.tum import is_tum
 
     return is_tum(path)
+
+
+def _is_transform(path: Path) -> bool:
+    """Whether a file is a transform of ITK, as text or HDF5."""
+    from speckle3d.io.hdf5 import SIGNATURE, open_hdf5
+
+    start = _start(path)
+    if not start.startswith(SIGNATURE):
+        return start.startswith(b"#Insight Transform File")
+    with open_hdf5(path) as file:
+        return "TransformGroup" in file
 
 
 _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
@@ -113,7 +143,9 @@ _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "picture": ("a PNG", _is_picture),
     "sequence": ("an image sequence", _is_sequence),
     "simulation": ("a simulated sweep", _is_simulation),
+    "surface": ("a surface", _is_surface),
     "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
     "trajectory": ("TUM text", _is_trajectory),
+    "transform": ("a transform", _is_transform),
     "volume": ("a volume", is_volume),
 }

@@ -22,6 +22,9 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, MismatchError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from speckle3d.config import Config
     from speckle3d.core.sweep import Sweep
     from speckle3d.study.job import JobResult
 
@@ -64,6 +67,19 @@ def reconstruct(
     drift_curves: Annotated[
         str | None, typer.Option(help="Correction cubic in time (published) or in distance (for reversals).")
     ] = None,
+    volume: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write a volume, too (.nrrd, .mha, .nii.gz, .nii), as group `volume` of the settings says."
+        ),
+    ] = None,
+    volume_mode: Annotated[
+        str | None,
+        typer.Option(
+            help="Poses of the volume; by default the first there is of fused, crossed, pose, inertial, "
+            "orientation, image."
+        ),
+    ] = None,
     calibration: CalibrationFiles = None,
     config_file: ConfigFile = None,
     as_json: Json = False,
@@ -71,6 +87,7 @@ def reconstruct(
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
+    from speckle3d.io.volume_writer import require_suffix
     from speckle3d.study.job import run_job
 
     settings = load_settings(config_file).with_choices(
@@ -89,6 +106,13 @@ def reconstruct(
             raise InvalidInputError("--save-curves: expected a crossing sweep (--crossing SWEEP), got none")
         read = (sweep_file, crossing[1], config_file, used, *(calibration or ()))
         require_own_place(save_curves, "curves", *read)
+    if volume is not None:
+        require_suffix(volume)
+        if volume.parent.exists() or volume.parent != out:
+            require_own_place(volume, "volume", sweep_file, crossing_file, used, *(calibration or ()))
+        _require_mode(volume_mode, modes)
+    elif volume_mode is not None:
+        raise InvalidInputError("--volume-mode: expected --volume beside it, got none")
     sweep = _part(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(
@@ -104,6 +128,8 @@ def reconstruct(
         emit(result.table)
     _tell(result)
     note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+    if volume is not None:
+        _write_volume(result, sweep_file, volume, volume_mode, settings)
     if save_curves is not None:
         note(
             f"curves corrected by the crossing sweep, for this probe: {save_curves}"
@@ -112,6 +138,23 @@ def reconstruct(
         )
     for reason in result.summary.left_out.values():
         raise MismatchError(f"{reason}; the other modes' results are in {result.directory}")
+
+
+def _require_mode(wanted: str | None, modes: Sequence[str]) -> None:
+    if wanted is not None and wanted not in ("image", *modes):
+        there = ", ".join(("image", *modes))
+        raise InvalidInputError(f"--volume-mode: expected one of {there}, as --drift has it, got {wanted!r}")
+
+
+def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | None, settings: Config) -> None:
+    """Compound the sweep at the poses just found."""
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.voxels import VolumeRequest, best_mode, write_voxels
+
+    made = result.directory / "reconstruction.h5"
+    posed = open_posed(made, mode or best_mode(made), sweep_file)
+    with progress_bar(f"compounding {out.name}") as progress:
+        note(write_voxels(posed, VolumeRequest(out, settings.volume), progress).line)
 
 
 def _crossing(

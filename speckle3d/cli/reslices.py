@@ -68,7 +68,7 @@ def reslice(
     dynamic_range_db: DynamicRange = 60.0,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
-    from speckle3d.io.volumes import SUFFIXES
+    from speckle3d.io.volume_writer import SUFFIXES
     from speckle3d.study.cuts import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)

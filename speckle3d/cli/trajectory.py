@@ -37,20 +37,57 @@ _LABELS = (
 @trajectory.command()
 def export(
     reconstruction_file: ReconstructionFile,
-    out: Annotated[Path, typer.Option("-o", "--output", help="Text file to write.")],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Text file to write; ITK transform if it ends in .tfm or .h5."),
+    ],
     mode: Annotated[
         str, typer.Option(help="Which poses to use: image, orientation, pose, crossed, inertial, fused.")
     ] = "image",
     length_unit: Unit = "m",
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|all", help="Of a transform: which frame; all writes a file for each, ...-0000."
+        ),
+    ] = None,
 ) -> None:
-    """Write the poses of one mode as TUM text: time_s x y z qx qy qz qw, image to world."""
+    """Write the poses of one mode as TUM text (time_s x y z qx qy qz qw, image to world), or ITK transforms.
+
+    Transforms are as 3D Slicer reads them: axes lead left, posterior and superior, mm.
+    """
+    from speckle3d.io.transforms import SUFFIXES
     from speckle3d.io.tum import write_tum
     from speckle3d.scoring.trajectories import load_reconstructed
 
     unit = cast("LengthUnit", length_unit)
+    if out.suffix.lower() in SUFFIXES:
+        _export_transforms(reconstruction_file, out, mode, frame)
+        return
+    if frame is not None:
+        raise InvalidInputError(f"--frame {frame}: is of transforms ({', '.join(SUFFIXES)}), got {out.name}")
     require_own_place(out, "trajectory", reconstruction_file)
     held = load_reconstructed(reconstruction_file, mode)
     write_tum(out, held.time_s, held.poses, unit)
+
+
+def _export_transforms(reconstruction_file: Path, out: Path, mode: str, frame: str | None) -> None:
+    from speckle3d.io.transforms import transform_paths, write_transform, write_transforms
+    from speckle3d.scoring.trajectories import load_reconstructed
+
+    if frame is None:
+        raise InvalidInputError(f"{out}: expected --frame N, or --frame all for a file of each, got neither")
+    poses = load_reconstructed(reconstruction_file, mode).poses
+    if frame == "all":
+        for path in transform_paths(out, len(poses)):
+            require_own_place(path, "transform", reconstruction_file)
+        write_transforms(out, poses)
+        return
+    number = int(frame) if frame.isascii() and frame.isdecimal() else -1
+    if not 0 <= number < len(poses):
+        raise InvalidInputError(f"--frame: expected a number from 0 to {len(poses) - 1} or all, got {frame}")
+    require_own_place(out, "transform", reconstruction_file)
+    write_transform(out, poses[number])
 
 
 @trajectory.command()

@@ -3,31 +3,131 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from speckle3d.cli.common import DynamicRange, Mode, PosedFile, SweepFile, app, progress_bar
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    ConfigFile,
+    Json,
+    Mode,
+    PosedFile,
+    SweepFile,
+    Transform,
+    app,
+    emit_json,
+    from_options,
+    load_settings,
+    note,
+    progress_bar,
+)
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+    given_settings,
+)
 from speckle3d.cli.outputs import require_own_place
 
+Three = tuple[float, float, float]
 
-@app.command()
+
+@app.command(cls=Importing)
 def volume(
     source: PosedFile,
-    out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha or .nii.gz to write.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha, .nii.gz or .nii to write.")],
     mode: Mode = None,
-    voxel_mm: Annotated[float, typer.Option(help="Side of a voxel.")] = 0.2,
+    voxel_mm: Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")] = None,
+    splat: Annotated[
+        str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
+    ] = None,
+    rule: Annotated[
+        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
+    ] = None,
+    fill_radius: Annotated[
+        int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
+    ] = None,
+    voxel_type: Annotated[
+        str | None, typer.Option(help="uint8, int16, uint16 or float32, in which empty voxels are NaN.")
+    ] = None,
+    levels: Annotated[
+        str | None, typer.Option(help="log, linear, or stored (B-mode as it is, which is the default).")
+    ] = None,
+    dynamic_range_db: Annotated[
+        float | None, typer.Option(help="Range of log-compressed grey levels (60).")
+    ] = None,
+    axes: Annotated[
+        Literal["sweep", "world", "principal"],
+        typer.Option(help="Of the voxels: sweep (mean of the images), world, principal (smallest box)."),
+    ] = "sweep",
+    spacing_mm: Annotated[Three | None, typer.Option(help="Voxels' sides along each axis.")] = None,
+    origin_mm: Annotated[Three | None, typer.Option(help="Centre of the first voxel in the world.")] = None,
+    shape: Annotated[
+        tuple[int, int, int] | None, typer.Option(help="Number of voxels along each axis.")
+    ] = None,
+    like: Annotated[Path | None, typer.Option(help="A volume whose grid to take.")] = None,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            help='What counts of an image: "rectangle x,y x,y", "fan ..." or "polygon x,y ..." in mm.'
+        ),
+    ] = None,
+    state: Annotated[
+        Path | None, typer.Option(help="Write which voxels are measured and filled, as labels.")
+    ] = None,
+    deviation: Annotated[
+        Path | None,
+        typer.Option(help="Write each voxel's standard deviation of position along the sweep, mm."),
+    ] = None,
+    backward_mm: Annotated[
+        float | None,
+        typer.Option(help="For sparse sweeps: voxels between the nearest images, at most so far away."),
+    ] = None,
+    max_memory_gb: Annotated[
+        float | None, typer.Option(help="Memory to work in (2.5); larger volumes are made in slabs.")
+    ] = None,
     sweep_file: SweepFile = None,
-    dynamic_range_db: DynamicRange = 60.0,
+    calibration: CalibrationFiles = None,
+    plus_config: PlusConfig = None,
+    transform: Transform = None,
+    reference_transform: ReferenceTransform = None,
+    column_pitch_mm: Number = None,
+    row_spacing_mm: Number = None,
+    frame_rate_hz: Number = None,
+    config_file: ConfigFile = None,
+    as_json: Json = False,
 ) -> None:
-    """Compound the frames into voxels, at the poses of one mode."""
-    from speckle3d.imaging.volume import compound
-    from speckle3d.io.volumes import write_volume
+    """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
+    from speckle3d.imaging.region import Region
+    from speckle3d.imaging.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
+    from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
 
-    require_own_place(out, "volume", source, sweep_file)
-    posed = open_posed(source, mode, sweep_file)
+    options = locals()
+    for place in (out, state, deviation):
+        if place is not None:
+            require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
+    base = load_settings(config_file).volume.model_dump()
+    given = {name: value for name, value in options.items() if name in base and value is not None}
+    settings = from_options(CompoundingSettings, base | given)
+    request = VolumeRequest(
+        out,
+        settings,
+        GridRequest(axes, spacing_mm, origin_mm, shape, like),
+        None if region is None else Region.from_text(region),
+        state,
+        deviation,
+    )
+    # The option is the range of the volume's levels, and of B-mode that says none of its own.
+    imported = given_settings(source, {**options, "dynamic_range_db": None})
+    posed = open_posed(source, mode, sweep_file, imported, calibration or (), dynamic_range_db)
+    for line in posed.notes():
+        note(line)
     with progress_bar(f"compounding {out.name}") as progress:
-        images, grid = posed.images(dynamic_range_db, progress)
-        voxels = compound(images, grid, posed.world_from_image, voxel_mm, voxel_type="uint8")
-    write_volume(out, voxels)
+        report = write_voxels(posed, request, progress)
+    if as_json:
+        emit_json(report.summary())
+    note(report.line)

@@ -186,7 +186,8 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
         raise MismatchError(f"{sweep.name}: expected the calibration's sensor, {name}, got none")
     mounting = calibration.sensor_from_image if name == "tracker" else calibration.rotation
     offset_s = held.time_offset_s if known_s is None else known_s
-    mounted: Any = replace(held, sensor_from_image=mounting, time_offset_s=offset_s)  # type: ignore[arg-type]
+    square = {"image_skew_rad": 0.0} if name == "tracker" else {}
+    mounted: Any = replace(held, sensor_from_image=mounting, time_offset_s=offset_s, **square)  # type: ignore[arg-type]
     return replace(sweep, **{name: mounted})
 
 

@@ -102,6 +102,42 @@ class Provenance:
 
 
 @dataclass(frozen=True)
+class SharedErrors:
+    """What the image-based distances of all frames have wrong together; see `speckle3d.motion.uncertainty`.
+
+    Attributes
+    ----------
+    scale_sigma : float
+        Relative standard deviation of the scale of distances that the images leave; it changes along the
+        sweep, too.
+    curves_sigma : float
+        That of the curves' mismatch with probe and tissue, one factor for the whole sweep.
+    turn_sigma_per_mm : ndarray, shape (2,)
+        Standard deviation of the yaw and the tilt that the images lack, rad/mm.
+    """
+
+    scale_sigma: float
+    curves_sigma: float
+    turn_sigma_per_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class ModeErrors:
+    """What a corrected mode claims of its poses' errors.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (n, 6, 6)
+        As `Trust.covariance`, along the axes of the mode's first frame.
+    length_sigma : float
+        Relative standard deviation of the sweep's length.
+    """
+
+    covariance: FloatArray
+    length_sigma: float
+
+
+@dataclass(frozen=True)
 class Trust:
     """Uncertainty and flags of the poses of mode `image`.
 
@@ -112,10 +148,16 @@ class Trust:
         axes, mm and rad.
     flags : ndarray of int, shape (n,)
         Zero for a good frame; else bits of `speckle3d.matching.quality.FrameFlag`.
+    shared : SharedErrors or None
+        Which part of the covariance all frames have in common; None in older files.
+    modes : dict of str to ModeErrors
+        Of corrected modes that claim errors of their own; none in older files.
     """
 
     covariance: FloatArray
     flags: IntArray
+    shared: SharedErrors | None = None
+    modes: dict[str, ModeErrors] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -160,7 +202,9 @@ class Reconstruction:
                 )
         if self.trust is not None:
             n = self.frame_time_s.size
-            for name, shape in (("covariance", (n, 6, 6)), ("flags", (n,))):
-                got = np.shape(getattr(self.trust, name))
-                if got != shape:
-                    raise InvalidInputError(f"{name}: expected shape {shape}, got {got}")
+            held = {"covariance": self.trust.covariance, "flags": self.trust.flags}
+            held |= {f"covariance of mode {mode}": each.covariance for mode, each in self.trust.modes.items()}
+            for name, values in held.items():
+                shape = (n,) if name == "flags" else (n, 6, 6)
+                if values.shape != shape:
+                    raise InvalidInputError(f"{name}: expected shape {shape}, got {values.shape}")

@@ -18,6 +18,9 @@ from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSam
 INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 """Vectors that an orientation sensor may measure beside its orientation, each of shape (m, 3)."""
 
+LARGEST_SKEW_RAD = 0.2
+"""Of an image's axes: those of published calibrations lean by 0.05."""
+
 _UNCALIBRATED = "the sensor is not calibrated to the image: {} lacks the attribute {}"
 
 
@@ -163,13 +166,21 @@ class BModeSettings:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Where the samples of a frame lie in the image plane P, mm."""
+    """Where the samples of a frame lie in the image plane P, mm.
+
+    Attributes
+    ----------
+    skew_rad : float
+        Angle by which rows and vectors lean towards each other, half of it each, about the first sample: in
+        images whose measured calibration is not square, when they are compounded; else zero.
+    """
 
     vectors: int
     samples: int
     vector_pitch_mm: float
     sample_spacing_mm: float
     first_sample_depth_mm: float = 0.0
+    skew_rad: float = 0.0
 
     def __post_init__(self) -> None:
         _require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
@@ -177,6 +188,7 @@ class ImageGrid:
             raise InvalidInputError(
                 f"first_sample_depth_mm: expected a finite value, got {self.first_sample_depth_mm}"
             )
+        require_skew(self.skew_rad, "skew_rad")
 
     @property
     def width_mm(self) -> float:
@@ -191,13 +203,33 @@ class ImageGrid:
     @property
     def centre_mm(self) -> FloatArray:
         """The image's centre in P, shape (3,), mm."""
+        if self.skew_rad:
+            return np.asarray(self.corners_mm.mean(axis=0))
         return np.array([self.width_mm / 2, (self.first_sample_depth_mm + self.depth_mm) / 2, 0.0])
 
     @property
     def corners_mm(self) -> FloatArray:
         """The image's corners in P, clockwise from the top left, shape (4, 3), mm."""
+        if self.skew_rad:
+            v, s = self.vectors - 1, self.samples - 1
+            corners = np.array([[0, 0, 1], [v, 0, 1], [v, s, 1], [0, s, 1]])
+            return np.asarray(corners @ self.image_from_sample[:3].T)
         x, top, bottom = self.width_mm, self.first_sample_depth_mm, self.depth_mm
         return np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
+
+    @property
+    def image_from_sample(self) -> FloatArray:
+        """Affine map from (vector, sample, 1) to (x, y, z, 1) in P, mm, shape (4, 3)."""
+        along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
+        across, down = self.vector_pitch_mm, self.sample_spacing_mm
+        return np.array(
+            [
+                [along * across, beside * down, 0.0],
+                [beside * across, along * down, self.first_sample_depth_mm],
+                [0.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0],
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -243,11 +275,23 @@ class OrientationSensor(_Sensor[Rotation]):
 
 @dataclass(frozen=True)
 class Tracker(_Sensor[RigidTransform]):
-    """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
+    """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`.
+
+    Attributes
+    ----------
+    image_skew_rad : float
+        What a measured calibration of pixels has beyond the rigid `sensor_from_image`, which is the nearest
+        to it: its columns and its rows lean towards each other by so much in all, half of it each. Only
+        compounding looks at it.
+    """
 
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")
 
     readings: TimedPoses
+    image_skew_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_skew(self.image_skew_rad, "image_skew_rad")
 
 
 @dataclass(frozen=True)
@@ -333,6 +377,12 @@ def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.Arr
     """Orientation ``world_from_image`` at each frame time, by either kind of sensor."""
     measured = sensor.world_from_image(frame_time_s)
     return measured.rotation if isinstance(measured, RigidTransform) else measured
+
+
+def require_skew(skew_rad: float, name: str) -> None:
+    """Raise `InvalidInputError` unless an image's axes are about square."""
+    if not abs(skew_rad) <= LARGEST_SKEW_RAD:
+        raise InvalidInputError(f"{name}: expected at most {LARGEST_SKEW_RAD:g} either way, got {skew_rad}")
 
 
 def _require_kind(sweep: Sweep) -> None:

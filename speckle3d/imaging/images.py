@@ -63,7 +63,12 @@ class PosedImages:
         return len(self.world_from_image)
 
     def read(self, index: int) -> Float32Array:
-        """Image number `index`, shape (vector, sample), contiguous.
+        """Image number `index`, shape (vector, sample), contiguous; raises what `read_as_stored` does."""
+        # Writeable, so that read-only sources do not compile the kernels a second time.
+        return np.require(self.read_as_stored(index), np.float32, ["C", "W"])
+
+    def read_as_stored(self, index: int) -> npt.NDArray[Any]:
+        """Image number `index` in the type and the order in memory that it has, shape (vector, sample).
 
         Raises
         ------
@@ -78,15 +83,16 @@ class PosedImages:
             raise MismatchError(f"images[{index}]: expected shape {expected}, got {image.shape}")
         if np.iscomplexobj(image):
             raise InvalidInputError(f"images[{index}]: expected grey levels, got type {image.dtype}")
-        # Writeable, so that read-only sources do not compile the kernels a second time.
-        return np.require(image, np.float32, ["C", "W"])
+        return image
 
     def index_from_image(self) -> FloatArray:
         """Affine map from image coordinates (x, y, z, 1) in mm to (vector, sample, z in mm), shape (3, 4)."""
-        pitch, spacing = self.grid.vector_pitch_mm, self.grid.sample_spacing_mm
-        scaled = np.diag([1.0 / pitch, 1.0 / spacing, 1.0, 1.0])[:3]
-        scaled[1, 3] = -self.grid.first_sample_depth_mm / spacing
-        return scaled
+        plane = np.zeros((3, 4))
+        image_from_sample = self.grid.image_from_sample
+        plane[:2, :2] = np.linalg.inv(image_from_sample[:2, :2])
+        plane[:2, 3] = -plane[:2, :2] @ image_from_sample[:2, 2]
+        plane[2, 2] = 1.0
+        return plane
 
 
 @dataclass(frozen=True)

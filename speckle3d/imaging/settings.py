@@ -27,20 +27,29 @@ class CompoundingSettings(BaseModel):
         description="What several samples of a voxel make: their mean, the largest, the one of the latest "
         "frame, or the mean weighted by how well each frame's place is known.",
     )
+    backward_mm: float = Field(
+        0.0,
+        ge=0,
+        description="If above zero, look each voxel up between the images nearest on either side, at most "
+        "this far away, in place of sharing out samples: for sparse sweeps.",
+    )
     fill_radius: int = Field(
         3,
         ge=0,
         description="Half the edge, in voxels, of the largest cube from which a hole is filled; 0: none.",
     )
     voxel_type: VoxelType = Field("uint8", description="Type of the voxels; in float32 empty ones are NaN.")
-    levels: Levels | None = Field(
-        None,
-        description="Log-compressed to 0-255, linear echo amplitude, or as stored; by default as stored for "
-        "B-mode and log-compressed for RF and I/Q.",
+    levels: Levels | Literal["auto"] = Field(
+        "auto",
+        description="log (compressed to 0-255), linear (echo amplitude), or stored; auto: stored for B-mode, "
+        "log for RF and I/Q.",
     )
     dynamic_range_db: float = Field(60.0, gt=0, description="Range of the log-compressed grey levels.")
     max_memory_gb: float = Field(
         2.5,
         gt=0,
         description="Memory to work in; a larger volume is made in slabs, written as they are done.",
+    )
+    max_file_gb: float = Field(
+        64.0, gt=0, description="Largest volume to make: larger ones are more often due to a wrong unit."
     )

@@ -1,4 +1,4 @@
-"""Voxels from a sweep's images: every sample averaged into its voxel, then the holes filled.
+"""Voxels from a sweep's images, all of them in memory.
 
 Voxels are indexed ``[i, j, k]`` along the grid's x, y and z, which are the world's axes unless asked
 otherwise: in the mode `image` lateral, axial and elevational of the first frame.
@@ -6,18 +6,21 @@ otherwise: in the mode `image` lateral, axial and elevational of the first frame
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
+from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, ByteArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.images import Images, PosedImages
+from speckle3d.imaging.settings import CompoundingSettings, Rule, Splat, VoxelType
+from speckle3d.imaging.slabs import compound_slabs, working_gb
+from speckle3d.imaging.splatting import Weights
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
@@ -25,45 +28,74 @@ DEFAULT_FILL_RADIUS = 3
 MAX_MEMORY_GB = 4.0
 """Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
 
-VoxelType = Literal["float32", "uint8"]
+
+@dataclass(frozen=True)
+class CompoundedVolume(Volume):
+    """A volume and where its voxels are from.
+
+    Attributes
+    ----------
+    state : ndarray of uint8, shape (n_i, n_j, n_k)
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.imaging.holes`.
+    """
+
+    state: ByteArray = field(kw_only=True)
 
 
 def compound(
     images: Images,
     grid: ImageGrid,
     world_from_image: RigidTransform,
-    voxel_mm: float,
+    voxel_mm: float | None = None,
     *,
+    voxel_grid: VoxelGrid | None = None,
+    splat: Splat = "nearest",
+    rule: Rule = "mean",
+    weights: Weights | None = None,
+    region: BoolArray | None = None,
     fill_radius: int = DEFAULT_FILL_RADIUS,
     voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
     max_memory_gb: float = MAX_MEMORY_GB,
-) -> Volume:
-    """Compound a sweep's images into cubic voxels that hold all of it.
+) -> CompoundedVolume:
+    """Compound a sweep's images into voxels, cubic ones that hold all of it or those of a grid.
 
-    Each voxel is the mean of all samples in it. An empty voxel is then the mean of those that are not in
-    the smallest cube around it that holds any; filled voxels stay as they are.
+    With "nearest" a sample counts in the voxel it lies in; with "linear" in the eight whose centres are
+    around it, by trilinear shares. A voxel becomes the mean of its samples by their shares, their maximum,
+    the mean of those of the latest image that has any there, or their mean by weight; with "linear", shares
+    below 1/8 do not count for the maximum and the latest. An empty voxel is then the mean of those that are
+    not in the smallest cube around it that holds any; measured voxels stay as they are.
 
     Parameters
     ----------
     images : indexable or callable
-        Grey images by frame number, shape (vector, sample), read one at a time.
+        Grey images by frame number, shape (vector, sample), read one at a time; the latest is the last.
     grid : ImageGrid
     world_from_image : RigidTransform, length n
-    voxel_mm : float
+    voxel_mm : float, optional
+        Side of cubic voxels; or give `voxel_grid`.
+    voxel_grid : VoxelGrid, optional
+        Where voxels lie; samples elsewhere are left out.
+    splat : {"nearest", "linear"}
+    rule : {"mean", "maximum", "latest", "weighted"}
+    weights : ndarray of shape (n,), or images of weights, optional
+        For the rule "weighted"; samples whose weight is 0 or NaN do not count.
+    region : ndarray of bool, shape (vector, sample), optional
+        Samples that count; by default all.
     fill_radius : int
         Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
         stay empty. The volume also grows by so many voxels beyond the first and the last frame.
-    voxel_type : {"float32", "uint8"}
-        With "float32" empty voxels are NaN. With "uint8" levels are rounded and clipped to 0-255, and empty
-        voxels are 0.
+    voxel_type : {"float32", "uint8", "int16", "uint16"}
+        With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
+        are 0.
     world_from_axes : Rotation, optional
-        Directions of the voxel axes; without it, the world's.
+        Directions of the axes of cubic voxels; without it, the world's.
     max_memory_gb : float
+        For the volume and the work on it.
 
     Returns
     -------
-    Volume
+    CompoundedVolume
 
     Raises
     ------
@@ -90,62 +122,63 @@ def compound(
     >>> volume.shape, volume.voxels[0, 0].tolist()
     ((4, 5, 4), [0.0, 1.0, 2.0, 3.0])
     """
-    voxel_grid = grid_around(grid, world_from_image, voxel_mm, world_from_axes)
-    _require_options(voxel_grid, fill_radius, voxel_type, max_memory_gb)
-    mean = _bin_mean(voxel_grid, PosedImages(images, grid, world_from_image))
-    _fill_holes(mean, fill_radius)
-    voxels = _as_uint8(mean) if voxel_type == "uint8" else mean
-    return Volume(voxels, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
-
-
-def _require_options(voxel_grid: VoxelGrid, fill_radius: int, voxel_type: str, max_memory_gb: float) -> None:
-    if fill_radius < 0:
-        raise InvalidInputError(f"fill_radius: expected zero or more voxels, got {fill_radius}")
-    if voxel_type not in ("float32", "uint8"):
-        raise InvalidInputError(f"voxel_type: expected 'float32' or 'uint8', got {voxel_type!r}")
-    if voxel_grid.memory_gb > max_memory_gb:
-        voxels = " x ".join(str(n) for n in voxel_grid.shape)
-        spacing = " x ".join(f"{step:g}" for step in voxel_grid.spacing_mm)
-        raise InvalidInputError(
-            f"volume: expected at most {max_memory_gb:g} GB of memory, got {voxel_grid.memory_gb:.3g} GB for "
-            f"{voxels} voxels of {spacing} mm: take larger voxels, or check the poses"
+    source = PosedImages(images, grid, world_from_image)
+    if (voxel_mm is None) == (voxel_grid is None):
+        raise InvalidInputError("compound: expected either voxel_mm or voxel_grid")
+    if voxel_grid is None:
+        voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)
+    try:
+        settings = CompoundingSettings(
+            splat=splat,
+            rule=rule,
+            fill_radius=fill_radius,
+            voxel_type=voxel_type,
+            max_memory_gb=max_memory_gb,
         )
+    except ValidationError as error:
+        found = error.errors()[0]
+        raise InvalidInputError(f"{found['loc'][0]}: {found['msg']}, got {found['input']!r}") from None
+    return _joined(source, voxel_grid, _within_memory(voxel_grid, settings), weights, region)
 
 
-def _bin_mean(voxel_grid: VoxelGrid, source: PosedImages) -> Float32Array:
-    """Mean of the samples in each voxel; NaN where there is none."""
-    from speckle3d.kernels.compounding import add_samples
+def _within_memory(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> CompoundingSettings:
+    """Settings whose memory is what slabs may take beside the whole volume.
 
-    total = np.zeros(voxel_grid.shape, dtype=np.float32)
-    count = np.zeros(voxel_grid.shape, dtype=np.uint32)
-    for index, index_from_sample in enumerate(_index_from_sample(voxel_grid, source)):
-        add_samples(source.read(index), index_from_sample, total, count)
-    if not count.any():
+    Raises
+    ------
+    InvalidInputError
+        If nothing is left.
+    """
+    if working_gb(voxel_grid, settings) <= settings.max_memory_gb:
+        return settings
+    # The type that the levels have, and a byte of state.
+    most, held = settings.max_memory_gb, voxel_grid.size_gb(settings.voxel_type) + voxel_grid.size_gb("uint8")
+    if held >= most:
+        raise InvalidInputError(
+            f"volume: expected at most {most:g} GB of memory, got {held:.3g} GB for {voxel_grid}: take "
+            "larger voxels, or check the poses"
+        )
+    return settings.model_copy(update={"max_memory_gb": most - held})
+
+
+def _joined(
+    source: PosedImages,
+    voxel_grid: VoxelGrid,
+    settings: CompoundingSettings,
+    weights: Weights | None,
+    region: BoolArray | None,
+) -> CompoundedVolume:
+    voxels, state = None, None
+    for slab in compound_slabs(source, voxel_grid, settings, weights, region):
+        if slab.voxels.shape[0] == voxel_grid.shape[2]:
+            voxels, state = slab.voxels, slab.state
+            break
+        if voxels is None or state is None:
+            voxels = np.empty(voxel_grid.shape[::-1], settings.voxel_type)
+            state = np.empty(voxel_grid.shape[::-1], np.uint8)
+        own = slice(slab.first, slab.first + len(slab.voxels))
+        voxels[own], state[own] = slab.voxels, slab.state
+    if voxels is None or state is None or not state.any():
         raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
-    with np.errstate(invalid="ignore"):  # 0 / 0 is the NaN that marks an empty voxel
-        return np.divide(total, count, out=total, casting="same_kind")
-
-
-def _index_from_sample(voxel_grid: VoxelGrid, source: PosedImages) -> FloatArray:
-    """Per image, the map from (vector, sample, 1) to fractional (i, j, k), shape (n, 3, 3)."""
-    grid_from_image = (voxel_grid.world_from_grid.inv() * source.world_from_image).as_matrix()
-    image_from_sample = np.zeros((4, 3))
-    image_from_sample[0, 0] = source.grid.vector_pitch_mm
-    image_from_sample[1, 1:] = source.grid.sample_spacing_mm, source.grid.first_sample_depth_mm
-    image_from_sample[3, 2] = 1.0
-    maps = (grid_from_image @ image_from_sample)[:, :3] / np.asarray(voxel_grid.spacing_mm)[:, None]
-    return np.ascontiguousarray(maps)
-
-
-def _fill_holes(voxels: Float32Array, fill_radius: int) -> None:
-    from speckle3d.kernels.compounding import fill_from_shell
-
-    empty = np.isnan(voxels)
-    if fill_radius > 0 and empty.any():
-        distance = distance_transform_cdt(empty, metric="chessboard")
-        fill_from_shell(voxels, np.asarray(distance, dtype=np.int32), fill_radius)
-
-
-def _as_uint8(voxels: Float32Array) -> ByteArray:
-    rounded = np.nan_to_num(np.rint(voxels), nan=0.0)
-    return np.clip(rounded, 0.0, 255.0, out=rounded).astype(np.uint8)
+    placed = voxel_grid.spacing_mm, voxel_grid.world_from_grid
+    return CompoundedVolume(voxels.T, *placed, state=state.T)

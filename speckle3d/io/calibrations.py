@@ -11,6 +11,7 @@ where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -21,7 +22,7 @@ from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Sourc
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.reconstruction import CalibrationFile
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.hdf5 import (
     PathLike,
     atomic_hdf5,
@@ -137,6 +138,30 @@ def apply_calibrations(sweep: Sweep, paths: Sequence[PathLike]) -> tuple[Sweep, 
             sweep = calibrated(sweep, calibration)
         held.append(CalibrationFile(calibration.sensor, str(path), sha256_of(path)))
     return sweep, tuple(held)
+
+
+def fitted_pixels(paths: Sequence[PathLike]) -> dict[str, float]:
+    """Return the pixel size of the first calibration that has one, as import settings of B-mode images."""
+    for path in paths:
+        pixel_mm = read_calibration(path).pixel_mm
+        if pixel_mm is not None:
+            return {"column_pitch_mm": float(pixel_mm[0]), "row_spacing_mm": float(pixel_mm[1])}
+    return {}
+
+
+def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
+    """Replace the pixel size of a sweep of B-mode images; names are those of the import settings."""
+    if not isinstance(sweep.signal, BModeSettings):
+        return sweep
+    grid = sweep.grid
+    column_mm = sizes.get("column_pitch_mm", grid.vector_pitch_mm)
+    row_mm = sizes.get("row_spacing_mm", grid.sample_spacing_mm)
+    # Rows count from the probe's face, including those above the first stored row.
+    first_mm = grid.first_sample_depth_mm * row_mm / grid.sample_spacing_mm
+    fitted = replace(
+        grid, vector_pitch_mm=column_mm, sample_spacing_mm=row_mm, first_sample_depth_mm=first_mm
+    )
+    return replace(sweep, grid=fitted)
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:

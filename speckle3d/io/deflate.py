@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import ByteArray
 
-_HEADER, _LAST_BLOCK = b"\x78\x01", b"\x03\x00"
+ZLIB_START, LAST_BLOCK = b"\x78\x01", b"\x03\x00"
 """Of a zlib stream, and of one whose last block is empty."""
 
 _MOST_STORED = 0xFFFF
@@ -29,6 +29,12 @@ _MOST_STORED = 0xFFFF
 _MOST_THREADS = 4
 _AHEAD = 2
 """Frames that may wait for each thread."""
+
+
+def packed_run(run: bytes | memoryview) -> bytes:
+    """Pack bytes into blocks that end on a byte and need nothing before them, or store what does not pack."""
+    packed = _packer()(run)
+    return packed if len(packed) < len(run) else _stored(run)
 
 
 def shuffled(frame: npt.NDArray[Any]) -> ByteArray:
@@ -47,35 +53,33 @@ def deflated(planes: ByteArray) -> bytes:
     ----------
     .. [1] P. Deutsch, RFC 1950 and RFC 1951, 1996: blocks that end on a byte follow one another.
     """
-    pack = _packer()
-    runs = ((plane, pack(plane)) for plane in planes)
-    blocks = (packed if len(packed) < plane.size else _stored(plane) for plane, packed in runs)
-    return b"".join((_HEADER, *blocks, _LAST_BLOCK, struct.pack(">I", zlib.adler32(planes.data))))
+    blocks = (packed_run(plane.data) for plane in planes)
+    return b"".join((ZLIB_START, *blocks, LAST_BLOCK, struct.pack(">I", zlib.adler32(planes.data))))
 
 
 @cache
-def _packer() -> Callable[[ByteArray], bytes]:
+def _packer() -> Callable[[bytes | memoryview], bytes]:
     """Function that packs a run into blocks that end on a byte: ISA-L's, or zlib's where it is missing."""
     try:
         from isal import isal_zlib
     except ImportError:
         return packed_by_zlib
 
-    def packed_by_isal(run: ByteArray) -> bytes:
+    def packed_by_isal(run: bytes | memoryview) -> bytes:
         packer = isal_zlib.compressobj(1, isal_zlib.DEFLATED, -zlib.MAX_WBITS)
         return bytes(packer.compress(run) + packer.flush(zlib.Z_FULL_FLUSH))
 
     return packed_by_isal
 
 
-def packed_by_zlib(run: ByteArray) -> bytes:
+def packed_by_zlib(run: bytes | memoryview) -> bytes:
     """Pack a run; of the repetitions in echoes, only those of single bytes are worth their search."""
     packer = zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, zlib.Z_RLE)
-    return packer.compress(run.data) + packer.flush(zlib.Z_FULL_FLUSH)
+    return packer.compress(run) + packer.flush(zlib.Z_FULL_FLUSH)
 
 
-def _stored(run: ByteArray) -> bytes:
-    pieces = (run[first : first + _MOST_STORED].tobytes() for first in range(0, run.size, _MOST_STORED))
+def _stored(run: bytes | memoryview) -> bytes:
+    pieces = (bytes(run[first : first + _MOST_STORED]) for first in range(0, len(run), _MOST_STORED))
     return b"".join(struct.pack("<BHH", 0, len(p), _MOST_STORED - len(p)) + p for p in pieces)
 
 

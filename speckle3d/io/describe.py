@@ -15,6 +15,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
+from speckle3d.core.labels import LabelMap
+from speckle3d.core.printable import printable
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
@@ -25,6 +27,7 @@ from speckle3d.io.import_settings import settings_for
 from speckle3d.io.load import kind_of, read_by
 from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.volumes import is_volume, read_volume
 
 _UNIT_NAMES = {"mm": "mm", "hz": "Hz", "db": "dB", "m_s": "m/s"}
 
@@ -39,6 +42,8 @@ def describe(path: PathLike) -> list[Row]:
     InvalidInputError
         If it is of no known kind, or what it holds is not valid.
     """
+    if Path(path).is_file() and is_volume(path):
+        return [("format", "volume", ""), *_describe_volume(path)]
     kind = kind_of(path)
     if kind not in _DESCRIBERS:
         reader = find_reader(path)
@@ -201,6 +206,30 @@ def _mounting_rows(held: Calibration) -> list[Row]:
 
 def _listed(values: FloatArray) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
+
+
+def _describe_volume(path: PathLike) -> list[Row]:
+    volume = read_volume(path)
+    turned = volume.world_from_grid.rotation.as_matrix().T
+    rows = [
+        ("voxels", " x ".join(map(str, volume.shape)), ""),
+        ("spacing", " x ".join(f"{step:g}" for step in volume.spacing_mm), "mm"),
+        ("voxel type", volume.voxels.dtype.name, ""),
+        ("first voxel at x, y, z (LPS)", _listed(volume.world_from_grid.translation), "mm"),
+        *(
+            (f"direction of {axis} (LPS)", _listed(along), "")
+            for axis, along in zip("ijk", turned, strict=True)
+        ),
+        *((printable(name), text, "") for name, text in volume.fields.items()),
+    ]
+    if not isinstance(volume, LabelMap):
+        held = volume.voxels[np.isfinite(volume.voxels)]
+        told = f"{held.min():g} to {held.max():g}" if held.size else "none"
+        return [*rows, ("levels found", told, "")]
+    for segment in volume.segments:
+        count = np.count_nonzero(volume.voxels == segment.value)
+        rows.append((f"label {segment.value}", f"{segment.name}: {count}", "voxels"))
+    return rows
 
 
 def _describe_curves(path: PathLike) -> list[Row]:

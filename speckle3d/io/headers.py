@@ -172,13 +172,21 @@ def _meta_header(path: PathLike, lines: dict[str, str], stream: BinaryIO) -> Seq
 
 
 def _nrrd_header(path: PathLike, lines: dict[str, str], stream: BinaryIO) -> SequenceHeader:
-    size = _sizes(path, lines, "sizes")
+    size = _sizes(path, _without_thickness(lines), "sizes")
     if "spacings" in lines:
         first_two = lines["spacings"].lower().replace("nan", "1").split()[:2]
         known: tuple[float, ...] | None = numbers(" ".join(first_two), 2, f"{path}: spacings")
     else:
         known = _direction_lengths(path, lines.get("space directions", ""))
     return _header(path, size, known, lines, nrrd_pixels(Path(path), lines, size, stream.tell()))
+
+
+def _without_thickness(lines: dict[str, str]) -> dict[str, str]:
+    """Sizes of a sequence of 3D Slicer, whose images are a pixel thick, as those of a sequence of planes."""
+    words = lines.get("sizes", "").split()
+    if lines.get("kinds", "").split()[-1:] == ["list"] and len(words) == 4 and words[2] == "1":
+        return {"sizes": " ".join((words[0], words[1], words[3]))}
+    return lines
 
 
 def _header(

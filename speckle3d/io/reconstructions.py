@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
 from speckle3d.core.reconstruction import (
@@ -16,8 +17,10 @@ from speckle3d.core.reconstruction import (
     CalibrationFile,
     FramePairs,
     ImportRecord,
+    ModeErrors,
     Provenance,
     Reconstruction,
+    SharedErrors,
     SourceFile,
     Trust,
 )
@@ -34,6 +37,7 @@ from speckle3d.io.hdf5 import (
     read_text,
     read_texts,
     read_transforms,
+    read_vector_attribute,
     require_group,
     write_attributes,
 )
@@ -57,6 +61,8 @@ _GRID = dict.fromkeys(("vectors", "samples"), int) | dict.fromkeys(
 )
 _PROVENANCE = dict.fromkeys(("input_path", "input_sha256", "package_version"), str)
 _SOURCE = dict.fromkeys(("path", "sha256"), str)
+_SHARED = dict.fromkeys(("scale_sigma", "curves_sigma"), float)
+_TURN = "turn_sigma_per_mm"
 _CHUNK_BYTES = 2**18
 
 
@@ -124,8 +130,7 @@ class ReconstructionWriter(HDF5Writer):
         for mode, world_from_image in poses.items():
             group[mode] = world_from_image.as_matrix()
         if trust is not None:
-            self._file["pose_covariance/image"] = trust.covariance
-            self._file["frame_flags"] = trust.flags
+            self._write_trust(trust)
         write_attributes(self._file, provenance, _PROVENANCE)
         for used in provenance.calibrations:
             write_attributes(self._file.require_group(f"calibrations/{used.sensor}"), used, _SOURCE)
@@ -138,6 +143,16 @@ class ReconstructionWriter(HDF5Writer):
             group["settings_json"] = provenance.imported.settings_json
         self._file["config_toml"] = config_toml
         self._finished = True
+
+    def _write_trust(self, trust: Trust) -> None:
+        group = self._file.create_group("pose_covariance")
+        group["image"] = trust.covariance
+        if trust.shared is not None:
+            write_attributes(group["image"], trust.shared, (*_SHARED, _TURN))
+        for mode, claimed in trust.modes.items():
+            group[mode] = claimed.covariance
+            write_attributes(group[mode], claimed, ("length_sigma",))
+        self._file["frame_flags"] = trust.flags
 
 
 def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstruction:
@@ -231,9 +246,29 @@ def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
     if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
         return None
-    covariance = read_checked(file, "pose_covariance/image", (frames, 6, 6))
-    require_finite(covariance, locate(file, "pose_covariance/image"))
-    return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64))
+    group = require_group(file, "pose_covariance")
+    modes = {}
+    for mode in MODES[1:]:
+        if has_member(group, mode):
+            modes[mode] = ModeErrors(
+                _read_covariance(group, mode, frames), **read_attributes(group[mode], {"length_sigma": float})
+            )
+    flags = read_checked(file, "frame_flags", (frames,), np.int64)
+    return Trust(_read_covariance(group, "image", frames), flags, _read_shared(group["image"]), modes)
+
+
+def _read_covariance(group: h5py.Group, mode: str, frames: int) -> FloatArray:
+    covariance = read_checked(group, mode, (frames, 6, 6))
+    require_finite(covariance, locate(group, mode))
+    return covariance
+
+
+def _read_shared(covariance: h5py.Dataset) -> SharedErrors | None:
+    """What the image's poses have wrong together; older files do not say."""
+    if _TURN not in covariance.attrs:
+        return None
+    turn = read_vector_attribute(covariance, _TURN, 2)
+    return SharedErrors(**read_attributes(covariance, _SHARED), turn_sigma_per_mm=turn)
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:

@@ -302,6 +302,8 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
         group["valid"] = np.ones(len(sensor.readings), dtype=bool)
         if sensor.sensor_from_image is not None:
             group.attrs["sensor_from_image"] = sensor.sensor_from_image.as_matrix()
+        if sensor.image_skew_rad:
+            group.attrs["image_skew_rad"] = sensor.image_skew_rad
         return
     group["quaternion_wxyz"] = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
     for name in INERTIAL:

@@ -213,7 +213,8 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
         mounting = transforms_from_matrices(matrix, f"{locate(group)} attribute {name}")[0]
     offset_s = read_attribute(group, "time_offset_s", default=0.0)
     with naming(locate(group)):
-        return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s)
+        skew_rad = read_attribute(group, "image_skew_rad", default=0.0)
+        return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
 
 
 def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:

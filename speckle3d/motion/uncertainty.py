@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
 from speckle3d.motion.planes import PairPlanes
 
@@ -40,17 +41,7 @@ def pose_covariance(
     turn[:, :3, :3] = turn[:, 3:, 3:] = poses.rotation.as_matrix()
     grown = SHARED * (1.0 + STRUCTURE * share)
     covariance = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
-    centres = poses.apply(centre_mm)
-    z = centres[:, 2] - centres[0, 2]
-    travel = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
-    covariance[:, 2, 2] += scale_sigma**2 * (z**2 + SCALE_CHANGE_MM * travel)
-    yaw, tilt = slopes.deviation_per_mm
-    for angle, shift, rate, sign in ((4, 0, yaw, 1.0), (3, 1, tilt, -1.0)):
-        # A turn that grows with z moves the centre sideways by half of it times z.
-        along = np.zeros((len(z), 6))
-        along[:, angle], along[:, shift] = z, sign * z**2 / 2
-        covariance += rate**2 * along[:, :, None] * along[:, None, :]
-        covariance[:, angle, angle] += rate**2 * TURN_CHANGE_MM * travel
+    covariance += shared_covariance(poses, centre_mm, SharedErrors(scale_sigma, 0.0, slopes.deviation_per_mm))
     return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
 
 
@@ -66,10 +57,42 @@ def with_common_scale(
     sigma : float
         Relative standard deviation of the factor.
     """
+    return covariance + shared_covariance(poses, centre_mm, SharedErrors(0.0, sigma, np.zeros(2)))
+
+
+def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
+    """Covariance of every frame's pose by what all pairs have wrong together, shape (n, 6, 6)."""
+    common = common_factors(poses, centre_mm, shared)
+    changing = changing_variance(poses, centre_mm, shared)
+    return np.asarray(np.einsum("mia,mib->iab", common, common) + changing[:, :, None] * np.eye(6))
+
+
+def common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
+    """Errors of poses for one deviation of the scale, of yaw and of tilt per mm, shape (3, n, 6)."""
     centres = poses.apply(centre_mm)
-    along = np.zeros((len(covariance), 6, 6))
-    along[:, 2, 2] = (sigma * (centres[:, 2] - centres[0, 2])) ** 2
-    return covariance + along
+    z = centres[:, 2] - centres[0, 2]
+    factors = np.zeros((3, len(z), 6))
+    factors[0, :, 2] = np.hypot(shared.scale_sigma, shared.curves_sigma) * z
+    yaw, tilt = shared.turn_sigma_per_mm
+    for number, angle, shift, rate, sign in ((1, 4, 0, yaw, 1.0), (2, 3, 1, tilt, -1.0)):
+        # A turn that grows with z moves the centre sideways by half of it times z.
+        factors[number, :, angle], factors[number, :, shift] = rate * z, sign * rate * z**2 / 2
+    return factors
+
+
+def changing_variance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
+    """Variance of poses by the parts of scale, yaw and tilt that change along the way, shape (n, 6)."""
+    travel = travelled(poses, centre_mm)
+    variance = np.zeros((len(travel), 6))
+    variance[:, 2] = shared.scale_sigma**2 * SCALE_CHANGE_MM * travel
+    variance[:, [4, 3]] = np.square(shared.turn_sigma_per_mm) * TURN_CHANGE_MM * travel[:, None]
+    return variance
+
+
+def travelled(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Way that the image's centre has gone up to every frame, shape (n,), mm."""
+    steps = np.linalg.norm(np.diff(poses.apply(centre_mm), axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 NEAR_MM = 0.1

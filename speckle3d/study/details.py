@@ -9,10 +9,11 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import sensor_of
+from speckle3d.correction.scale import ScaledPoses
 from speckle3d.correction.trust import name_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
@@ -80,6 +81,16 @@ def claims_of(
         else:
             claims[mode] = correction.log_scale_sigma
     return claims
+
+
+def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
+    """What a reconstruction's file says of its poses' errors."""
+    modes = {
+        mode: ModeErrors(each.covariance, each.log_scale_sigma)
+        for mode, each in corrections.items()
+        if isinstance(each, ScaledPoses)
+    }
+    return Trust(tracked.covariance, tracked.flags, tracked.shared, modes)
 
 
 def _correction_details(correction: Correction) -> dict[str, Any]:

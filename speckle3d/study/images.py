@@ -1,22 +1,25 @@
-"""Images of a sweep to look at: log-compressed, or a narrow strip of every frame to cut along the sweep."""
+"""Images of a sweep to look at: grey levels, or a narrow strip of every frame to cut along the sweep."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config, config_from_toml
 from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
 from speckle3d.imaging.images import Images
 from speckle3d.imaging.planes import ReslicePlane, lateral_line, planes_from_first_frame
 from speckle3d.imaging.reslice import reslice_frames
+from speckle3d.imaging.settings import Levels
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
@@ -30,7 +33,98 @@ _GLANCES = 24
 """Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""
 
 
-class GreyImages:
+class GreyFrames(Protocol):
+    """Grey images of a sweep by frame number, shape (vector, sample), where they lie and what they are."""
+
+    grid: ImageGrid
+
+    @property
+    def meaning(self) -> str:
+        """What the grey levels are, in words."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (frame, vector, sample)."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the grey levels."""
+
+    def __getitem__(self, index: int, /) -> npt.NDArray[Any]:
+        """Make one image."""
+
+
+class _Counted:
+    """Frames that tell how many of them were asked for."""
+
+    def __init__(self, sweep: Sweep, grid: ImageGrid, progress: Callable[[int, int], None] | None) -> None:
+        self._sweep, self._progress = sweep, progress
+        self.grid = grid
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (frame, vector, sample)."""
+        return len(self._sweep), self.grid.vectors, self.grid.samples
+
+    def _frame(self, index: int) -> npt.NDArray[Any]:
+        if self._progress:
+            self._progress(index + 1, len(self._sweep))
+        return read_frame(self._sweep.frames, index)
+
+
+class StoredImages(_Counted):
+    """B-mode images as they are stored, in their own type; arguments as for `GreyImages`.
+
+    Raises
+    ------
+    InvalidInputError
+        If the sweep holds echoes, which are no images yet.
+    """
+
+    def __init__(self, sweep: Sweep, progress: Callable[[int, int], None] | None = None) -> None:
+        if not isinstance(sweep.signal, BModeSettings):
+            raise InvalidInputError(
+                f"{sweep.name}: expected B-mode for levels as stored, got RF or I/Q: take log or linear"
+            )
+        super().__init__(sweep, sweep.grid, progress)
+        self.meaning = f"B-mode as stored, 0 to {sweep.signal.full_scale:g}"
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the grey levels."""
+        return np.dtype(self._sweep.frames.dtype)
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        return self._frame(index)
+
+
+class AmplitudeImages(_Counted):
+    """Echo amplitude, on a linear scale; arguments as for `GreyImages`."""
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        progress: Callable[[int, int], None] | None = None,
+        settings: IntensitySettings | None = None,
+    ) -> None:
+        self._extractor = IntensityExtractor.for_sweep(sweep, settings)
+        super().__init__(sweep, self._extractor.grid, progress)
+        self.meaning = "echo amplitude, linear, in the units of the samples"
+        if isinstance(sweep.signal, BModeSettings):
+            range_db = sweep.signal.dynamic_range_db
+            self.meaning = f"echo amplitude, linear, of B-mode over {range_db:g} dB; 1 is full scale"
+
+    @property
+    def dtype(self) -> np.dtype[np.float32]:
+        """Type of the amplitudes."""
+        return np.dtype(np.float32)
+
+    def __getitem__(self, index: int) -> Float32Array:
+        intensity = self._extractor.intensity(self._frame(index))
+        return np.asarray(np.sqrt(intensity), dtype=np.float32)
+
+
+class GreyImages(_Counted):
     """Log-compressed images of a sweep, 0 to 255, by frame number.
 
     Parameters
@@ -55,8 +149,9 @@ class GreyImages:
         if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
         self._extractor = IntensityExtractor.for_sweep(sweep, settings)
-        self._sweep, self._range_db, self._progress = sweep, dynamic_range_db, progress
-        self.grid: ImageGrid = self._extractor.grid
+        super().__init__(sweep, self._extractor.grid, progress)
+        self._range_db = dynamic_range_db
+        self.meaning = f"log-compressed, 0 to 255 over {dynamic_range_db:g} dB"
         # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo does
         # not darken it; for measuring an echo's place, the brightest, so that none is cut off.
         if clipped:
@@ -66,23 +161,19 @@ class GreyImages:
             self._brightest = max(float(self._decibel(int(i)).max()) for i in some)
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-        return len(self._sweep), self.grid.vectors, self.grid.samples
-
-    @property
     def dtype(self) -> np.dtype[np.float32]:
         """Type of the grey levels."""
         return np.dtype(np.float32)
 
     def __getitem__(self, index: int) -> Float32Array:
-        if self._progress:
-            self._progress(index + 1, len(self._sweep))
-        level = 1 + (self._decibel(index) - self._brightest) / self._range_db
+        level = 1 + (self._decibel_of(self._frame(index)) - self._brightest) / self._range_db
         return np.asarray(255 * np.clip(level, 0, 1), dtype=np.float32)
 
     def _decibel(self, index: int) -> Float32Array:
-        intensity = self._extractor.intensity(self._sweep.frames[index])
+        return self._decibel_of(read_frame(self._sweep.frames, index))
+
+    def _decibel_of(self, frame: npt.NDArray[Any]) -> Float32Array:
+        intensity = self._extractor.intensity(frame)
         return np.asarray(10 * np.log10(np.maximum(intensity, np.float32(1e-12))))
 
 
@@ -91,7 +182,8 @@ def grey_images(
     dynamic_range_db: float = 60.0,
     progress: Callable[[int, int], None] | None = None,
     reconstruction: Reconstruction | None = None,
-) -> GreyImages:
+    levels: Levels = "log",
+) -> GreyFrames:
     """Make a sweep's grey images for compounding and reslicing, one at a time as they are asked for.
 
     Parameters
@@ -103,16 +195,18 @@ def grey_images(
         Called with the number of each image and of all.
     reconstruction : Reconstruction, optional
         To make the images as its configuration says.
+    levels : {"log", "linear", "stored"}
+        Log-compressed to 0-255, linear echo amplitude, or B-mode as it is stored.
 
     Returns
     -------
-    GreyImages
-        Indexed by frame: float32, shape (vector, sample), 0 to 255.
+    GreyImages, AmplitudeImages or StoredImages
+        Indexed by frame: float32, or the type that is stored, shape (vector, sample).
 
     Raises
     ------
     InvalidInputError
-        If `dynamic_range_db` is not above zero.
+        If `dynamic_range_db` is not above zero, or echoes are asked for as stored.
 
     Examples
     --------
@@ -127,7 +221,16 @@ def grey_images(
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
         settings = config_from_toml(reconstruction.config_toml).intensity
+    if levels == "stored":
+        return StoredImages(sweep, progress)
+    if levels == "linear":
+        return AmplitudeImages(sweep, progress, settings)
     return GreyImages(sweep, dynamic_range_db, progress, settings)
+
+
+def usual_levels(sweep: Sweep) -> Levels:
+    """As stored for B-mode, which is compressed already, and log-compressed for echoes."""
+    return "stored" if isinstance(sweep.signal, BModeSettings) else "log"
 
 
 def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Reconstruction, Sweep]:

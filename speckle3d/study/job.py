@@ -16,7 +16,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
-from speckle3d.core.reconstruction import Provenance, Trust
+from speckle3d.core.reconstruction import Provenance
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.modes import PUBLISHED
@@ -34,7 +34,7 @@ from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
 from speckle3d.study.crossed import Companion
 from speckle3d.study.cuts import CutPicture, DrawnCut, frame_lines
-from speckle3d.study.details import claims_of, details_of, doubted_modes
+from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_planes
@@ -178,7 +178,7 @@ def write_results(
             request.crossing_file,
             import_record(source),
         )
-        writer.finish(poses, provenance, settings.to_toml(), Trust(tracked.covariance, tracked.flags))
+        writer.finish(poses, provenance, settings.to_toml(), trust_of(tracked, corrections))
     if request.reference is None and compared is not None and compared.name == "tracker":
         compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,21 @@ from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.imaging.images import ChosenImages, Images
+from speckle3d.imaging.images import ChosenImages, Images, PosedImages
+from speckle3d.imaging.settings import Levels
+from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
+from speckle3d.io.hdf5 import PathLike
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.reconstructions import FORMAT
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
-from speckle3d.study.images import grey_images, open_reconstruction
+from speckle3d.study.images import grey_images, open_reconstruction, usual_levels
+
+USUAL_RANGE_DB = 60.0
+"""Dynamic range where nothing says another."""
+
+_RANGE = "dynamic_range_db"
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,9 @@ class PosedSweep:
         Where poses are from: a mode of the reconstruction, "tracker" or "truth".
     reconstruction : Reconstruction or None
         None where the recording itself says where its frames are.
+    range_is_known : bool
+        Whether the recording says the dynamic range of its B-mode, or it is given; levels as stored need
+        none.
     """
 
     sweep: Sweep
@@ -42,16 +54,81 @@ class PosedSweep:
     world_from_image: RigidTransform
     mode: str
     reconstruction: Reconstruction | None = None
+    range_is_known: bool = True
 
     def images(
-        self, dynamic_range_db: float = 60.0, progress: Callable[[int, int], None] | None = None
+        self, dynamic_range_db: float = USUAL_RANGE_DB, progress: Callable[[int, int], None] | None = None
     ) -> tuple[Images, ImageGrid]:
-        """Grey images of the frames that have a pose, in the order of their poses, and their grid."""
+        """Log-compressed images of the frames that have a pose, in the order of their poses, and their grid.
+
+        Raises
+        ------
+        MissingSettingsError
+            If the recording does not say the dynamic range of its B-mode.
+        """
+        self._require_range("log")
         every = grey_images(self.sweep, dynamic_range_db, progress, self.reconstruction)
         return ChosenImages(every, self.frames), every.grid
 
+    def source(
+        self,
+        levels: Levels | None = None,
+        dynamic_range_db: float = USUAL_RANGE_DB,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> tuple[PosedImages, str]:
+        """Images to compound with their poses, and what their grey levels are in words.
 
-def open_posed(path: Path, mode: str | None = None, sweep_file: Path | None = None) -> PosedSweep:
+        A tracker's image calibration is used whole: columns and rows lie where it has them, also if they are
+        not square.
+
+        Parameters
+        ----------
+        levels : {"log", "linear", "stored"}, optional
+            By default as stored for B-mode, and log-compressed for echoes.
+        dynamic_range_db : float
+            Range of the log-compressed grey levels.
+
+        Raises
+        ------
+        MissingSettingsError
+            If levels need the dynamic range of B-mode, and the recording does not say it.
+        InvalidInputError
+            If echoes are asked for as stored.
+        """
+        chosen = levels or usual_levels(self.sweep)
+        self._require_range(chosen)
+        every = grey_images(self.sweep, dynamic_range_db, progress, self.reconstruction, chosen)
+        grid = replace(every.grid, skew_rad=self.skew_rad)
+        return PosedImages(ChosenImages(every, self.frames), grid, self.world_from_image), every.meaning
+
+    @property
+    def skew_rad(self) -> float:
+        """What the image calibration has beyond the rigid poses, which are the tracker's; else zero."""
+        tracker = self.sweep.tracker
+        return 0.0 if tracker is None or self.mode != "tracker" else tracker.image_skew_rad
+
+    def notes(self) -> list[str]:
+        """Tell which frames are left out."""
+        without = len(self.sweep) - len(self.frames)
+        if not without:
+            return []
+        return [
+            f"{self.sweep.name}: {without} of {len(self.sweep)} frames have no valid pose and are left out"
+        ]
+
+    def _require_range(self, levels: Levels) -> None:
+        if not self.range_is_known and levels != "stored":
+            raise MissingSettingsError(self.sweep.name, (_RANGE,))
+
+
+def open_posed(
+    path: Path,
+    mode: str | None = None,
+    sweep_file: Path | None = None,
+    settings: ImportSettings | None = None,
+    calibrations: Sequence[PathLike] = (),
+    dynamic_range_db: float | None = None,
+) -> PosedSweep:
     """Open a reconstruction with its sweep, or a recording whose poses are known.
 
     Parameters
@@ -63,6 +140,13 @@ def open_posed(path: Path, mode: str | None = None, sweep_file: Path | None = No
         the truth if stored, else the tracker).
     sweep_file : path, optional
         The reconstruction's sweep, if it moved.
+    settings : ImportSettings, optional
+        What the recording does not say; of a reconstruction, its sweep's are those it was made with.
+    calibrations : sequence of path
+        Calibration files to use in place of what the recording says of its sensors and, unless settings
+        give it, of its pixels' size.
+    dynamic_range_db : float, optional
+        Of B-mode that does not say its own, and only of that.
 
     Raises
     ------
@@ -72,6 +156,10 @@ def open_posed(path: Path, mode: str | None = None, sweep_file: Path | None = No
         If the recording does not say where its frames are.
     """
     if kind_of(path) == FORMAT:
+        if calibrations or (settings is not None and settings.model_fields_set):
+            raise InvalidInputError(
+                f"{path}: expected a recording with what it does not say, got a reconstruction"
+            )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
         chosen = mode or "image"
         return PosedSweep(
@@ -84,8 +172,23 @@ def open_posed(path: Path, mode: str | None = None, sweep_file: Path | None = No
             f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
             "make its reconstruction first (speckle3d reconstruct)"
         )
-    sweep = load_sweep(path)
-    return posed_by_itself(sweep, mode)
+    given = settings or ImportSettings()
+    sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in given.model_fields_set}
+    sweep, known = _load(path, given.model_copy(update=sizes), dynamic_range_db)
+    mounted, _ = apply_calibrations(resized(sweep, sizes), calibrations)
+    return replace(posed_by_itself(mounted, mode), range_is_known=known)
+
+
+def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
+    """Read a sweep whose grey levels may do as they are, and tell whether their dynamic range is known."""
+    try:
+        return load_sweep(path, settings), True
+    except MissingSettingsError as error:
+        if error.settings != (_RANGE,):
+            lacking = tuple(name for name in error.settings if name != _RANGE)
+            raise MissingSettingsError(path, lacking) from None
+    given = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
+    return load_sweep(path, given), dynamic_range_db is not None
 
 
 def posed_by_itself(sweep: Sweep, mode: str | None = None) -> PosedSweep:

@@ -137,7 +137,7 @@ def test_absurd_sizes_are_refused_before_a_frame_is_read():
     with pytest.raises(InvalidInputError, match="voxel_mm"):
         compound(read, GRID, poses, 0.0)
     with pytest.raises(InvalidInputError, match="voxel_type"):
-        compound(read, GRID, poses[:1], 0.5, voxel_type="int16")
+        compound(read, GRID, poses[:1], 0.5, voxel_type="int8")
     with pytest.raises(InvalidInputError, match="fill_radius"):
         compound(read, GRID, poses[:1], 0.5, fill_radius=-1)
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.io.hdf5 import open_hdf5, reading
 from speckle3d.io.plus.frames import SequenceFrames
@@ -60,6 +61,24 @@ class Rows:
     def stored(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Give Q the sign that it has in the file."""
         return np.conj(frame) if self.conjugated else frame
+
+    def add_transforms(self, name: str, matrices: FloatArray) -> None:
+        """Give the sweep's frames one more transform, shape (n, 4, 4), by a name as ``ImageToWorld``.
+
+        It counts pixels, so that their spacing becomes 1: a viewer that knew both would apply it twice.
+
+        Raises
+        ------
+        InvalidInputError
+            If there are fewer or more transforms than frames.
+        """
+        count = sum(each is not None for each in self.images)
+        if matrices.shape != (count, 4, 4):
+            raise InvalidInputError(f"{name}: expected shape ({count}, 4, 4), got {matrices.shape}")
+        self.fields["ElementSpacing"] = "1 1 1"
+        for frame, i in zip(self.frames, self.images, strict=True):
+            if i is not None:
+                _add([frame], name, matrices[[i]], np.ones(1, dtype=bool))
 
     @property
     def is_plane(self) -> bool:
@@ -136,7 +155,7 @@ def _stamp(frames: list[dict[str, str]], images: Sequence[int | None], times_s: 
     """Give every frame its time; returns those of all, NaN where a frame without image has none."""
     times = np.full(len(frames), np.nan)
     for i, (frame, number) in enumerate(zip(frames, images, strict=True)):
-        held = _number(frame.get("Timestamp"))
+        held = number_of(frame.get("Timestamp"))
         times[i] = held if number is None else times_s[number]
         if number is not None and held != times[i]:
             frame["Timestamp"] = number_text(times[i])
@@ -145,7 +164,8 @@ def _stamp(frames: list[dict[str, str]], images: Sequence[int | None], times_s: 
     return times
 
 
-def _number(text: str | None) -> float:
+def number_of(text: str | None) -> float:
+    """Read a number; NaN where there is none."""
     try:
         return float(text or "nan")
     except ValueError:
@@ -178,7 +198,9 @@ def _add_tracker(
                 f"the tracker's {len(tracker.readings)} readings, of which {np.count_nonzero(covered)} "
                 f"interpolated ones are at the times of {len(frames)} frames"
             )
-    _add_calibration(sweep, tracker.sensor_from_image, f"{IMAGE}To{tool}", record, frames)
+    _add_calibration(
+        sweep, tracker.sensor_from_image, f"{IMAGE}To{tool}", record, frames, tracker.image_skew_rad
+    )
     return left_out
 
 
@@ -203,6 +225,7 @@ def _add_calibration(
     name: str,
     record: SequenceRecord,
     frames: list[dict[str, str]],
+    skew_rad: float = 0.0,
 ) -> None:
     if mounting is None:
         return
@@ -211,7 +234,7 @@ def _add_calibration(
     if held is not None and _same(sensor_from_image(held, grid.first_sample_depth_mm, name), mounting):
         return
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
-    matrix = image_matrix(mounting, *sizes)
+    matrix = image_matrix(mounting, *sizes, skew_rad)
     _add(frames, name, np.tile(matrix, (len(frames), 1, 1)), np.ones(len(frames), dtype=bool))
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -27,6 +26,7 @@ from speckle3d.io.plus.transforms import (
     ORIENTATION,
     Poses,
     fixed_transform,
+    image_skew_rad,
     pixel_axes,
     sensor_from_image,
     time_stamps,
@@ -319,12 +319,13 @@ class Source:
 
     def tracker(self, grid: ImageGrid) -> Tracker | None:
         """The tracker, with the image on it if that is known."""
-        poses = self.poses
-        return None if poses is None else Tracker(poses.readings, self._mounting(grid))
-
-    def _mounting(self, grid: ImageGrid) -> RigidTransform | None:
-        found = self.image_to_probe()
-        return None if found is None else sensor_from_image(found[0], grid.first_sample_depth_mm, found[1])
+        poses, found = self.poses, self.image_to_probe()
+        if poses is None:
+            return None
+        if found is None:
+            return Tracker(poses.readings)
+        mounting = sensor_from_image(found[0], grid.first_sample_depth_mm, found[1])
+        return Tracker(poses.readings, mounting, image_skew_rad=image_skew_rad(*found))
 
     def orientation(self) -> OrientationSensor | None:
         """The orientation sensor that this package wrote; None where there is none."""

@@ -184,6 +184,16 @@ def sensor_from_image(matrix: FloatArray, first_sample_depth_mm: float, where: s
     )
 
 
+def image_skew_rad(matrix: FloatArray, where: str) -> float:
+    """Angle by which columns and rows of a calibration of pixels lean towards each other.
+
+    The nearest rigid transform, `sensor_from_image`, lies in their middle: half of the angle is missing from
+    either axis.
+    """
+    across, down = (matrix[:3, :2] / pixel_axes(matrix, where)).T
+    return float(np.arcsin(across @ down))
+
+
 def _require_right_handed(axes: FloatArray, where: str) -> None:
     """Refuse a mirrored calibration: a plane alone does not show it, its third column does.
 
@@ -206,13 +216,19 @@ def _require_right_handed(axes: FloatArray, where: str) -> None:
 
 
 def image_matrix(
-    sensor_from_image: RigidTransform, column_mm: float, row_mm: float, first_sample_depth_mm: float
+    sensor_from_image: RigidTransform,
+    column_mm: float,
+    row_mm: float,
+    first_sample_depth_mm: float,
+    skew_rad: float = 0.0,
 ) -> FloatArray:
-    """Transform of pixels to mm that `sensor_from_image` reads back, shape (4, 4).
+    """Transform of pixels to mm that `sensor_from_image` and `image_skew_rad` read back, shape (4, 4).
 
     The third axis, of which a plane has no pixels, has the mean length, as in PLUS's own calibrations.
     """
     pixels = np.diag([column_mm, row_mm, (column_mm + row_mm) / 2, 1.0])
+    half = skew_rad / 2
+    pixels[:2, :2] = np.array([[np.cos(half), np.sin(half)], [np.sin(half), np.cos(half)]]) @ pixels[:2, :2]
     pixels[1, 3] = first_sample_depth_mm
     return np.asarray(sensor_from_image.as_matrix() @ pixels)
 

@@ -4,12 +4,13 @@ References
 ----------
 .. [1] PLUS user manual, "Sequence file".
 .. [2] G. Kindlmann, "Definition of NRRD File Format", teem.sourceforge.net.
+.. [3] 3D Slicer developer guide, "Volume sequence file format (.seq.nrrd)".
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike
 from speckle3d.core.parts import cannot_write
@@ -26,12 +28,15 @@ from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import read_header
 from speckle3d.io.pixels import meta_type, type_of_word
 from speckle3d.io.plus.layout import Layout
-from speckle3d.io.plus.rows import Rows, rows_of
+from speckle3d.io.plus.rows import Rows, number_of, rows_of
 
 Progress = Callable[[int, int], None]
 
 SUFFIXES = (".mha", ".mhd", ".nrrd")
 """Of the files that `write_sequence` writes, as .igs.mha."""
+
+_OF_SLICER = ".seq.nrrd"
+"""With four axes, the last of them the frames, as 3D Slicer reads it [3]_; other NRRD files have three."""
 
 _LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
@@ -49,7 +54,11 @@ _META_ONLY = ("NDims", "ElementType", "ElementSpacing")
 
 
 def write_sequence(
-    path: PathLike, sweep: Sweep, progress: Progress | None = None, compressed: bool = True
+    path: PathLike,
+    sweep: Sweep,
+    progress: Progress | None = None,
+    compressed: bool = True,
+    transforms: Mapping[str, FloatArray] | None = None,
 ) -> list[str]:
     """Write a sweep as a sequence of PLUS, of the container that the suffix names; memory stays flat.
 
@@ -67,6 +76,8 @@ def write_sequence(
         Called with the number of images written and their total.
     compressed : bool
         Whether pixels are packed with deflate.
+    transforms : mapping of str to ndarray, shape (n, 4, 4), optional
+        More transforms of the sweep's frames, by names as ``ImageToWorld``: of pixels to mm.
 
     Returns
     -------
@@ -85,6 +96,8 @@ def write_sequence(
     if suffix not in SUFFIXES:
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}, got {suffix!r}")
     rows = rows_of(sweep)
+    for name, matrices in (transforms or {}).items():
+        rows.add_transforms(name, matrices)
     images = _Images.of(sweep, rows, progress)
     if suffix == ".mhd":
         beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
@@ -103,7 +116,8 @@ def write_sequence(
         return rows.left_out
     with atomic_path(target) as part, part.open("wb") as file:
         if suffix == ".nrrd":
-            file.write(_nrrd_header(images, rows, "gzip" if compressed else "raw"))
+            is_slicers = target.name.lower().endswith(_OF_SLICER)
+            file.write(_nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers))
             images.write(file, 31 if compressed else None)
             return rows.left_out
         head = _meta_header(images, rows, "LOCAL", 0 if compressed else None)
@@ -232,20 +246,13 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
     return _encoded(lines)
 
 
-def _nrrd_header(images: _Images, rows: Rows, encoding: str) -> bytes:
-    x, y, *_ = rows.fields["ElementSpacing"].split()
-    apart = "" if rows.is_plane else " none"
+def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -> bytes:
     lines = [
         "NRRD0004",
         f"type: {_NRRD_WORDS[images.dtype.str[1:]]}",
-        f"dimension: {2 if rows.is_plane else 3}",
-        "space dimension: 2",
-        f"sizes: {_lengths(images, rows)}",
-        f"space directions: ({x},0) (0,{y}){apart}",
-        f"kinds: {'domain domain' if rows.is_plane else 'domain domain list'}",
+        *(_slicers_axes if is_slicers else _axes)(images, rows),
         "endian: little",
         f"encoding: {encoding}",
-        f"space origin: ({','.join(rows.fields.get('Offset', '0 0').split()[:2])})",
         *(
             f"{_NRRD_NAMES.get(name, name)}:={value}"
             for name, value in rows.fields.items()
@@ -256,9 +263,49 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str) -> bytes:
             for i, frame in enumerate(rows.frames)
             for name, value in frame.items()
         ),
+        # Slicer reads the transforms up to the first line of more than 1,000 characters.
+        *(_slicers_index(rows) if is_slicers else ()),
         "",
     ]
     return _encoded(lines)
+
+
+def _axes(images: _Images, rows: Rows) -> Iterator[str]:
+    """Axes of an image, and one of frames, in a plane: as PLUS writes them."""
+    x, y, *_ = rows.fields["ElementSpacing"].split()
+    apart = "" if rows.is_plane else " none"
+    yield f"dimension: {2 if rows.is_plane else 3}"
+    yield "space dimension: 2"
+    yield f"sizes: {_lengths(images, rows)}"
+    yield f"space directions: ({x},0) (0,{y}){apart}"
+    yield f"kinds: {'domain domain' if rows.is_plane else 'domain domain list'}"
+    yield f"space origin: ({','.join(rows.fields.get('Offset', '0 0').split()[:2])})"
+
+
+def _slicers_axes(images: _Images, rows: Rows) -> Iterator[str]:
+    """Axes of images one pixel thick in space, and one of frames; transforms count pixels from its origin."""
+    y, x = images.shape
+    sx, sy, *_ = rows.fields["ElementSpacing"].split()
+    yield "dimension: 4"
+    yield "space: right-anterior-superior"
+    yield f"sizes: {x} {y} 1 {len(rows.images)}"
+    yield f"space directions: ({sx},0,0) (0,{sy},0) (0,0,1) none"
+    yield "kinds: domain domain domain list"
+    yield 'labels: "" "" "" "time"'
+    yield 'units: "" "" "" "s"'
+    yield "space origin: (0,0,0)"
+
+
+def _slicers_index(rows: Rows) -> Iterator[str]:
+    """Frames' times, by which Slicer finds what belongs together; it rounds those of transforms to 1 ms."""
+    yield "DataNodeClassName:=vtkMRMLScalarVolumeNode"
+    times = [f"{number_of(frame.get('Timestamp')):.3f}" for frame in rows.frames]
+    values = times if len({*times}) == len(times) and "nan" not in times else map(str, range(len(times)))
+    told = " ".join(values)
+    # Up to version 5.6 Slicer knew the axis of frames as the first.
+    for axis in (3, 0):
+        yield f"axis {axis} index type:=numeric"
+        yield f"axis {axis} index values:={told}"
 
 
 def _encoded(lines: list[str]) -> bytes:

@@ -1,0 +1,96 @@
+"""Volumes whose voxels are labels, and what the labels mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.volume import Volume
+
+LABEL_TYPES = ("uint8", "uint16")
+"""Types that labels may have; 0 is the background, which has no segment."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What one label means.
+
+    Parameters
+    ----------
+    value : int
+        The label, above zero.
+    name : str
+        What a person reads.
+    colour : tuple of float
+        Red, green and blue, 0 to 1.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the argument that is not what it must be.
+    """
+
+    value: int
+    name: str
+    colour: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not 0 < self.value < 2**16:
+            raise InvalidInputError(f"segment: expected a label from 1 to 65535, got {self.value}")
+        if not self.name.strip():
+            raise InvalidInputError(f"segment {self.value}: expected a name, got {self.name!r}")
+        colour = tuple(float(part) for part in self.colour)
+        if len(colour) != 3 or not all(0 <= part <= 1 for part in colour):
+            raise InvalidInputError(f"segment {self.value}: expected a colour of three parts, got {colour}")
+        object.__setattr__(self, "colour", colour)
+
+
+STATE_SEGMENTS = (
+    Segment(1, "measured", (0.25, 0.75, 0.35)),
+    Segment(2, "filled", (0.95, 0.65, 0.15)),
+)
+"""Of voxels by how they came to their value; those that are empty have label 0."""
+
+
+@dataclass(frozen=True)
+class LabelMap(Volume):
+    """Labels on a regular grid, uint8 or uint16.
+
+    Parameters
+    ----------
+    segments : tuple of Segment
+        What labels mean; one that has no segment means nothing.
+
+    Raises
+    ------
+    InvalidInputError
+        If voxels are of another type, or two segments have one label.
+
+    Examples
+    --------
+    >>> from scipy.spatial.transform import RigidTransform
+    >>> state = np.zeros((4, 3, 2), np.uint8)
+    >>> labels = LabelMap(state, (0.5, 0.5, 0.5), RigidTransform.identity(), {}, STATE_SEGMENTS)
+    >>> [segment.name for segment in labels.segments]
+    ['measured', 'filled']
+    """
+
+    segments: tuple[Segment, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_segments(self.voxels.dtype, self.segments)
+
+
+def require_segments(dtype: np.dtype[np.generic], segments: tuple[Segment, ...]) -> None:
+    """Raise `InvalidInputError` unless labels of a type can have these segments."""
+    if dtype.name not in LABEL_TYPES:
+        raise InvalidInputError(f"labels: expected {' or '.join(LABEL_TYPES)}, got {dtype}")
+    values = [segment.value for segment in segments]
+    if len({*values}) != len(values):
+        raise InvalidInputError(f"segments: expected one for each label, got labels {values}")
+    most = np.iinfo(dtype.name).max
+    if values and max(values) > most:
+        raise InvalidInputError(f"segments: expected labels up to {most} of {dtype}, got {max(values)}")

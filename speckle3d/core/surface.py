@@ -1,0 +1,125 @@
+"""A surface: triangles in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles whose corners, seen from outside, go round against the clock.
+
+    Parameters
+    ----------
+    vertices_mm : ndarray, shape (n, 3)
+        In the world.
+    triangles : ndarray of int, shape (m, 3)
+        Vertices of each.
+    fields : mapping of str to str
+        What is said of the surface beside its shape.
+
+    Examples
+    --------
+    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    >>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    >>> round(Surface(corners, faces).volume_mm3, 6)
+    0.166667
+    """
+
+    vertices_mm: FloatArray
+    triangles: IntArray
+    fields: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        for name, shape in (
+            ("vertices_mm", np.shape(self.vertices_mm)),
+            ("triangles", np.shape(self.triangles)),
+        ):
+            if len(shape) != 2 or shape[1] != 3:
+                raise InvalidInputError(f"{name}: expected shape (n, 3), got {shape}")
+        if not np.isfinite(self.vertices_mm).all():
+            raise InvalidInputError("vertices_mm: expected finite values, got others")
+        if len(self.triangles) and not (
+            self.triangles.min() >= 0 and self.triangles.max() < len(self.vertices_mm)
+        ):
+            raise InvalidInputError(f"triangles: expected vertices 0 to {len(self.vertices_mm) - 1}")
+
+    def __len__(self) -> int:
+        """Number of triangles."""
+        return len(self.triangles)
+
+    @property
+    def normals_mm2(self) -> FloatArray:
+        """Outward normal of each triangle, as long as its area, shape (m, 3)."""
+        a, b, c = (self.vertices_mm[self.triangles[:, corner]] for corner in range(3))
+        return np.asarray(np.cross(b - a, c - a) / 2)
+
+    @property
+    def normals(self) -> FloatArray:
+        """Outward unit normal of each triangle, shape (m, 3); zero where it has no area."""
+        normals = self.normals_mm2
+        return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300))
+
+    @property
+    def area_mm2(self) -> float:
+        """Area of all triangles."""
+        return float(np.linalg.norm(self.normals_mm2, axis=1).sum())
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume inside, less that of cavities; of an open surface it means nothing."""
+        middles = self.vertices_mm[self.triangles].sum(axis=1) / 3.0 - self.vertices_mm.mean(axis=0)
+        return float((self.normals_mm2 * middles).sum() / 3.0)
+
+    def volume_gradient(self) -> FloatArray:
+        """Derivative of the volume with respect to each vertex, shape (n, 3), mm2."""
+        return self._spread(np.repeat(self.normals_mm2[:, None] / 3.0, 3, axis=1))
+
+    def area_gradient(self) -> FloatArray:
+        """Derivative of the area with respect to each vertex, shape (n, 3), mm."""
+        corners = self.vertices_mm[self.triangles]
+        opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+        return self._spread(np.cross(self.normals[:, None], opposite) / 2.0)
+
+    def open_edges(self) -> IntArray:
+        """Edges that only one triangle has, vertices of each, shape (e, 2): the border of an open surface."""
+        edges = np.sort(self._edges(), axis=1)
+        _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
+        return np.asarray(edges[first[count == 1]])
+
+    def parts(self) -> IntArray:
+        """Number, from 0, of the connected part that each triangle belongs to, shape (m,)."""
+        n, edges = len(self.vertices_mm), self._edges()
+        graph = coo_array((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
+        _, part = connected_components(graph, directed=False)
+        return np.unique(part[self.triangles[:, 0]], return_inverse=True)[1].astype(np.int64)
+
+    def of_triangles(self, chosen: IntArray | BoolArray) -> Surface:
+        """Only some of the triangles (numbers, or a mask), with only their vertices."""
+        triangles = self.triangles[chosen]
+        kept, renumbered = np.unique(triangles, return_inverse=True)
+        return Surface(self.vertices_mm[kept], renumbered.reshape(-1, 3).astype(np.int64), self.fields)
+
+    def _edges(self) -> IntArray:
+        """Edges of all triangles, round each, shape (3 m, 2)."""
+        return np.concatenate(
+            [self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]]
+        )
+
+    def _spread(self, of_corners: FloatArray) -> FloatArray:
+        """Sum of what each triangle gives to its corners, shape (m, 3, 3) to (n, 3)."""
+        total = np.zeros_like(self.vertices_mm, dtype=float)
+        for axis in range(3):
+            total[:, axis] = np.bincount(
+                self.triangles.ravel(), of_corners[..., axis].ravel(), len(self.vertices_mm)
+            )
+        return total

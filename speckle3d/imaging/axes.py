@@ -1,0 +1,128 @@
+"""Directions for voxels: the images' mean lateral, axial and elevational, or those of the smallest box."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import fmin
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.grid import image_corners
+from speckle3d.imaging.images import require_poses
+
+_LEAST_COMMON = 0.5
+"""Length of a mean of unit vectors that makes it a direction: as of a spread of 110 degrees either way."""
+
+_STARTS = Rotation.from_rotvec(0.4 * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]))
+"""Turns from which the smallest box is looked for, since it is not the only minimum."""
+_SIMPLEX = np.vstack([np.zeros(3), 0.15 * np.eye(3)])
+"""Turns with which each search begins, rad."""
+
+
+def sweep_axes(world_from_image: RigidTransform) -> Rotation:
+    """Mean orientation of a sweep's images: axes that are lateral, axial and elevational.
+
+    Images of a probe that was turned about its depth axis between two passes count as turned back: lateral
+    and elevational are those of the first image.
+
+    Parameters
+    ----------
+    world_from_image : RigidTransform, length n
+
+    Raises
+    ------
+    InsufficientDataError
+        If the images have no lateral, axial or elevational direction in common, as when the probe turned
+        through half a circle.
+    InvalidInputError
+        If there are no poses.
+
+    References
+    ----------
+    .. [1] F. L. Markley et al., "Averaging quaternions", J. Guidance, Control, and Dynamics, 2007.
+    """
+    require_poses(world_from_image)
+    images = world_from_image.rotation
+    matrices = images.as_matrix()
+    lateral, elevational = (matrices[:, :, axis] @ _line_along(matrices[:, :, axis]) for axis in (0, 2))
+    half_turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
+    turned = (lateral < 0) & (elevational < 0)
+    facing = Rotation.concatenate([images[~turned], images[turned] * half_turn])
+    common = np.linalg.norm(facing.as_matrix().mean(axis=0), axis=0)
+    if common.min() < _LEAST_COMMON:
+        which = ("lateral", "axial", "elevational")[int(common.argmin())]
+        raise InsufficientDataError(
+            f"the images have no {which} direction in common: expected one sweep, or axes as asked for"
+        )
+    return facing.mean()
+
+
+def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotation:
+    """Axes of the smallest box around a sweep's images, nearest to lateral, axial and elevational.
+
+    The volume of the box is minimised from several orientations. Unless another is smaller by 0.01 %, it is
+    `sweep_axes`, then the world's axes.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+
+    Returns
+    -------
+    Rotation
+        World from the box's axes, right-handed: i is nearest to lateral, j to axial, k to elevational, of the
+        mean image or, where the images have no mean, of the first.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are no poses.
+    """
+    points = _extreme_points(image_corners(grid, world_from_image))
+    try:
+        lateral_first = sweep_axes(world_from_image)
+    except InsufficientDataError:
+        lateral_first = world_from_image[0].rotation
+    # A sheet has no volume: a sample's width more on all sides makes of two sheets the smaller one.
+    skin = min(grid.vector_pitch_mm, grid.sample_spacing_mm)
+
+    def log_volume(turn_rad: FloatArray, start: Rotation) -> float:
+        axes = start * Rotation.from_rotvec(turn_rad)
+        return float(np.log(np.ptp(points @ axes.as_matrix(), axis=0) + skin).sum())
+
+    def smallest_near(start: Rotation) -> Rotation:
+        turn = fmin(log_volume, np.zeros(3), (start,), 1e-6, 1e-6, initial_simplex=_SIMPLEX, disp=False)
+        return start * Rotation.from_rotvec(turn)
+
+    found = [lateral_first, Rotation.identity()]
+    starts = (*found, _spread_axes(points), *(lateral_first * turn for turn in _STARTS))
+    found += [smallest_near(start) for start in starts]
+    volume = np.array([log_volume(np.zeros(3), axes) for axes in found])
+    smallest = found[int(np.flatnonzero(volume <= volume.min() + 1e-4)[0])]
+    alike = smallest * Rotation.create_group("O")
+    return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
+
+
+def _line_along(directions: FloatArray) -> FloatArray:
+    """Line that directions, shape (n, 3), lie along best, whichever way they point; as the first points."""
+    line = np.asarray(np.linalg.eigh(directions.T @ directions)[1][:, -1], dtype=float)
+    return line if directions[0] @ line >= 0 else -line
+
+
+def _extreme_points(points: FloatArray) -> FloatArray:
+    """Corners of the convex hull; all points if they lie in a plane."""
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:
+        return points
+
+
+def _spread_axes(points: FloatArray) -> Rotation:
+    """Axes along which points spread most, and least."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2].T
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    return Rotation.from_matrix(axes)

@@ -1,0 +1,99 @@
+"""Which frames a point of the world belongs to: the two on either side of it, as reslices blend them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.pose_errors import Belonging
+from speckle3d.core.sweep import ImageGrid
+
+_AT_ONCE = 2**22
+"""Points times frames worked on at a time: some 100 MB."""
+
+
+def belonging_of(
+    points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform, margin_mm: float = 1e-6
+) -> Belonging:
+    """Find the frame nearest to each point, and its neighbour on the point's other side.
+
+    Nearest is the frame with the least distance to its plane, among those into whose image, grown by
+    `margin_mm` on all sides, the point projects; if there is none, among all. The neighbour is the frame
+    before or after it on whose other side the point lies; weights are as the distances to the planes have it.
+    Past the last frame the nearest counts alone.
+
+    Parameters
+    ----------
+    points_mm : ndarray, shape (k, 3)
+        In the world.
+    world_from_image : RigidTransform, length n
+
+    Returns
+    -------
+    Belonging
+        ``gap_mm`` is infinite for points that project into no image.
+    """
+    points = np.asarray(points_mm, dtype=float).reshape(-1, 3)
+    frames = np.zeros((len(points), 2), dtype=np.int64)
+    weights, gap = np.tile([1.0, 0.0], (len(points), 1)), np.full(len(points), np.inf)
+    image_from_world = world_from_image.inv().as_matrix()
+    rows = max(_AT_ONCE // len(world_from_image), 1)
+    for first in range(0, len(points), rows):
+        some = slice(first, first + rows)
+        _place(points[some], image_from_world, grid, margin_mm, frames[some], weights[some], gap[some])
+    return Belonging(frames, weights, gap)
+
+
+def require_inside(
+    points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform, reach_mm: float = 0.5
+) -> Belonging:
+    """Find frames of points inside the sweep: in an image, and between frames or within `reach_mm` of one.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first point that lies outside.
+    """
+    found = belonging_of(points_mm, grid, world_from_image)
+    outside = np.flatnonzero((found.gap_mm > reach_mm) & (found.weights[:, 1] == 0.0))
+    if outside.size:
+        row = int(outside[0])
+        x, y, z = points_mm[row]
+        near = found.gap_mm[row]
+        words = "in no frame's image" if np.isinf(near) else f"{near:.2f} mm past the nearest frame"
+        raise InvalidInputError(
+            f"point {row + 1} ({x:g}, {y:g}, {z:g}): expected a point inside the sweep, got one {words}"
+        )
+    return found
+
+
+def _place(
+    points: FloatArray,
+    image_from_world: FloatArray,
+    grid: ImageGrid,
+    margin_mm: float,
+    frames: IntArray,
+    weights: FloatArray,
+    gap: FloatArray,
+) -> None:
+    """Fill the rows of some points."""
+    q = points @ image_from_world[:, 2, :3].T + image_from_world[:, 2, 3]
+    away = np.abs(q)
+    anywhere = away.argmin(axis=1)
+    for axis, (low, high) in enumerate(((0.0, grid.width_mm), (grid.first_sample_depth_mm, grid.depth_mm))):
+        at = points @ image_from_world[:, axis, :3].T + image_from_world[:, axis, 3]
+        away[(at < low - margin_mm) | (at > high + margin_mm)] = np.inf
+    row, best = np.arange(len(points)), away.argmin(axis=1)
+    gap[:] = away[row, best]
+    best = np.where(np.isinf(gap), anywhere, best)
+    frames[:, 0], own = best, q[row, best]
+    for step in (-1, 1):
+        other = np.clip(best + step, 0, q.shape[1] - 1)
+        across = (own * q[row, other] < 0) & (other != best)
+        share = np.abs(own) / np.maximum(np.abs(own) + np.abs(q[row, other]), 1e-12)
+        # Of two neighbours on the other side, where the probe turns back, the nearer.
+        across &= (weights[:, 1] == 0.0) | (share > weights[:, 1])
+        frames[across, 1] = other[across]
+        weights[across] = np.column_stack([1.0 - share, share])[across]

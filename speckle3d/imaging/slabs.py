@@ -1,0 +1,126 @@
+"""Volumes made in slabs of planes: larger than memory, and the same whatever the slabs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.imaging.grid import Slab, VoxelGrid
+from speckle3d.imaging.holes import EMPTY, fill_holes
+from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.settings import CompoundingSettings, VoxelType
+from speckle3d.imaging.splatting import Placed, Weights, bytes_per_voxel, splat_block
+
+_BATCH_GB = 0.1
+"""Frames in hand."""
+_LEAST_PLANES = 8
+"""Thinner slabs read frames too often, and work more on their neighbours' planes than on their own."""
+
+
+def compound_slabs(
+    source: PosedImages,
+    voxel_grid: VoxelGrid,
+    settings: CompoundingSettings | None = None,
+    weights: Weights | None = None,
+    region: BoolArray | None = None,
+) -> Iterator[Slab]:
+    """Compound images into voxels, a slab of planes along k at a time.
+
+    Joined slabs equal the whole to the last bit, whatever the memory and the number of threads. Each slab
+    reads the frames that touch it.
+
+    Parameters
+    ----------
+    source : PosedImages
+    voxel_grid : VoxelGrid
+    settings : CompoundingSettings, optional
+        `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have them.
+    weights : ndarray of shape (n,), or images of weights, optional
+        For the rule "weighted"; samples whose weight is 0 or NaN do not count.
+    region : ndarray of bool, shape (vector, sample), optional
+        Samples that count; by default all.
+
+    Yields
+    ------
+    Slab
+        In order along k.
+
+    Raises
+    ------
+    InvalidInputError
+        If the volume is larger than `max_file_gb`, not even a thin slab fits into `max_memory_gb`, or an
+        input is not what it must be.
+    """
+    chosen = settings or CompoundingSettings()
+    if (size := voxel_grid.size_gb(chosen.voxel_type)) > chosen.max_file_gb:
+        raise InvalidInputError(
+            f"volume: expected at most {chosen.max_file_gb:g} GB, got {size:.3g} GB for {voxel_grid}: take "
+            "larger voxels, or check the poses"
+        )
+    placed = Placed.on(voxel_grid, source, weights, region)
+    planes = planes_per_slab(voxel_grid, chosen)
+    for first in range(0, voxel_grid.shape[2], planes):
+        yield _slab(placed, voxel_grid, chosen, first, min(first + planes, voxel_grid.shape[2]))
+
+
+def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> int:
+    """Planes of one slab, so that work on it stays within `max_memory_gb`.
+
+    Raises
+    ------
+    InvalidInputError
+        If less than a thin slab would.
+    """
+    n_i, n_j, n_k = voxel_grid.shape
+    around, most = 2 * settings.fill_radius, settings.max_memory_gb
+    if working_gb(voxel_grid, settings) <= most:
+        return n_k
+    plane_gb = _plane_gb(voxel_grid, settings)
+    planes = int((most - _BATCH_GB) / plane_gb) - around
+    if planes < min(_LEAST_PLANES, n_k):
+        needed = (min(_LEAST_PLANES, n_k) + around) * plane_gb + _BATCH_GB
+        raise InvalidInputError(
+            f"volume: expected to work within {most:g} GB of memory, but a slab of {n_i} x {n_j} voxels "
+            f"takes {needed:.3g} GB: take larger voxels, or allow more memory"
+        )
+    # Slabs of nearly one size: none at the end that is worth little.
+    return -(-n_k // -(-n_k // planes))
+
+
+def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
+    """Memory to make all of a volume at once, the volume included, GB."""
+    return voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + _BATCH_GB
+
+
+def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
+    size = np.dtype(settings.voxel_type).itemsize
+    n_i, n_j, _ = voxel_grid.shape
+    return n_i * n_j * (bytes_per_voxel(settings.splat, settings.rule) + size) / 1e9
+
+
+def _slab(
+    placed: Placed, voxel_grid: VoxelGrid, settings: CompoundingSettings, first: int, stop: int
+) -> Slab:
+    below = max(first - settings.fill_radius, 0)
+    above = min(stop + settings.fill_radius, voxel_grid.shape[2])
+    voxels, state = splat_block(placed, voxel_grid, settings.splat, settings.rule, below, above)
+    fill_holes(voxels, state, settings.fill_radius, first - below, stop - below)
+    own = slice(first - below, stop - below)
+    return Slab(first, as_type(voxels[own], state[own], settings.voxel_type), state[own])
+
+
+def as_type(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:
+    """Voxels rounded and clipped to a type, empty ones 0; as they are in float32, with NaN for empty."""
+    if voxel_type == "float32":
+        return voxels
+    limits = np.iinfo(voxel_type)
+    out = np.empty(voxels.shape, voxel_type)
+    for plane, (levels, marks) in enumerate(zip(voxels, state, strict=True)):
+        whole = np.clip(np.rint(levels), limits.min, limits.max)
+        out[plane] = np.where(marks == EMPTY, np.float32(0), whole)
+    return out

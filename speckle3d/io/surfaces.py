@@ -1,0 +1,113 @@
+"""Surfaces as STL, PLY or VTK files, by meshio; headers say that axes are LPS, as 3D Slicer reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.files import PathLike
+from speckle3d.core.surface import Surface
+from speckle3d.io.hdf5 import atomic_path, one_line, reading
+
+SUFFIXES = (".stl", ".ply", ".vtk")
+SPACE = "SPACE=LPS"
+"""What 3D Slicer looks for in the header of STL and VTK, and among the comments of PLY."""
+_STL_HEADER_BYTES = 80
+
+
+def write_surface(path: PathLike, surface: Surface) -> None:
+    """Write a surface whole or not at all, binary; the suffix chooses the format.
+
+    Coordinates are the world's, mm, as float32; STL has no vertices in common between triangles. VTK is the
+    legacy format, version 4.2, which older readers know, too.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is not one of `SUFFIXES`, or there is no triangle.
+    FileError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_surface(f"{folder}/s.ply", Surface(corners, np.array([[0, 1, 2]])))
+    ...     len(read_surface(f"{folder}/s.ply"))
+    1
+    """
+    suffix = require_suffix(path)
+    if not len(surface):
+        raise InvalidInputError(f"{path}: expected a surface of at least one triangle, got none")
+    import meshio
+
+    points, triangles = surface.vertices_mm.astype(np.float32), surface.triangles.astype(np.int32)
+    mesh = meshio.Mesh(points, [("triangle", triangles)])
+    if suffix == ".stl":
+        mesh.cell_data["facet_normals"] = [surface.normals.astype(np.float32)]
+    with atomic_path(path) as part:
+        if suffix == ".stl":
+            meshio.stl.write(part, mesh, binary=True)
+            _say_in_stl(part)
+        elif suffix == ".ply":
+            meshio.ply.write(part, mesh, binary=True)
+            _replace_line(part, b"comment ", f"comment {SPACE}")
+        else:
+            meshio.vtk.write(part, mesh, fmt_version="4.2", binary=True)
+            _replace_line(part, b"written by ", f"speckle3d surface. {SPACE}")
+
+
+def read_surface(path: PathLike) -> Surface:
+    """Read a surface of triangles.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, truncated or not of the format that its suffix says.
+    InvalidInputError
+        If the suffix is not one of `SUFFIXES`, or the file holds no triangles.
+    """
+    suffix = require_suffix(path)
+    with reading(path), open(path, "rb"):
+        pass
+    import meshio
+
+    read: Callable[[Any], Any] = {".stl": meshio.stl.read, ".ply": meshio.ply.read, ".vtk": meshio.vtk.read}[
+        suffix
+    ]
+    try:
+        mesh = read(Path(path))
+        triangles = [block.data for block in mesh.cells if block.type == "triangle"]
+    # A damaged file shows in whatever meshio happens to stumble over.
+    except Exception as error:
+        raise FileError(f"{path}: cannot be read as {suffix[1:].upper()}: {one_line(error)}") from error
+    if not triangles:
+        raise InvalidInputError(f"{path}: expected triangles, got none")
+    with naming(str(path)):
+        return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
+
+
+def require_suffix(path: PathLike) -> str:
+    """Suffix of a surface's file, or an `InvalidInputError`."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
+    return suffix
+
+
+def _say_in_stl(part: Path) -> None:
+    """Put the world's axes into the header, which must not begin as a text file does."""
+    with part.open("r+b") as file:
+        file.write(f"speckle3d surface. {SPACE}".encode().ljust(_STL_HEADER_BYTES))
+
+
+def _replace_line(part: Path, begins: bytes, line: str) -> None:
+    """Replace the first line that begins so; what is behind it is binary."""
+    held = part.read_bytes()
+    start = held.index(begins)
+    part.write_bytes(held[:start] + line.encode() + held[held.index(b"\n", start) :])

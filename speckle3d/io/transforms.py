@@ -1,0 +1,123 @@
+"""Poses as ITK transform files, which 3D Slicer reads: text (.tfm) or HDF5 (.h5).
+
+ITK's files hold what takes points of the parent to those of the child, as for resampling [1]_; Slicer shows
+its inverse as the node's "transform to parent". So what is written is `world_from_image`'s inverse, in axes
+that lead left, posterior and superior, mm. A node with that transform has image coordinates of P below it.
+
+References
+----------
+.. [1] 3D Slicer user guide, "Transforms", section "ITK transform files".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.files import PathLike
+from speckle3d.core.parts import DiskFile
+from speckle3d.io.fileset import FileSet
+from speckle3d.io.hdf5 import atomic_path
+
+SUFFIXES = (".tfm", ".h5")
+
+_TYPE = "AffineTransform_double_3_3"
+"""Rigid, but of the type that all of ITK's readers know."""
+
+
+def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
+    """Write one pose as a transform of ITK; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        With a suffix of `SUFFIXES`.
+    world_from_image : RigidTransform
+        A single pose; its world's axes lead left, posterior and superior; mm.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is another, or the pose is a row of poses: Slicer reads one transform of a file.
+    FileError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_transform(f"{folder}/t.tfm", RigidTransform.from_translation([1.0, 2.0, 3.0]))
+    ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
+    Parameters: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0 -1.0 -2.0 -3.0
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InvalidInputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}, got {suffix!r}")
+    if not world_from_image.single:
+        raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
+    parameters = _parameters(world_from_image.inv())
+    with atomic_path(path) as part:
+        if suffix == ".tfm":
+            part.write_text(_text(parameters), encoding="ascii")
+        else:
+            _write_hdf5(part, parameters)
+
+
+def write_transforms(path: PathLike, world_from_image: RigidTransform) -> None:
+    """Write a row of poses, each into a file of its own: all of them appear, or none.
+
+    Parameters
+    ----------
+    path : path
+        As of `write_transform`; names are as in `transform_paths`.
+    world_from_image : RigidTransform, length n
+
+    Raises
+    ------
+    InvalidInputError, FileError
+        As `write_transform` does.
+    """
+    first, *others = (each.name for each in transform_paths(path, len(world_from_image)))
+    with FileSet(first, tuple(others)).replaced(Path(path).parent) as part:
+        for name, pose in zip((first, *others), world_from_image, strict=True):
+            write_transform(part / name, pose)
+
+
+def transform_paths(path: PathLike, count: int) -> list[Path]:
+    """Files of a row of poses: the path with the frame's number behind its stem, as poses-0000.tfm."""
+    given = Path(path)
+    return [given.with_name(f"{given.stem}-{i:04d}{given.suffix}") for i in range(count)]
+
+
+def _parameters(image_from_world: RigidTransform) -> FloatArray:
+    """Matrix, row by row, and translation, shape (12,)."""
+    matrix = image_from_world.as_matrix()
+    # No number is a negative zero.
+    return np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3])) + 0.0
+
+
+def _text(parameters: FloatArray) -> str:
+    lines = (
+        "#Insight Transform File V1.0",
+        "#Transform 0",
+        f"Transform: {_TYPE}",
+        f"Parameters: {' '.join(map(repr, parameters.tolist()))}",
+        "FixedParameters: 0 0 0",
+    )
+    return "\n".join(lines) + "\n"
+
+
+def _write_hdf5(part: Path, parameters: FloatArray) -> None:
+    with DiskFile(part) as disk, h5py.File(disk, "w") as file:
+        text = h5py.string_dtype("ascii")
+        for name, value in (("ITKVersion", "5.4"), ("HDFVersion", h5py.version.hdf5_version)):
+            file.create_dataset(name, data=[value], dtype=text)
+        group = file.create_group("TransformGroup/0")
+        group.create_dataset("TransformType", data=[_TYPE], dtype=text)
+        group["TransformParameters"] = parameters
+        group["TransformFixedParameters"] = np.zeros(3)

@@ -1,0 +1,371 @@
+"""Samples of frames given to the voxels that they lie in, or to the eight around them.
+
+Positions are whole numbers of 2^-40 voxel, so that stepping along a line adds no error and a part of the
+voxels gets exactly what it gets as part of all. Lines are cut to the voxels wanted before they are walked.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+
+POSITION_BITS = 40
+"""Bits of a position behind the point; 23 before it and a sign."""
+SHARE_BITS = 10
+"""Bits behind the point of a position between eight voxels."""
+COUNT_BITS = 40
+"""Where a voxel's number of samples begins in the word that also holds their sum."""
+
+_ONE_SAMPLE = np.uint64(1 << COUNT_BITS)
+_WHOLE = 1 << POSITION_BITS
+_DROPPED = POSITION_BITS - SHARE_BITS
+_SHARE = 1.0 / (1 << SHARE_BITS)
+_SHARES = (1 << SHARE_BITS) - 1
+_LEAST_SHARE = 0.125
+
+Numbers = npt.NDArray[Any]
+Words = npt.NDArray[np.uint64]
+Tags = npt.NDArray[np.uint32]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _cut(start: int, stop: int, at: int, step: int, low: int, high: int) -> tuple[int, int]:
+    """Samples of a range whose position ``at + sample * step`` is at least `low` and below `high`."""
+    first, last = at + start * step, at + (stop - 1) * step
+    if min(first, last) >= low and max(first, last) < high:
+        return start, stop
+    if max(first, last) < low or min(first, last) >= high:
+        return start, start
+    if step < 0:
+        # Seen from the other side, where the last position inside is the first.
+        at, step, low, high = -at, -step, 1 - high, 1 - low
+    return max(start, -((at - low) // step)), min(stop, -((at - high) // step))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _cut_to_box(
+    span: IntArray, m: IntArray, box: IntArray, reach: int
+) -> tuple[int, int, int, int, int, int]:
+    """Part of a span of samples inside a box: its line, first and end, and where its first lies."""
+    line, start, stop = span[0], span[1], span[2]
+    x, y, z = m[0, 0] * line + m[0, 2], m[1, 0] * line + m[1, 2], m[2, 0] * line + m[2, 2]
+    start, stop = _cut(start, stop, x, m[0, 1], (box[0, 0] - reach) * _WHOLE, box[0, 1] * _WHOLE)
+    if start < stop:
+        start, stop = _cut(start, stop, y, m[1, 1], (box[1, 0] - reach) * _WHOLE, box[1, 1] * _WHOLE)
+    if start < stop:
+        start, stop = _cut(start, stop, z, m[2, 1], (box[2, 0] - reach) * _WHOLE, box[2, 1] * _WHOLE)
+    return line, start, stop, x + start * m[0, 1], y + start * m[1, 1], z + start * m[2, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
+    """Whether a position is in a voxel, or between the same eight."""
+    return (((x >> POSITION_BITS) ^ i) | ((y >> POSITION_BITS) ^ j) | ((z >> POSITION_BITS) ^ k)) == 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def count_nearest(
+    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, offset: int, table: Words
+) -> None:
+    """Add whole levels of several images to the voxels that their samples lie in.
+
+    Parameters
+    ----------
+    images : ndarray of integers, shape (n, line, sample)
+    maps : ndarray, shape (n, 3, 3)
+        From (line, sample, 1) to positions (i, j, k) in units of 2^-40 voxel; voxel n reaches from n to n + 1
+        whole ones.
+    spans : ndarray, shape (m, 3)
+        Line, first sample and end of what is used of every image.
+    box : ndarray, shape (3, 2)
+        First voxel and end along i, j and k; others are left alone.
+    offset : int
+        Added to each level, so that none is below zero.
+    table : ndarray, shape (n_k, n_j, n_i), changed in place
+        Sum of levels in the lower 40 bits, number of samples above.
+    """
+    n_j, n_i = table.shape[1:]
+    words = table.reshape(-1)
+    for n in range(images.shape[0]):
+        m = maps[n]
+        dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
+        for span in range(spans.shape[0]):
+            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            if start >= stop:
+                continue
+            # Several samples in a row lie in one voxel: memory is touched when it changes.
+            held = np.uint64(0)
+            at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
+            for sample in range(start, stop):
+                here = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
+                if here != at:
+                    words[at] += held
+                    at, held = here, np.uint64(0)
+                held += _ONE_SAMPLE + np.uint64(np.int64(images[n, line, sample]) + offset)
+                x, y, z = x + dx, y + dy, z + dz
+            words[at] += held
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def add_nearest(
+    images: Numbers,
+    weights: Float32Array,
+    maps: IntArray,
+    spans: IntArray,
+    box: IntArray,
+    first_tag: int,
+    table: FloatArray,
+    tags: Tags,
+) -> None:
+    """Add weighted levels of several images to the voxels that their samples lie in.
+
+    Parameters
+    ----------
+    images : ndarray, shape (n, line, sample)
+        NaN does not count.
+    weights : ndarray, shape (n, line, sample)
+        Samples whose weight is not above zero do not count.
+    maps, spans, box
+        As for `count_nearest`.
+    first_tag : int
+        With 0 all images count; else the last that has a sample in a voxel: this is the first one's tag, and
+        the others' follow.
+    table : ndarray, shape (n_k, n_j, n_i, 2), changed in place
+        Sum of weighted levels, and of weights.
+    tags : ndarray, shape (n_k, n_j, n_i), changed in place
+        Tag of the image that a voxel's sum is of; not read without tags.
+    """
+    n_j, n_i = table.shape[1:3]
+    sums, marks = table.reshape(-1, 2), tags.reshape(-1)
+    for n in range(images.shape[0]):
+        m = maps[n]
+        tag = first_tag + n if first_tag > 0 else 0
+        dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
+        for span in range(spans.shape[0]):
+            line, sample, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            while sample < stop:
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                total, weight = 0.0, 0.0
+                inside = True
+                while inside:
+                    level, share = float(images[n, line, sample]), float(weights[n, line, sample])
+                    if level == level and share > 0.0:
+                        total += share * level
+                        weight += share
+                    x, y, z, sample = x + dx, y + dy, z + dz, sample + 1
+                    inside = sample < stop and _same_cell(x, y, z, i, j, k)
+                at = np.uint64((k * n_j + j) * n_i + i)
+                if weight > 0.0 and tag > 0 and marks[at] != tag:
+                    marks[at] = tag
+                    sums[at, 0], sums[at, 1] = 0.0, 0.0
+                sums[at, 0] += total
+                sums[at, 1] += weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def raise_nearest(
+    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, table: Float32Array
+) -> None:
+    """Raise voxels to the largest level of the samples that lie in them.
+
+    Parameters
+    ----------
+    images, maps, spans, box
+        As for `add_nearest`.
+    table : ndarray, shape (n_k, n_j, n_i), changed in place
+        NaN where no sample was.
+    """
+    n_j, n_i = table.shape[1:]
+    levels = table.reshape(-1)
+    for n in range(images.shape[0]):
+        m = maps[n]
+        for span in range(spans.shape[0]):
+            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            for sample in range(start, stop):
+                at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
+                level = np.float32(images[n, line, sample])
+                if level == level and not levels[at] >= level:
+                    levels[at] = level
+                x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _fraction(x: int) -> float:
+    """How far a position is from the voxel below to the one above."""
+    return (x >> _DROPPED & _SHARES) * _SHARE
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _large(share: float) -> float:
+    """Drop a share that is too small to count."""
+    return share if share >= _LEAST_SHARE else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def add_linear(
+    images: Numbers,
+    weights: Float32Array,
+    maps: IntArray,
+    spans: IntArray,
+    box: IntArray,
+    first_tag: int,
+    table: FloatArray,
+    tags: Tags,
+) -> None:
+    """Share weighted levels of several images out to the eight voxel centres around each sample.
+
+    Parameters
+    ----------
+    images, weights, spans, box, table, tags
+        As for `add_nearest`.
+    maps : ndarray, shape (n, 3, 3)
+        As for `add_nearest`, but the centre of voxel n is n, and positions are half of 2^-10 voxel ahead:
+        shares are of positions rounded to 2^-10 voxel.
+    first_tag : int
+        As for `add_nearest`; with tags, shares below 1/8 do not count.
+    """
+    n_j, n_i = table.shape[1:3]
+    row, plane, one = np.uint64(n_i), np.uint64(n_j * n_i), np.uint64(1)
+    sums, marks = table.reshape(-1, 2), tags.reshape(-1)
+    low_i, low_j, low_k = box[0, 0], box[1, 0], box[2, 0]
+    last_i, last_j, last_k = box[0, 1] - 1, box[1, 1] - 1, box[2, 1] - 1
+    for n in range(images.shape[0]):
+        m = maps[n]
+        tag = first_tag + n if first_tag > 0 else 0
+        dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
+        for span in range(spans.shape[0]):
+            line, sample, stop, x, y, z = _cut_to_box(spans[span], m, box, 1)
+            while sample < stop:
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                # Sums of samples in a row between the same eight voxels, x fastest, in registers: arrays or
+                # tuples take several times as long.
+                t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
+                w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = 0.0
+                inside = True
+                while inside:
+                    level, share = float(images[n, line, sample]), float(weights[n, line, sample])
+                    if level == level and share > 0.0:
+                        fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
+                        gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
+                        a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
+                        s0, s1, s2, s3 = gx * a, fx * a, gx * b, fx * b
+                        s4, s5, s6, s7 = gx * c, fx * c, gx * d, fx * d
+                        if tag > 0:
+                            s0, s1, s2, s3 = _large(s0), _large(s1), _large(s2), _large(s3)
+                            s4, s5, s6, s7 = _large(s4), _large(s5), _large(s6), _large(s7)
+                        w0, w1, w2, w3 = w0 + share * s0, w1 + share * s1, w2 + share * s2, w3 + share * s3
+                        w4, w5, w6, w7 = w4 + share * s4, w5 + share * s5, w6 + share * s6, w7 + share * s7
+                        level *= share
+                        t0, t1, t2, t3 = t0 + level * s0, t1 + level * s1, t2 + level * s2, t3 + level * s3
+                        t4, t5, t6, t7 = t4 + level * s4, t5 + level * s5, t6 + level * s6, t7 + level * s7
+                    x, y, z, sample = x + dx, y + dy, z + dz, sample + 1
+                    inside = sample < stop and _same_cell(x, y, z, i, j, k)
+                if tag == 0 and low_i <= i < last_i and low_j <= j < last_j and low_k <= k < last_k:
+                    at = np.uint64((k * n_j + j) * n_i + i)
+                    sums[at, 0] += t0
+                    sums[at, 1] += w0
+                    sums[at + one, 0] += t1
+                    sums[at + one, 1] += w1
+                    at += row
+                    sums[at, 0] += t2
+                    sums[at, 1] += w2
+                    sums[at + one, 0] += t3
+                    sums[at + one, 1] += w3
+                    at += plane
+                    sums[at, 0] += t6
+                    sums[at, 1] += w6
+                    sums[at + one, 0] += t7
+                    sums[at + one, 1] += w7
+                    at -= row
+                    sums[at, 0] += t4
+                    sums[at, 1] += w4
+                    sums[at + one, 0] += t5
+                    sums[at + one, 1] += w5
+                    continue
+                totals, shares = (t0, t1, t2, t3, t4, t5, t6, t7), (w0, w1, w2, w3, w4, w5, w6, w7)
+                for corner in range(8):
+                    u, v, w = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
+                    if (
+                        shares[corner] > 0.0
+                        and low_i <= u <= last_i
+                        and low_j <= v <= last_j
+                        and low_k <= w <= last_k
+                    ):
+                        at = np.uint64((w * n_j + v) * n_i + u)
+                        if tag > 0 and marks[at] != tag:
+                            marks[at] = tag
+                            sums[at, 0], sums[at, 1] = 0.0, 0.0
+                        sums[at, 0] += totals[corner]
+                        sums[at, 1] += shares[corner]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def raise_linear(
+    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, table: Float32Array
+) -> None:
+    """Raise voxels to the largest level of the samples of which they get a share of at least 1/8.
+
+    Parameters
+    ----------
+    images, maps, spans, box
+        As for `add_linear`.
+    table : ndarray, shape (n_k, n_j, n_i), changed in place
+        NaN where no sample was.
+    """
+    for n in range(images.shape[0]):
+        m = maps[n]
+        for span in range(spans.shape[0]):
+            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 1)
+            for sample in range(start, stop):
+                level = np.float32(images[n, line, sample])
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
+                for corner in range(8):
+                    u, v, w = corner & 1, corner >> 1 & 1, corner >> 2
+                    share = (fx if u else 1.0 - fx) * (fy if v else 1.0 - fy) * (fz if w else 1.0 - fz)
+                    if (
+                        share >= _LEAST_SHARE
+                        and box[0, 0] <= i + u < box[0, 1]
+                        and box[1, 0] <= j + v < box[1, 1]
+                        and box[2, 0] <= k + w < box[2, 1]
+                        and level == level
+                        and not table[k + w, j + v, i + u] >= level
+                    ):
+                        table[k + w, j + v, i + u] = level
+                x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def means_of_counts(table: Words, offset: int, voxels: Float32Array, state: npt.NDArray[np.uint8]) -> None:
+    """Turn what `count_nearest` made into means and states.
+
+    Parameters
+    ----------
+    table : ndarray, shape (n_k, n_j, n_i)
+    offset : int
+        What was added to each level.
+    voxels : ndarray, shape (n_k, n_j, n_i), filled in
+        NaN where no sample was.
+    state : ndarray, shape (n_k, n_j, n_i), filled in
+        1 where a sample was, else 0.
+    """
+    words, means, marks = table.reshape(-1), voxels.reshape(-1), state.reshape(-1)
+    for at in range(words.size):
+        count = np.int64(words[at] >> np.uint64(COUNT_BITS))
+        total = np.int64(words[at] & np.uint64((1 << COUNT_BITS) - 1))
+        means[at] = np.float32((total - count * offset) / count)
+        marks[at] = count > 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def means_of_sums(table: FloatArray, voxels: Float32Array, state: npt.NDArray[np.uint8]) -> None:
+    """Turn what `add_nearest` or `add_linear` made into means and states, as for `means_of_counts`."""
+    sums, means, marks = table.reshape(-1, 2), voxels.reshape(-1), state.reshape(-1)
+    for at in range(means.size):
+        means[at] = np.float32(sums[at, 0] / sums[at, 1])
+        marks[at] = sums[at, 1] > 0.0

@@ -1,0 +1,71 @@
+"""Joint errors of the poses of a reconstruction's modes, from what its file claims."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.config import Config, config_from_toml
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.pose_errors import PosedErrors, PoseErrors
+from speckle3d.core.reconstruction import Reconstruction, SharedErrors
+from speckle3d.motion.joint_errors import joint_errors, turn_factors
+from speckle3d.scoring.trajectories import poses_of
+
+
+def posed_errors_of(reconstruction: Reconstruction, mode: str = "image") -> PosedErrors:
+    """Errors of a mode's poses, with these poses; as `errors_of`."""
+    errors = errors_of(reconstruction, mode)
+    return PosedErrors(errors, poses_of(reconstruction, mode), reconstruction.grid.centre_mm)
+
+
+def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors:
+    """Joint errors of the poses of one mode.
+
+    `image`: what the file holds. `crossed`, `inertial`, `fused`: their own claims; the claimed error of the
+    length stretches the whole sweep, and the rest has grown from frame to frame. `orientation`: the images'
+    error of length, with the angles' errors of the sensor, which bend the path. `pose` and `image+subset`
+    claim nothing and are taken to be no better than the images.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Its pairs are not needed.
+    mode : str
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no such mode.
+    InsufficientDataError
+        If the file says nothing about errors, as the oldest do.
+    """
+    poses, trust = poses_of(reconstruction, mode), reconstruction.trust
+    if trust is None:
+        raise InsufficientDataError(
+            "expected a reconstruction that says how far to trust its poses, got an older one: "
+            "make it again (speckle3d reconstruct)"
+        )
+    centre = reconstruction.grid.centre_mm
+    if mode in trust.modes:
+        own = trust.modes[mode]
+        stretched = SharedErrors(0.0, own.length_sigma, np.zeros(2))
+        return joint_errors(own.covariance, poses, centre, stretched)
+    image = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
+    if mode != "orientation":
+        return image
+    config = config_from_toml(reconstruction.config_toml) if reconstruction.config_toml else Config()
+    return _sensed(image, poses, centre, reconstruction.frame_time_s, config)
+
+
+def _sensed(
+    image: PoseErrors, poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, config: Config
+) -> PoseErrors:
+    """Errors of the images' steps, turned by an orientation sensor with errors of its own."""
+    own = config.fused
+    places = image.factors.copy()
+    places[:, :, 3:] = 0.0
+    sigma = np.array([own.inclination_sigma_rad, own.inclination_sigma_rad, own.heading_sigma_rad])
+    turned = turn_factors(sigma, own.wander_s, time_s, poses, centre_mm)
+    return PoseErrors(np.concatenate([places, turned]))

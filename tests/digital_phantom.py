@@ -1,0 +1,110 @@
+"""A phantom known by formula: spheres and a helix, cut by images at known poses.
+
+An image point's grey level follows from its distance to the nearest surface alone, as the share of its pixel
+that lies inside: no voxels, no splatting, and no model of the estimator.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.geometry import rotation_from_fixed_angles
+from speckle3d.core.sweep import ImageGrid
+
+OUTSIDE, INSIDE = 40.0, 200.0
+LEVEL = (OUTSIDE + INSIDE) / 2
+
+
+@dataclass(frozen=True)
+class Ball:
+    centre_mm: tuple[float, float, float]
+    radius_mm: float
+
+    @property
+    def volume_mm3(self):
+        return 4.0 / 3.0 * np.pi * self.radius_mm**3
+
+    @property
+    def area_mm2(self):
+        return 4.0 * np.pi * self.radius_mm**2
+
+    def depth(self, points):
+        """How far inside points are; below zero outside."""
+        return self.radius_mm - np.linalg.norm(points - np.asarray(self.centre_mm), axis=-1)
+
+
+@dataclass(frozen=True)
+class Helix:
+    """A tube round a helix whose axis runs along z."""
+
+    centre_mm: tuple[float, float, float]
+    radius_mm: float
+    pitch_mm: float
+    turns: float
+    tube_mm: float
+
+    @property
+    def length_mm(self):
+        return self.turns * np.hypot(2 * np.pi * self.radius_mm, self.pitch_mm)
+
+    def at(self, angle):
+        x, y = self.radius_mm * np.cos(angle), self.radius_mm * np.sin(angle)
+        rise = self.pitch_mm * (angle / (2 * np.pi) - self.turns / 2)
+        return np.asarray(self.centre_mm) + np.stack([x, y, rise], axis=-1)
+
+    def depth(self, points):
+        """By Newton's steps from the nearest of points close together along the helix."""
+        last = 2 * np.pi * self.turns
+        own = points - np.asarray(self.centre_mm)
+        round_ = np.arctan2(own[..., 1], own[..., 0])
+        best = np.full(points.shape[:-1], np.inf)
+        for turn in range(int(np.ceil(self.turns)) + 1):
+            angle = np.clip(round_ + 2 * np.pi * turn, 0.0, last)
+            for _ in range(6):
+                angle = np.clip(angle - self._step(own, angle), 0.0, last)
+            best = np.minimum(best, np.linalg.norm(points - self.at(angle), axis=-1))
+        return self.tube_mm - best
+
+    def _step(self, own, angle):
+        """First over second derivative of half the squared distance."""
+        rise = self.pitch_mm / (2 * np.pi)
+        out = own[..., 0] * np.sin(angle) - own[..., 1] * np.cos(angle)
+        height = rise * (angle - np.pi * self.turns) - own[..., 2]
+        second = own[..., 0] * np.cos(angle) + own[..., 1] * np.sin(angle)
+        curved = self.radius_mm * second + rise**2
+        slope = self.radius_mm * out + rise * height
+        return np.clip(slope / np.where(curved > 0.1, curved, 0.1), -0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Phantom:
+    shapes: tuple = ()
+    grid: ImageGrid = field(default_factory=lambda: ImageGrid(96, 120, 0.2, 0.2))
+
+    def image(self, pose):
+        """Grey levels of the image at one pose, shape (vector, sample)."""
+        x = self.grid.vector_pitch_mm * np.arange(self.grid.vectors)
+        y = self.grid.first_sample_depth_mm + self.grid.sample_spacing_mm * np.arange(self.grid.samples)
+        inside = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((x.size, y.size))], axis=-1)
+        points = pose.apply(inside.reshape(-1, 3)).reshape(inside.shape)
+        depth = np.full(points.shape[:-1], -np.inf)
+        for shape in self.shapes:
+            depth = np.maximum(depth, shape.depth(points))
+        share = np.clip(0.5 + depth / self.grid.sample_spacing_mm, 0.0, 1.0)
+        return (OUTSIDE + (INSIDE - OUTSIDE) * share).astype(np.float32)
+
+    def images(self, poses):
+        return [self.image(pose) for pose in poses]
+
+
+def curved_path(frames, length_mm, seed=0, turn_deg=4.0):
+    """A freehand sweep: bends, wanders, tilts, yaws and rolls, at an uneven speed."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 1.0, frames)
+    phase = rng.uniform(0, 2 * np.pi, 6)
+    waves = [np.sin(2 * np.pi * (0.6 + 0.3 * k) * t + phase[k]) for k in range(6)]
+    uneven = t + 0.04 * np.sin(4 * np.pi * t) / (4 * np.pi)
+    places = np.column_stack([0.8 * waves[0], 0.5 * waves[1], length_mm * uneven])
+    roll, yaw, tilt = (np.deg2rad(turn_deg) * wave for wave in waves[3:])
+    return RigidTransform.from_components(places, rotation_from_fixed_angles(roll / 2, yaw, tilt))

@@ -1,0 +1,135 @@
+"""Regions of the image: sample by sample, and as written on the command line."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.region import Fan, Polygon, Rectangle, Region
+
+GRID = ImageGrid(
+    vectors=31, samples=57, vector_pitch_mm=0.3, sample_spacing_mm=0.1, first_sample_depth_mm=0.7
+)
+
+
+def positions(grid):
+    for vector, sample in np.ndindex(grid.vectors, grid.samples):
+        x = vector * grid.vector_pitch_mm
+        yield vector, sample, x, grid.first_sample_depth_mm + sample * grid.sample_spacing_mm
+
+
+def winding(x, y, corners):
+    """Times a polygon goes round a point: angles between successive corners, summed."""
+    away = np.asarray(corners) - (x, y)
+    angle = np.unwrap(np.arctan2(*np.vstack([away, away[:1]]).T[::-1]))
+    return round((angle[-1] - angle[0]) / (2 * np.pi))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    apex=st.tuples(st.floats(-3, 12), st.floats(-20, 3)),
+    angles=st.tuples(st.floats(-89, 0), st.floats(1, 89)),
+    radii=st.tuples(st.floats(0, 8), st.floats(9, 25)),
+)
+def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
+    expected, sure = np.zeros((31, 57), bool), np.ones((31, 57), bool)
+    for vector, sample, x, y in positions(GRID):
+        angle = np.degrees(np.arctan2(x - apex[0], y - apex[1]))
+        radius = np.hypot(x - apex[0], y - apex[1])
+        expected[vector, sample] = angles[0] <= angle <= angles[1] and radii[0] <= radius <= radii[1]
+        # Samples on a side itself are a matter of rounding.
+        sure[vector, sample] = (
+            min(abs(angle - np.array(angles))) > 1e-4 and min(abs(radius - np.array(radii))) > 1e-6
+        )
+    found = Fan(apex, angles, radii).mask(GRID)
+    np.testing.assert_array_equal(found[sure], expected[sure])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), corners=st.integers(3, 8))
+def test_polygon_is_what_it_goes_round(seed, corners):
+    rng = np.random.default_rng(seed)
+    # A star round a point is simple, and mostly not convex.
+    turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    reach = rng.uniform(0.5, 5.0, corners)
+    outline = [4.5, 3.5] + reach[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    expected = np.zeros((31, 57), bool)
+    for vector, sample, x, y in positions(GRID):
+        expected[vector, sample] = winding(x, y, outline) != 0
+    found = Polygon(tuple(map(tuple, outline))).mask(GRID)
+    # A corner of a star in general position hits no sample.
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_rectangle_has_its_sides():
+    # 0.3 * 3 and 0.7 + 0.1 * 2 are a hair off 0.9 in floating point.
+    found = Rectangle((0.9, 0.9), (1.5, 1.2)).mask(GRID)
+    expected = np.zeros((31, 57), bool)
+    expected[3:6, 2:6] = True
+    np.testing.assert_array_equal(found, expected)
+    corners = ((0.9, 0.9), (1.5, 0.9), (1.5, 1.2), (0.9, 1.2))
+    np.testing.assert_array_equal(Polygon(corners).mask(GRID), expected)
+
+
+@pytest.mark.parametrize("text", ["rectangle 1,1.5 5,4", "fan 4.5,-5 -20,30 7,9", "polygon 1,1 8,2 5,6"])
+def test_a_region_is_where_it_is_in_skewed_images_too(text):
+    # A grid leaning by 5 degrees; fine, so that areas are known to 1 %.
+    grids = [ImageGrid(300, 570, 0.03, 0.01, 0.7, skew) for skew in (0.0, np.radians(5.0))]
+    area, centre = [], []
+    for grid in grids:
+        inside = Region.from_text(text).mask(grid)
+        points = np.column_stack([np.argwhere(inside), np.ones(inside.sum())]) @ grid.image_from_sample[:2].T
+        cell = np.linalg.det(grid.image_from_sample[:2, :2])
+        area.append(inside.sum() * cell)
+        centre.append(points.mean(axis=0))
+    np.testing.assert_allclose(area[1], area[0], rtol=0.01)
+    np.testing.assert_allclose(centre[1], centre[0], atol=0.03)
+
+
+def test_shapes_are_intersected_and_without_any_the_image_is_whole():
+    text = "rectangle 1,1 5,4 and fan 4.5,-5 -30,30 6,9 and polygon 0,0 9,0 9,6"
+    region = Region.from_text(text)
+    rectangle, fan, polygon = region.shapes
+    assert rectangle == Rectangle((1.0, 1.0), (5.0, 4.0))
+    assert fan == Fan((4.5, -5.0), (-30.0, 30.0), (6.0, 9.0))
+    assert polygon == Polygon(((0.0, 0.0), (9.0, 0.0), (9.0, 6.0)))
+    common = rectangle.mask(GRID) & fan.mask(GRID) & polygon.mask(GRID)
+    assert 0 < common.sum() < rectangle.mask(GRID).sum()
+    np.testing.assert_array_equal(region.mask(GRID), common)
+    pieces = [Region.from_text(part) for part in text.split(" and ")]
+    assert pieces[0] & pieces[1] & pieces[2] == region
+    assert Region().mask(GRID).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "expected 'rectangle x0,y0"),
+        ("circle 1,1 2,2", "got 'circle 1,1 2,2'"),
+        ("rectangle 1,1", "expected 'rectangle x0,y0"),
+        ("rectangle 1,1 2,2 3,3", "expected 'rectangle x0,y0"),
+        ("rectangle 1,1 2;2", "expected 'rectangle x0,y0"),
+        ("rectangle 1,1 2,2,2", "expected 'rectangle x0,y0"),
+        ("rectangle 2,1 1,2", "lower values first"),
+        ("rectangle 0,0 nan,2", "two finite corners"),
+        ("fan 0,0 30,-30 1,2", "smaller first"),
+        ("fan 0,0 -100,30 1,2", "-90 to 90 degrees"),
+        ("fan 0,0 -30,30 2,1", "two radii"),
+        ("fan inf,0 -30,30 1,2", "finite apex"),
+        ("polygon 0,0 1,1", "expected 'rectangle x0,y0"),
+        ("polygon 0,0 1,1 nan,2", "expected a finite value"),
+        ("rectangle 0,0 1,1 and ", "joined by ' and '"),
+    ],
+)
+def test_what_is_no_region_is_refused_in_one_line(text, expected):
+    with pytest.raises(InvalidInputError) as error:
+        Region.from_text(text)
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_region_beside_the_image_is_refused():
+    with pytest.raises(InvalidInputError, match=r"x 0 to 9 mm and y 0\.7 to 6\.3 mm, got none"):
+        Region.from_text("rectangle 20,0 30,5").mask(GRID)
