@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
-    from speckle3d.study.cuts import Place
+    from speckle3d.study.places import Place
 
 Triple = tuple[float, float, float]
 
@@ -69,7 +69,7 @@ def reslice(
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
     from speckle3d.io.volume_writer import SUFFIXES
-    from speckle3d.study.cuts import Place
+    from speckle3d.study.places import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)
     require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, volume)

@@ -6,6 +6,7 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -43,6 +44,35 @@ class Cut(Protocol):
 
     def lines(self) -> FloatArray:
         """Of each line the first pixel's centre and the step to the next, shape (n, 2, 3), mm."""
+
+
+class _Gathering:
+    """A cut while images pass by: of each pixel the nearest images' distances and levels, either side."""
+
+    def __init__(self, source: PosedImages, cut: Cut, max_distance_mm: float) -> None:
+        self._cut, self._lines, self._reach_mm = cut, cut.lines(), max_distance_mm
+        self._maps = _index_from_world(source)
+        self.near = _touches(self._maps, source.grid, cut.hull_mm, max_distance_mm)
+        shape = (2, len(self._lines), _points_per_line(cut))
+        self._distance_mm = np.full(shape, max_distance_mm, dtype=np.float32)
+        self._grey = np.full(shape, np.nan, dtype=np.float32)
+
+    def add(self, images: Mapping[int, Float32Array]) -> None:
+        """Look at some of the images."""
+        from speckle3d.kernels.cuts import keep_nearest
+
+        def fill(first: int, stop: int) -> None:
+            band = slice(first, stop)
+            for index, image in images.items():
+                if self.near[index]:
+                    kept = self._distance_mm[:, band], self._grey[:, band]
+                    keep_nearest(image, self._maps[index], self._lines[band], self._reach_mm, *kept)
+
+        in_parallel(fill, len(self._lines), _GRAIN)
+
+    def blended(self) -> Float32Array:
+        """The cut, shape (rows, columns)."""
+        return _upright(self._cut, _blend(self._distance_mm, self._grey))
 
 
 def reslice_frames(
@@ -83,29 +113,26 @@ def reslice_frames(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    from speckle3d.kernels.cuts import keep_nearest
+    return reslice_at(images, grid, [(world_from_image, cut)], max_distance_mm)[0]
 
+
+def reslice_at(
+    images: Images,
+    grid: ImageGrid,
+    wanted: Sequence[tuple[RigidTransform, Cut]],
+    max_distance_mm: float,
+) -> list[Float32Array]:
+    """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`."""
     if not (np.isfinite(max_distance_mm) and max_distance_mm > 0):
         raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {max_distance_mm}")
-    source = PosedImages(images, grid, world_from_image)
-    maps, lines = _index_from_world(source), cut.lines()
-    near = np.flatnonzero(_touches(maps, grid, cut.hull_mm, max_distance_mm))
-    shape = (2, len(lines), cut.shape[1] if cut.along_rows else cut.shape[0])
-    distance_mm = np.full(shape, max_distance_mm, dtype=np.float32)
-    grey = np.full(shape, np.nan, dtype=np.float32)
-    for start in range(0, len(near), _BATCH):
-        batch = near[start : start + _BATCH]
-        images_read = [source.read(int(index)) for index in batch]
-
-        def fill(first: int, stop: int) -> None:
-            band = slice(first, stop)
-            for image, index in zip(images_read, batch, strict=True):  # noqa: B023 (done within the batch)
-                kept = distance_mm[:, band], grey[:, band]
-                keep_nearest(image, maps[index], lines[band], max_distance_mm, *kept)
-
-        in_parallel(fill, len(lines), _GRAIN)
-    blended = _blend(distance_mm, grey)
-    return blended if cut.along_rows else np.ascontiguousarray(blended.T)
+    sources = [PosedImages(images, grid, poses) for poses, _ in wanted]
+    cuts = [_Gathering(at, cut, max_distance_mm) for at, (_, cut) in zip(sources, wanted, strict=True)]
+    asked = np.flatnonzero(np.any([each.near for each in cuts], axis=0))
+    for start in range(0, len(asked), _BATCH):
+        batch = {int(index): sources[0].read(int(index)) for index in asked[start : start + _BATCH]}
+        for each in cuts:
+            each.add(batch)
+    return [each.blended() for each in cuts]
 
 
 def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
@@ -155,14 +182,24 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
     held = np.empty(0, np.uint8) if state is None else _flat(state.astype(np.uint8, copy=False), order)
     index_from_world = np.array(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
     lines, sides = cut.lines(), np.array(volume.shape)
-    out = np.empty((len(lines), cut.shape[1] if cut.along_rows else cut.shape[0]), np.float32)
+    out = np.empty((len(lines), _points_per_line(cut)), np.float32)
 
     def fill(first: int, stop: int) -> None:
         band = slice(first, stop)
         cut_voxels(flat, held, strides, sides, index_from_world, lines[band], out[band])
 
     in_parallel(fill, len(lines), _GRAIN)
-    return out if cut.along_rows else np.ascontiguousarray(out.T)
+    return _upright(cut, out)
+
+
+def _points_per_line(cut: Cut) -> int:
+    rows, columns = cut.shape
+    return columns if cut.along_rows else rows
+
+
+def _upright(cut: Cut, lines: Float32Array) -> Float32Array:
+    """Lines of a cut as an image, shape (rows, columns)."""
+    return lines if cut.along_rows else np.ascontiguousarray(lines.T)
 
 
 def _flat(values: npt.NDArray[Any], order: Literal["C", "F"]) -> npt.NDArray[Any]:
