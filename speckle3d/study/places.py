@@ -230,7 +230,7 @@ def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) 
 
 
 def frame_centres(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
-    """Where along a plane's x the frames' centres are, from the first one's, shape (n,), mm; none for a sheet."""
+    """Where the frames' centres are along a plane's x, from the first's, shape (n,), mm; not on a sheet."""
     if isinstance(cut, CurvedSheet):
         return np.empty(0)
     x = cut.world_from_plane.inv().apply(world_from_image.apply(grid.centre_mm))[:, 0]
