@@ -23,7 +23,6 @@ from speckle3d.scoring.trajectories import poses_of
 from speckle3d.study.places import (
     AnyCut,
     Place,
-    axis_names,
     frame_centres,
     frame_lines,
     sweep_extent,
@@ -187,7 +186,7 @@ def cut_posed(
     unit, range_db = ("dB", (-dynamic_range_db, 0.0)) if voxels is None else ("level", None)
     reference = opened.reference if len(cuts) > 1 else None
     return CutPicture(
-        cuts, axis_names(shown, there), where, unit, range_db, reference, opened.posed.sweep.name
+        cuts, place.axes(shown, there), where, unit, range_db, reference, opened.posed.sweep.name
     )
 
 

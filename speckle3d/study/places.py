@@ -128,6 +128,22 @@ class Place:
         middle = RigidTransform.from_translation([0, 0, (volume.shape[2] - 1) / 2 * volume.spacing_mm[2]])
         return covering_box(volume.world_from_grid * middle, corners, self.pixel_mm)
 
+    def axes(self, cut: AnyCut, world_from_image: RigidTransform) -> tuple[str, str]:
+        """Names of the cut's axes: by how it was placed, else by the directions of the sweep they follow."""
+        if isinstance(cut, CurvedSheet):
+            return "along the curve", _name(cut.down, world_from_image)
+        if self.depth_mm is not None:
+            return "along the sweep", "lateral"
+        if self._is_along_sweep:
+            return "along the sweep", "depth"
+        right, down = cut.world_from_plane.rotation.as_matrix().T[:2]
+        return _name(right, world_from_image), _name(down, world_from_image)
+
+    @property
+    def _is_along_sweep(self) -> bool:
+        placed = (self.frame, self.points_mm, self.origin_mm, self.curve_mm)
+        return all(each is None for each in placed)
+
     def words(self, grid: ImageGrid | None = None) -> str:
         """Where the cut is."""
         if self.frame is not None:
@@ -149,7 +165,7 @@ class Place:
     def _line(self, grid: ImageGrid) -> FloatArray | None:
         if self.depth_mm is not None:
             return depth_line(grid, self.depth_mm)
-        if any(each is not None for each in (self.frame, self.points_mm, self.origin_mm, self.curve_mm)):
+        if not self._is_along_sweep:
             return None
         return lateral_line(grid, grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm)
 
@@ -197,14 +213,6 @@ def mean_directions(world_from_image: RigidTransform) -> FloatArray:
     """Mean lateral, axial and elevational direction of frames, shape (3, 3), a unit vector each."""
     axes = world_from_image.rotation.as_matrix().mean(axis=0).T
     return np.asarray(axes / np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-9))
-
-
-def axis_names(cut: AnyCut, world_from_image: RigidTransform) -> tuple[str, str]:
-    """Names of a cut's axes by the directions of the sweep that they follow."""
-    if isinstance(cut, CurvedSheet):
-        return "along the curve", _name(cut.down, world_from_image)
-    right, down = cut.world_from_plane.rotation.as_matrix().T[:2]
-    return _name(right, world_from_image), _name(down, world_from_image)
 
 
 def view_of(cut: AnyCut, world_from_image: RigidTransform) -> str:
