@@ -43,9 +43,9 @@ def read_places(path: PathLike, columns: Sequence[str] = WORLD) -> FloatArray:
     return np.array(found, dtype=float).reshape(-1, len(columns))
 
 
-def parse_places(texts: Sequence[str], columns: Sequence[str] = WORLD) -> FloatArray:
+def parse_places(texts: Sequence[str], columns: Sequence[str] = WORLD, option: str = "--point") -> FloatArray:
     """Points given as ``X,Y,Z``, or ``X,Y``, each; shape (k, number of columns)."""
-    found = [_place(text.split(","), "--point", len(columns)) for text in texts]
+    found = [_place(text.split(","), option, len(columns)) for text in texts]
     return np.array(found, dtype=float).reshape(-1, len(columns))
 
 
