@@ -16,7 +16,7 @@ from fuzz import mutations
 
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
-from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
+from speckle3d.core.reconstruction import FramePairs, ModeErrors, Provenance, SharedErrors, Trust
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
@@ -106,7 +106,9 @@ def reconstructions(folder, n=8, patches=6):
         patch_centre_mm=np.arange(2.0 * patches).reshape(patches, 2),
     )
     poses = {"image": sweep_examples.poses(n), "pose": sweep_examples.poses(n, 1)}
-    trust = Trust(np.tile(np.eye(6), (n, 1, 1)), np.zeros(n, dtype=np.int64))
+    each = np.tile(np.eye(6), (n, 1, 1))
+    shared, modes = SharedErrors(0.02, 0.07, np.array([1e-3, 2e-3])), {"fused": ModeErrors(each, 0.004)}
+    trust = Trust(each, np.zeros(n, dtype=np.int64), shared, modes)
     with ReconstructionWriter(folder / "r.h5", 0.04 * np.arange(n), sweep_examples.rf_sweep().grid) as writer:
         writer.append_pairs(pairs)
         writer.finish(poses, Provenance("sweep.h5", "ab" * 32, "0.1.0"), "[matching]\n", trust)
