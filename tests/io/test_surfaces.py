@@ -62,6 +62,14 @@ def test_damaged_files_are_one_clear_error(path):
             read_surface(path)
 
 
+def test_a_header_without_an_end_is_refused_at_once(tmp_path):
+    write_surface(tmp_path / "t.ply", Surface(CORNERS, FACES))
+    head = (tmp_path / "t.ply").read_bytes().split(b"end_header")[0]
+    (tmp_path / "t.ply").write_bytes(head)
+    with pytest.raises(FileError, match="header has no end"):
+        read_surface(tmp_path / "t.ply")
+
+
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
     surface = Surface(CORNERS, FACES)
     with pytest.raises(InvalidInputError, match=r"\.stl, \.ply, \.vtk"):
