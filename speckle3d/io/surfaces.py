@@ -87,7 +87,8 @@ def read_surface(path: PathLike) -> Surface:
     promised = _promised_cells(Path(path))
     if promised is not None and promised != sum(len(block.data) for block in mesh.cells):
         raise FileError(f"{path}: cannot be read: it ends before its {promised} triangles do")
-    with naming(str(path)):
+    # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
+    with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
 
 
