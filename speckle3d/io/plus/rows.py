@@ -129,6 +129,12 @@ def rows_of(sweep: Sweep) -> Rows:
     return Rows(fields, frames, images, record.conjugated, left_out)
 
 
+def rows_without_images(times_s: FloatArray) -> Rows:
+    """Rows of frames that have a time alone, to which transforms are added."""
+    frames = [{"Timestamp": number_text(time)} for time in times_s.tolist()]
+    return Rows({}, frames, [*range(len(frames))], False, [])
+
+
 def _standard(sweep: Sweep) -> dict[str, str]:
     """Fields of a sweep that has none of its own.
 

@@ -89,7 +89,7 @@ def assert_same(got, expected, added=()):
 
 
 @pytest.mark.parametrize("compressed", [True, False])
-@pytest.mark.parametrize("suffix", [".igs.mha", ".mhd", ".igs.nrrd"])
+@pytest.mark.parametrize("suffix", [".igs.mha", ".mhd", ".igs.nrrd", ".seq.nrrd"])
 def test_every_field_survives_a_sweep_file_and_each_container(tmp_path, suffix, compressed):
     fields = {"UltrasoundImageOrientation": "UFA", **CUSTOM}
     path = write_mha(tmp_path / "in.mha", grey(4), fields, rich(), spacing="0.1 0.2 7")
@@ -98,7 +98,7 @@ def test_every_field_survives_a_sweep_file_and_each_container(tmp_path, suffix, 
     for source in (sweep, read_sweep(tmp_path / "sweep.h5")):
         out = tmp_path / f"out{suffix}"
         assert write_sequence(out, source, compressed=compressed) == []
-        if suffix == ".igs.nrrd":  # which has no third spacing, as a sequence has none
+        if suffix.endswith(".nrrd"):  # which has no third spacing, as a sequence has none
             content(out)[0]["ElementSpacing"] = (0.1, 0.2, 7.0)
             path = write_mha(tmp_path / "in.mha", grey(4), fields, rich(), spacing="0.1 0.2 1")
         assert_same(out, path)
@@ -162,7 +162,7 @@ def test_an_image_of_two_axes_stays_one(tmp_path):
 
 
 @pytest.mark.parametrize("make", [sweep_examples.bmode_sweep, sweep_examples.rf_sweep])
-@pytest.mark.parametrize("suffix", [".mha", ".nrrd"])
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".seq.nrrd"])
 def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix):
     sweep = make()
     left_out = write_sequence(tmp_path / f"out{suffix}", sweep)
