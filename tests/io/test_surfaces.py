@@ -37,6 +37,7 @@ def test_headers_say_the_axes_as_slicer_looks_for_them(path):
         assert b"SPACE=LPS" in start.split(b"\n")[1]
 
 
+@pytest.mark.slow
 def test_vtk_reads_the_same_points_and_header(path):
     vtk = pytest.importorskip("vtk")
     reader = {".stl": vtk.vtkSTLReader, ".ply": vtk.vtkPLYReader, ".vtk": vtk.vtkUnstructuredGridReader}[
