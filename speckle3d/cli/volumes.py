@@ -121,6 +121,8 @@ def volume(
             require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
+    if levels == "linear" and voxel_type is None:  # most amplitudes are less than one
+        given["voxel_type"] = "float32"
     settings = from_options(CompoundingSettings, base | given)
     request = VolumeRequest(
         out,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -91,64 +92,86 @@ class NearestImages:
         expected = (source.grid.vectors, source.grid.samples)
         if region is not None and region.shape != expected:
             raise InvalidInputError(f"region: expected shape {expected}, as the images, got {region.shape}")
-        self._source, self._max_distance_mm = source, max_distance_mm
+        self._source, self.max_distance_mm = source, max_distance_mm
         self._outside = None if region is None else ~region
         image_from_world = source.world_from_image.inv().as_matrix()
         self.normals = image_from_world[:, 2, :3]
         """Where each image faces in the world, shape (n, 3)."""
-        self._index_from_world = source.index_from_image() @ image_from_world
+        self.index_from_world = source.index_from_image() @ image_from_world
+        """To (vector, sample, signed distance in mm) of each image, shape (n, 3, 4)."""
         # "Behind" and "in front" must mean the same for all images, or neighbours of opposite facing
         # (a probe turned round between two passes) would compete for one side and leave the other empty.
-        self._index_from_world[self.normals @ line_along(self.normals) < 0, 2] *= -1.0
+        self.index_from_world[self.normals @ line_along(self.normals) < 0, 2] *= -1.0
 
     def beside(self, lines: FloatArray, points: int, hull_mm: FloatArray) -> Sides:
-        """Look up points along straight lines.
+        """Look up points along straight lines; as `LookUp` and `in_one_pass`."""
+        return in_one_pass([LookUp(self, lines, points, hull_mm)])[0]
 
-        One pass over the images, in any order, with memory for the points and `BATCH` images; images that
-        reach no point are not even read.
-
-        Parameters
-        ----------
-        lines : ndarray, shape (n, 2, 3)
-            Of each line the first point and the step to the next one, mm in the world.
-        points : int
-            On each line.
-        hull_mm : ndarray, shape (m, 3)
-            Points in whose convex hull all others lie.
-        """
-        from speckle3d.kernels.cuts import keep_nearest
-
-        reach_mm = self._max_distance_mm
-        distance_mm = np.full((2, len(lines), points), reach_mm, dtype=np.float32)
-        grey = np.full(distance_mm.shape, np.nan, dtype=np.float32)
-        near = np.flatnonzero(self._reach(hull_mm))
-        few = max(1, _CACHED_BYTES // (BYTES_PER_POINT * points))
-        for batch in np.split(near, range(BATCH, len(near), BATCH)):
-            images = [self._read(int(index)) for index in batch]
-            maps = np.ascontiguousarray(self._index_from_world[batch])
-
-            def look_up(first: int, stop: int) -> None:
-                for low in range(first, stop, few):
-                    band = slice(low, min(low + few, stop))
-                    for image, index_from_world in zip(images, maps, strict=True):  # noqa: B023 (in the batch)
-                        kept = distance_mm[:, band], grey[:, band]
-                        keep_nearest(image, index_from_world, lines[band], reach_mm, *kept)
-
-            in_parallel(look_up, len(lines), _GRAIN)
-        return Sides(distance_mm, grey)
-
-    def _read(self, index: int) -> Float32Array:
+    def read(self, index: int) -> Float32Array:
+        """One image, NaN outside the region."""
         image = self._source.read(index)
         return image if self._outside is None else np.where(self._outside, np.float32(np.nan), image)
 
-    def _reach(self, hull_mm: FloatArray) -> BoolArray:
+    def reach(self, hull_mm: FloatArray) -> BoolArray:
         """Whether each image's slab can reach a point: no face of it has all of their hull beyond it."""
-        maps, grid = self._index_from_world, self._source.grid
+        maps, grid = self.index_from_world, self._source.grid
         u, v, q = np.moveaxis(maps[:, :, :3] @ hull_mm.T + maps[:, :, 3:], 1, 0)
         reach = (
             (u, 0.0, grid.vectors - 1.0),
             (v, 0.0, grid.samples - 1.0),
-            (q, -self._max_distance_mm, self._max_distance_mm),
+            (q, -self.max_distance_mm, self.max_distance_mm),
         )
         near = [(c.max(axis=1) > low - 1e-3) & (c.min(axis=1) < high + 1e-3) for c, low, high in reach]
         return np.asarray(near[0] & near[1] & near[2])
+
+
+class LookUp:
+    """Points along straight lines, and the images nearest to them so far.
+
+    Parameters
+    ----------
+    images : NearestImages
+    lines : ndarray, shape (n, 2, 3)
+        Of each line the first point and the step to the next one, mm in the world.
+    points : int
+        On each line.
+    hull_mm : ndarray, shape (m, 3)
+        Points in whose convex hull all others lie.
+    """
+
+    def __init__(self, images: NearestImages, lines: FloatArray, points: int, hull_mm: FloatArray) -> None:
+        self.images, self._lines = images, lines
+        self.near = images.reach(hull_mm)
+        distance_mm = np.full((2, len(lines), points), images.max_distance_mm, dtype=np.float32)
+        self.sides = Sides(distance_mm, np.full(distance_mm.shape, np.nan, dtype=np.float32))
+        self._few = max(1, _CACHED_BYTES // (BYTES_PER_POINT * points))
+
+    def add(self, batch: Mapping[int, Float32Array]) -> None:
+        """Look at some of the images."""
+        from speckle3d.kernels.cuts import keep_nearest
+
+        reach_mm, (distance_mm, grey) = self.images.max_distance_mm, self.sides
+        seen = [(image, self.images.index_from_world[i].copy()) for i, image in batch.items() if self.near[i]]
+
+        def look_up(first: int, stop: int) -> None:
+            for low in range(first, stop, self._few):
+                band = slice(low, min(low + self._few, stop))
+                for image, index_from_world in seen:
+                    kept = distance_mm[:, band], grey[:, band]
+                    keep_nearest(image, index_from_world, self._lines[band], reach_mm, *kept)
+
+        in_parallel(look_up, len(self._lines), _GRAIN)
+
+
+def in_one_pass(wanted: Sequence[LookUp]) -> list[Sides]:
+    """Look up points of several kinds in the same images, each at poses of its own.
+
+    One pass over the images, in any order, with memory for the points and `BATCH` images; images that reach
+    no point are not even read.
+    """
+    asked = np.flatnonzero(np.any([each.near for each in wanted], axis=0))
+    for start in range(0, len(asked), BATCH):
+        batch = {int(index): wanted[0].images.read(int(index)) for index in asked[start : start + BATCH]}
+        for each in wanted:
+            each.add(batch)
+    return [each.sides for each in wanted]

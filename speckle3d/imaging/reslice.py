@@ -6,6 +6,7 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
-from speckle3d.imaging.nearest import NearestImages
+from speckle3d.imaging.nearest import LookUp, NearestImages, in_one_pass
 from speckle3d.imaging.planes import ReslicePlane as ReslicePlane
 from speckle3d.imaging.planes import image_plane
 
@@ -81,11 +82,27 @@ def reslice_frames(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    source = PosedImages(images, grid, world_from_image)
-    points = cut.shape[1] if cut.along_rows else cut.shape[0]
-    sides = NearestImages(source, max_distance_mm).beside(cut.lines(), points, cut.hull_mm)
-    blended, _ = sides.blended()
-    return blended if cut.along_rows else np.ascontiguousarray(blended.T)
+    return reslice_at(images, grid, [(world_from_image, cut)], max_distance_mm)[0]
+
+
+def reslice_at(
+    images: Images,
+    grid: ImageGrid,
+    wanted: Sequence[tuple[RigidTransform, Cut]],
+    max_distance_mm: float,
+) -> list[Float32Array]:
+    """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`."""
+    sought = [
+        LookUp(
+            NearestImages(PosedImages(images, grid, poses), max_distance_mm),
+            cut.lines(),
+            _points_per_line(cut),
+            cut.hull_mm,
+        )
+        for poses, cut in wanted
+    ]
+    found = in_one_pass(sought)
+    return [_upright(cut, sides.blended()[0]) for sides, (_, cut) in zip(found, wanted, strict=True)]
 
 
 def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
@@ -135,14 +152,24 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
     held = np.empty(0, np.uint8) if state is None else _flat(state.astype(np.uint8, copy=False), order)
     index_from_world = np.array(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
     lines, sides = cut.lines(), np.array(volume.shape)
-    out = np.empty((len(lines), cut.shape[1] if cut.along_rows else cut.shape[0]), np.float32)
+    out = np.empty((len(lines), _points_per_line(cut)), np.float32)
 
     def fill(first: int, stop: int) -> None:
         band = slice(first, stop)
         cut_voxels(flat, held, strides, sides, index_from_world, lines[band], out[band])
 
     in_parallel(fill, len(lines), _GRAIN)
-    return out if cut.along_rows else np.ascontiguousarray(out.T)
+    return _upright(cut, out)
+
+
+def _points_per_line(cut: Cut) -> int:
+    rows, columns = cut.shape
+    return columns if cut.along_rows else rows
+
+
+def _upright(cut: Cut, lines: Float32Array) -> Float32Array:
+    """Lines of a cut as an image, shape (rows, columns)."""
+    return lines if cut.along_rows else np.ascontiguousarray(lines.T)
 
 
 def _flat(values: npt.NDArray[Any], order: Literal["C", "F"]) -> npt.NDArray[Any]:

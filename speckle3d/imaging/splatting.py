@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -148,13 +149,30 @@ def _batches(source: PosedImages, frames: IntArray) -> Iterator[_Batch]:
     images = np.empty((min(size, frames.size), *shape), kind)
     for start in range(0, frames.size, size):
         some = frames[start : start + size]
-        for n, frame in enumerate(some):
-            image = source.read_as_stored(int(frame))
-            if image.dtype != stored:
-                raise MismatchError(f"images[{frame}]: expected {stored} as the others, got {image.dtype}")
-            images[n] = image.T if turned else image
-            del image
+        read = partial(_read_into, images, source, some, stored, turned)
+        if source.any_thread:
+            in_parallel(read, some.size)
+        else:
+            read(0, some.size)
         yield _Batch(images[: some.size], some, turned)
+
+
+def _read_into(
+    images: npt.NDArray[Any],
+    source: PosedImages,
+    frames: IntArray,
+    stored: np.dtype[Any],
+    turned: bool,
+    first: int,
+    stop: int,
+) -> None:
+    """Read some of the frames, from `first` to before `stop`."""
+    for n in range(first, stop):
+        image = source.read_as_stored(int(frames[n]))
+        if image.dtype != stored:
+            raise MismatchError(f"images[{frames[n]}]: expected {stored} as the others, got {image.dtype}")
+        images[n] = image.T if turned else image
+        del image
 
 
 def batch_gb(source: PosedImages) -> float:
