@@ -10,10 +10,11 @@ import pytest
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.labels import MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.backward import backward_slabs
 from speckle3d.imaging.grid import VoxelGrid
-from speckle3d.imaging.holes import MEASURED, fill_holes
+from speckle3d.imaging.holes import fill_holes
 from speckle3d.imaging.images import PosedImages
 
 SHAPE = (240, 193, 273)

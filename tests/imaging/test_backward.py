@@ -8,10 +8,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.backward import backward_slabs
 from speckle3d.imaging.grid import VoxelGrid, grid_around
-from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.volume import compound

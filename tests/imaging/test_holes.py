@@ -9,9 +9,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.grid import grid_as_asked
-from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED, boxes_within, fill_holes
+from speckle3d.imaging.holes import boxes_within, fill_holes
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.settings import CompoundingSettings
 from speckle3d.imaging.slabs import compound_slabs
