@@ -15,6 +15,7 @@ from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.volume import compound
+from speckle3d.kernels.cuts import EDGE_TOLERANCE
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -27,8 +28,11 @@ def shaken(rng, frames, step_mm, turn_rad=0.05):
 def sampled(image, x, y):
     """Bilinear sample at a point of the image in mm; NaN outside and beside NaN."""
     u, v = x / GRID.vector_pitch_mm, (y - GRID.first_sample_depth_mm) / GRID.sample_spacing_mm
-    if not (0 <= u <= GRID.vectors - 1 and 0 <= v <= GRID.samples - 1):
+    # A millionth of a pixel outside is on the border: rounding of poses.
+    inside = min(max(u, 0.0), GRID.vectors - 1.0), min(max(v, 0.0), GRID.samples - 1.0)
+    if max(abs(u - inside[0]), abs(v - inside[1])) > EDGE_TOLERANCE:
         return np.nan
+    u, v = inside
     i, j = min(int(u), GRID.vectors - 2), min(int(v), GRID.samples - 2)
     a, b = u - i, v - j
     near = (1 - b) * image[i][j] + b * image[i][j + 1]
@@ -70,7 +74,7 @@ def joined(slabs):
     return np.concatenate([slab.voxels for slab in slabs]), np.concatenate([slab.state for slab in slabs])
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     spacing=st.sampled_from([(0.4, 0.4, 0.4), (0.6, 0.5, 1.2), (0.9, 0.7, 0.2)]),
