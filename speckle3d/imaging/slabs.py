@@ -85,7 +85,9 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
     around, most = 2 * _halo(boxes_of(voxel_grid, settings)), settings.max_memory_gb
     if working_gb(voxel_grid, settings, frames_gb) <= most:
         return n_k
-    plane_gb = _plane_gb(voxel_grid, settings)
+    # Whoever takes the slabs still has the one before.
+    held = n_i * n_j * (np.dtype(settings.voxel_type).itemsize + 1) / 1e9
+    plane_gb = _plane_gb(voxel_grid, settings) + held
     planes = int((most - frames_gb) / plane_gb) - around
     if planes < min(_LEAST_PLANES, n_k):
         needed = (min(_LEAST_PLANES, n_k) + around) * plane_gb + frames_gb

@@ -22,7 +22,10 @@ Weights = npt.NDArray[Any] | Images
 
 _DIRECT = ("uint8", "int16", "uint16", "float32")
 """Types that kernels read as they are; others become float32."""
-_POSITION_BITS, _SHARE_BITS, _COUNT_BITS = 40, 10, 24
+_POSITION_BITS, _SHARE_BITS = 40, 10
+"""As the kernels have them."""
+_MOST_COUNTED = 2**24
+"""Samples in a voxel for which sum and count fit into one word."""
 _BORDER = 2.0**-24
 """Voxels. A sample less than this below a border lies on it, and belongs to the voxel above."""
 _FARTHEST = 2.0**22
@@ -212,7 +215,7 @@ class Accumulator:
     ) -> None:
         self.shape, self.splat, self.rule = shape, splat, rule
         self.counts = (
-            splat == "nearest" and rule == "mean" and kind.kind in "iu" and most_samples < 2**_COUNT_BITS
+            splat == "nearest" and rule == "mean" and kind.kind in "iu" and most_samples < _MOST_COUNTED
         )
         self._offset = 2**15 if kind.kind == "i" else 0
         self._table = self._empty_table()

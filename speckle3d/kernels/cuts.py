@@ -13,13 +13,11 @@ import numpy.typing as npt
 from numba import njit
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.kernels.slicing import bilinear
 
 EDGE_TOLERANCE = 1e-6
 """Fraction of a pixel or voxel by which a point may miss the border: rounding of poses."""
-
-EMPTY, MEASURED, FILLED = np.uint8(0), np.uint8(1), np.uint8(2)
-"""States of a point or voxel: it holds nothing, an image's level, one from between images."""
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath=False)

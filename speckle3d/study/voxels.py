@@ -15,12 +15,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.labels import STATE_SEGMENTS, Segment
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
-from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.settings import CompoundingSettings
