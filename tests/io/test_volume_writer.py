@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io import deflate, volume_writer
@@ -155,6 +155,21 @@ def test_larger_than_its_batches_and_what_does_not_pack(tmp_path, monkeypatch):
     header, _, packed = (tmp_path / "zlib.mha").read_bytes().partition(b"ElementDataFile = LOCAL\n")
     assert zlib.decompress(packed) == noise.tobytes(order="F")
     assert f"CompressedDataSize = {len(packed)} ".encode() in header
+
+
+def test_members_of_gzip_that_follow_one_another_are_one_volume(tmp_path):
+    """As bgzip and pigz write them."""
+    volume = volume_of(4, "int16")
+    write_volume(tmp_path / "v.nii", volume)
+    whole = (tmp_path / "v.nii").read_bytes()
+    parts = [gzip.compress(whole[i : i + 100]) for i in range(0, len(whole), 100)]
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts))
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts[:-1]))
+    with pytest.raises(FileError, match=r"bytes of pixels unpacked, got \d+"):
+        read_volume(tmp_path / "v.nii.gz")
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts) + b"behind it")
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
 
 
 FIELDS = {
