@@ -91,6 +91,26 @@ def test_a_voxel_is_at_the_same_place_in_everybodys_reader(
     np.testing.assert_array_equal(back.voxels, volume.voxels)
 
 
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
+@pytest.mark.parametrize(
+    ("suffix", "reader"),
+    [(".nrrd", "Nrrd"), (".mha", "MetaImage"), (".nii.gz", "NIFTIImage"), (".nii", "NIFTIImage")],
+)
+def test_vtk_finds_the_same_voxels(tmp_path, suffix, reader, dtype):
+    readers = pytest.importorskip("vtkmodules.vtkIOImage")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    volume = volume_of(10, dtype, (7, 6, 5), fields=FIELDS)
+    write_volume(tmp_path / f"v{suffix}", volume)
+    found = getattr(readers, f"vtk{reader}Reader")()
+    found.SetFileName(str(tmp_path / f"v{suffix}"))
+    found.Update()
+    voxels = vtk_to_numpy(found.GetOutput().GetPointData().GetScalars())
+    np.testing.assert_array_equal(voxels.reshape(5, 6, 7).T, volume.voxels)
+    assert voxels.dtype == dtype
+    np.testing.assert_allclose(found.GetOutput().GetSpacing(), volume.spacing_mm, rtol=1e-6)
+
+
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 179.99, 179.0])
 @pytest.mark.parametrize("axis", [(0, 0, 1), (1, 0, 0), (1, 2, 3)])
 def test_near_a_half_turn_nifti_is_as_exact(tmp_path, turn_deg, axis):

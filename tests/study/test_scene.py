@@ -19,6 +19,7 @@ from speckle3d.io.headers import read_header
 from speckle3d.study.mrml import Scene
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scene import SceneRequest, require_scene_place, write_scene
+from speckle3d.study.sequences import PosedSequence
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
@@ -159,6 +160,22 @@ def test_images_move_through_the_volume(folder):
     )
     assert all(frame["ImageToWorldTransformStatus"] == "OK" for frame in poses.frames)
     assert poses.frames[5]["ImageToWorldTransform"] == header["Seq_Frame0005_ImageToWorldTransform"]
+
+
+def test_the_extension_of_slicer_finds_the_images_by_vtk(tmp_path):
+    """SlicerIGSIO reads pixels of .seq.mha by VTK's reader, and transforms from the text before them."""
+    readers = pytest.importorskip("vtkmodules.vtkIOImage")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    posed = posed_sweep()
+    PosedSequence.of(posed).write(tmp_path / "s.seq.mha")
+    reader = readers.vtkMetaImageReader()
+    reader.SetFileName(str(tmp_path / "s.seq.mha"))
+    reader.Update()
+    pixels = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars()).reshape(8, 20, 12)
+    np.testing.assert_array_equal(pixels.transpose(0, 2, 1), posed.sweep.frames)
+    assert reader.GetOutput().GetSpacing() == (1.0, 1.0, 1.0)
+    assert read_header(tmp_path / "s.seq.mha").transforms == ["ImageToWorld"]
 
 
 def test_slicer_finds_every_transform_before_a_line_that_its_reader_would_break(folder):
