@@ -51,8 +51,8 @@ def test_a_frame_that_is_none_is_refused(refused, made, tmp_path, name, frame, w
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["s.seq.nrrd", "s.seq.mha"])
-def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, bench, tmp_path, name):
+def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, bench, tmp_path):
+    name = "s.seq.nrrd"
     code, out, err = run("convert", made, tmp_path / name, "--mode", "orientation")
     assert (code, out) == (0, ""), err
     header = read_header(tmp_path / name)

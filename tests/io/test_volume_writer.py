@@ -160,6 +160,15 @@ def test_slabs_and_threads_do_not_show_in_the_file(tmp_path, suffix, monkeypatch
         assert path.read_bytes() == whole
 
 
+def test_numbers_in_the_other_byte_order_are_the_same(tmp_path):
+    volume = volume_of(3, "int16")
+    turned = Volume(volume.voxels.astype(">i2"), volume.spacing_mm, volume.world_from_grid)
+    for suffix in SUFFIXES:
+        for name, each in (("little", volume), ("big", turned)):
+            write_volume(tmp_path / f"{name}{suffix}", each)
+        assert (tmp_path / f"big{suffix}").read_bytes() == (tmp_path / f"little{suffix}").read_bytes()
+
+
 def test_larger_than_its_batches_and_what_does_not_pack(tmp_path, monkeypatch):
     monkeypatch.setattr(volume_writer, "_PIECE_BYTES", 2**12)
     monkeypatch.setattr(volume_writer, "_BATCH_BYTES", 2**14)

@@ -207,7 +207,9 @@ def test_the_browser_plays_both_sequences_into_a_volume_under_a_transform(folder
 def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
     target = tmp_path / "s"
     write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST)
+    (target / "volume-crop.nrrd").write_bytes(b"somebody's own")
     write_scene(target, [posed_sweep("image")], replace(REQUEST, with_images=False))
+    (target / "volume-crop.nrrd").unlink()
     stems = ("first-frame", "outlines", "scene", "state", "volume")
     assert sorted(path.name.split(".")[0].removesuffix("-image") for path in target.iterdir()) == [*stems]
 
