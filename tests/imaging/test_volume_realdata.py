@@ -38,7 +38,7 @@ def volumes(realdata):
     fixed = fixed_maps(np.array(maps), "nearest", 0, turned=True)
     rows, columns = frames.shape[1:]
     spans = np.array([[row, 0, columns] for row in range(rows)])
-    accumulator = Accumulator(plus.GetSize()[::-1], frames.dtype, "nearest", "mean", frames.size)
+    accumulator = Accumulator(plus.GetSize()[::-1], frames.dtype, "nearest", "mean", countable=True)
     accumulator.add(frames, np.ones_like(frames, np.float32), fixed, spans, 1)
     return *accumulator.finish(), sitk.GetArrayFromImage(plus).astype(np.float32)
 
