@@ -54,17 +54,22 @@ class Helix:
         return np.asarray(self.centre_mm) + np.stack([x, y, rise], axis=-1)
 
     def depth(self, points):
-        """By Newton's steps from the nearest of points close together along the helix."""
+        return self.tube_mm - np.linalg.norm(points - self.at(self.nearest_angle(points)), axis=-1)
+
+    def nearest_angle(self, points):
+        """Where along the helix is nearest, by Newton's steps from every turn."""
         last = 2 * np.pi * self.turns
         own = points - np.asarray(self.centre_mm)
         round_ = np.arctan2(own[..., 1], own[..., 0])
-        best = np.full(points.shape[:-1], np.inf)
+        best, nearest = np.full(points.shape[:-1], np.inf), np.zeros(points.shape[:-1])
         for turn in range(int(np.ceil(self.turns)) + 1):
             angle = np.clip(round_ + 2 * np.pi * turn, 0.0, last)
             for _ in range(6):
                 angle = np.clip(angle - self._step(own, angle), 0.0, last)
-            best = np.minimum(best, np.linalg.norm(points - self.at(angle), axis=-1))
-        return self.tube_mm - best
+            away = np.linalg.norm(points - self.at(angle), axis=-1)
+            nearest = np.where(away < best, angle, nearest)
+            best = np.minimum(best, away)
+        return nearest
 
     def _step(self, own, angle):
         """First over second derivative of half the squared distance."""

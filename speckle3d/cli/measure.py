@@ -11,27 +11,36 @@ from speckle3d.cli.common import Json, ReconstructionFile, app, emit, emit_json
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from speckle3d.core.arrays import FloatArray
     from speckle3d.imaging.measure import Measurement
 
 
 @app.command()
 def measure(
     source: ReconstructionFile,
-    mode: Annotated[
-        str, typer.Option(help="Which poses the points were picked at: image, orientation, pose, ...")
-    ] = "image",
     point: Annotated[
         list[str] | None,
         typer.Option(metavar="X,Y,Z", help="A point of the world, mm; repeat it, in order."),
     ] = None,
     points: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Points in a file, with columns x_mm,y_mm,z_mm.")
+        Path | None, typer.Option(metavar="CSV", help="Points in a file with columns x_mm,y_mm,z_mm.")
+    ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CUT.png",
+            help="Picture of `speckle3d reslice` in which the points were picked: X,Y then, by its axes.",
+        ),
+    ] = None,
+    mode: Annotated[
+        str | None,
+        typer.Option(help="Which poses the points were picked at: image (default), orientation, pose, ..."),
     ] = None,
     pick_mm: Annotated[
         float | None,
         typer.Option(
-            help="How well a point is picked, standard deviation per axis; by default half the "
-            "distance of the image's vectors."
+            help="How well a point is picked, standard deviation per axis; by default half the distance of "
+            "the image's vectors."
         ),
     ] = None,
     as_json: Json = False,
@@ -43,25 +52,38 @@ def measure(
     """
     from speckle3d.imaging.belonging import require_inside
     from speckle3d.imaging.measure import measured
-    from speckle3d.io.picks import parse_point, read_places
+    from speckle3d.io.picks import PICTURE, WORLD, parse_places, read_places
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.study.pose_errors import posed_errors_of
 
+    columns = WORLD if on is None else PICTURE
     if (points is None) == (not point):
-        raise InvalidInputError("expected --point X,Y,Z two or more times, or --points CSV")
+        wanted = "X,Y,Z" if on is None else "X,Y"
+        raise InvalidInputError(f"expected --point {wanted} two or more times, or --points CSV")
     if pick_mm is not None and not 0.0 <= pick_mm < float("inf"):
         raise InvalidInputError(f"--pick-mm: expected zero or more, got {pick_mm}")
+    places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
+    if on is not None:
+        places, mode = _in_world(on, places, mode)
     held = read_reconstruction(source, with_pairs=False)
-    errors = posed_errors_of(held, mode)
-    places = read_places(points) if points is not None else parse_point(point or [])
+    errors = posed_errors_of(held, mode or "image")
     near = require_inside(places, held.grid, errors.world_from_image)
     picked = held.grid.vector_pitch_mm / 2 if pick_mm is None else pick_mm
     found = measured(places, near, errors, picked)
+    told = f"mode {mode or 'image'}; points picked to {picked:.2g} mm per axis; 95 % in brackets"
     if as_json:
-        emit_json({"mode": mode, "pick_mm": picked, "measurements": [_plain(each) for each in found]})
+        rows = [_plain(each) for each in found]
+        emit_json({"mode": mode or "image", "pick_mm": picked, "measurements": rows})
     else:
-        lines = [_line(each) for each in found]
-        emit("\n".join([*lines, f"mode {mode}; points picked to {picked:.2g} mm per axis; 95 % in brackets"]))
+        emit("\n".join([*(_line(each) for each in found), told]))
+
+
+def _in_world(picture: Path, places: FloatArray, mode: str | None) -> tuple[FloatArray, str]:
+    """Points of the world that lie under points of a picture, and the mode whose poses it shows."""
+    from speckle3d.study.cut_geometry import read_plane
+
+    shown = read_plane(picture, mode)
+    return shown.cut.world_from_mm(places[:, 0], places[:, 1]), shown.mode
 
 
 def _plain(found: Measurement) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +15,8 @@ from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
-    from speckle3d.study.cuts import Place
+    from speckle3d.study.cuts import CutPicture
+    from speckle3d.study.places import Place
 
 Triple = tuple[float, float, float]
 
@@ -60,6 +63,16 @@ def reslice(
             help="CSV of a curve's points x_mm,y_mm,z_mm in the world: cut along it and into the depth."
         ),
     ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CUT.png",
+            help="Picture of `speckle3d reslice` with the curve's points: x_mm,y_mm then, by its axes.",
+        ),
+    ] = None,
+    straight: Annotated[
+        bool, typer.Option("--straight", help="Join the curve's points by straight lines, not by a spline.")
+    ] = False,
     outlines: Annotated[bool, typer.Option("--outlines", help="Draw where the frames are instead.")] = False,
     volume: Annotated[Path | None, typer.Option(help="Cut this volume of the sweep, not its frames.")] = None,
     pixel_mm: Annotated[float, typer.Option(help="Side of a pixel.")] = 0.2,
@@ -69,14 +82,16 @@ def reslice(
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
     from speckle3d.io.volume_writer import SUFFIXES
-    from speckle3d.study.cuts import Place
+    from speckle3d.study.places import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)
-    require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, volume)
+    require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, on, volume)
     _require_one_place(
         {"--lateral-mm": lateral_mm if frame is None else None, "--depth-mm": depth_mm, "--frame": frame,
          "--points": points, "--origin": origin, "--curve": curve}
     )  # fmt: skip
+    _require_together({"--angle-deg": angle_deg or None, "--frame": frame}, {"--on": on, "--curve": curve},
+                      {"--right": right, "--origin": origin})  # fmt: skip
     place = Place(
         lateral_mm,
         depth_mm,
@@ -86,47 +101,64 @@ def reslice(
         _vector(origin),
         _vector(right),
         _vector(down),
-        None if curve is None else _curve(curve),
+        smooth=not straight,
         pixel_mm=pixel_mm,
         reach_mm=reach_mm,
     )
+
+    def located(mode: str | None) -> Place:
+        return place if curve is None else replace(place, curve_mm=_curve(curve, on, mode))
+
     modes = tuple(mode or ())
     if outlines:
         _draw_outlines(source, out, modes, difference_to, sweep_file)
-        return
-    if _is_volume(source):
+    elif _is_volume(source):
         _require_no_modes(modes, difference_to, volume)
-        _cut_volume(source, out, place, as_volume)
+        _cut_volume(source, out, located(None))
     else:
-        _cut_sweep(source, out, place, modes, difference_to, volume, sweep_file, dynamic_range_db)
+        _cut_sweep(source, out, located, (modes, difference_to), volume, sweep_file, dynamic_range_db)
 
 
 def _cut_sweep(
     source: Path,
     out: Path,
-    place: Place,
-    modes: tuple[str, ...],
-    difference_to: str | None,
+    located: Callable[[str | None], Place],
+    compared: tuple[tuple[str, ...], str | None],
     volume: Path | None,
     sweep_file: Path | None,
     dynamic_range_db: float,
 ) -> None:
-    from speckle3d.io.volumes import read_volume, write_volume
-    from speckle3d.study.cuts import cut_as_volume, cut_posed, open_modes
-    from speckle3d.study.reslice_figures import save_reslices
+    from speckle3d.io.volumes import read_volume
+    from speckle3d.study.cuts import cut_posed, open_modes
 
-    opened = open_modes(source, modes, difference_to, sweep_file)
-    as_volume = not out.name.lower().endswith(".png")
-    if (as_volume or volume is not None) and len(opened.poses) > 1:
-        what = "a volume file" if as_volume else "--volume"
-        raise InvalidInputError(f"--mode: expected one mode for {what}, got {', '.join(opened.poses)}")
+    opened = open_modes(source, *compared, sweep_file)
+    if volume is not None and len(opened.poses) > 1:
+        raise InvalidInputError(f"--mode: expected one beside --volume, got {', '.join(opened.poses)}")
     voxels = None if volume is None else read_volume(volume)
+    place = located(opened.reference)
     with progress_bar(f"reslicing {out.name}") as progress:
         picture = cut_posed(opened, place, dynamic_range_db, voxels, progress)
-    if not as_volume:
+    _write(picture, out)
+
+
+def _cut_volume(source: Path, out: Path, place: Place) -> None:
+    from speckle3d.io.volumes import read_volume
+    from speckle3d.study.cuts import cut_voxels
+
+    _write(cut_voxels(read_volume(source), place, source.name), out)
+
+
+def _write(picture: CutPicture, out: Path) -> None:
+    """Write a cut as a volume of one plane if the name says so, else as a picture."""
+    from speckle3d.io.volume_writer import SUFFIXES
+    from speckle3d.io.volumes import write_volume
+    from speckle3d.study.cuts import cut_as_volume
+    from speckle3d.study.reslice_figures import save_reslices
+
+    if out.name.lower().endswith(SUFFIXES):
+        write_volume(out, cut_as_volume(picture))
+    else:
         save_reslices(picture, out)
-        return
-    write_volume(out, cut_as_volume(picture))
 
 
 def _draw_outlines(
@@ -144,18 +176,6 @@ def _draw_outlines(
     save_figure(figure_outlines(outlines, opened.posed.sweep.name), out)
 
 
-def _cut_volume(source: Path, out: Path, place: Place, as_volume: bool) -> None:
-    from speckle3d.io.volumes import read_volume, write_volume
-    from speckle3d.study.cuts import cut_as_volume, cut_voxels
-    from speckle3d.study.reslice_figures import save_reslices
-
-    picture = cut_voxels(read_volume(source), place, source.name)
-    if as_volume:
-        write_volume(out, cut_as_volume(picture))
-    else:
-        save_reslices(picture, out)
-
-
 def _is_volume(path: Path) -> bool:
     from speckle3d.cli.outputs import is_volume
 
@@ -166,6 +186,14 @@ def _require_one_place(given: dict[str, object]) -> None:
     named = [name for name, value in given.items() if value is not None]
     if len(named) > 1:
         raise InvalidInputError(f"expected one of {', '.join(given)}; got {' and '.join(named)}")
+
+
+def _require_together(*pairs: dict[str, object]) -> None:
+    """Refuse an option, the first of each pair, without the one it belongs to."""
+    for pair in pairs:
+        (name, value), (other, needed) = pair.items()
+        if value is not None and needed is None:
+            raise InvalidInputError(f"{name}: expected {other} with it, got none")
 
 
 def _require_no_modes(modes: tuple[str, ...], difference_to: str | None, volume: Path | None) -> None:
@@ -181,29 +209,17 @@ def _vector(values: Triple | None) -> FloatArray | None:
 
 
 def _points(text: str | None) -> FloatArray | None:
-    import numpy as np
+    from speckle3d.io.picks import parse_places
 
-    from speckle3d.io.text import numbers
-
-    if text is None:
-        return None
-    return np.array([numbers(word.replace(",", " "), 3, "--points") for word in text.split()])
+    return None if text is None else parse_places(text.split(), option="--points")
 
 
-def _curve(path: Path) -> FloatArray:
-    """Points of a CSV with the heading ``x_mm,y_mm,z_mm``; more columns are ignored."""
-    import numpy as np
+def _curve(path: Path, picture: Path | None, mode: str | None) -> FloatArray:
+    """Points of a curve in the world, read as such or as points of a picture of the mode."""
+    from speckle3d.io.picks import PICTURE, WORLD, read_places
+    from speckle3d.study.cut_geometry import read_plane
 
-    from speckle3d.io.text import numbers, text_lines
-
-    wanted = ("x_mm", "y_mm", "z_mm")
-    lines = ((number, line) for number, line in text_lines(path) if not line.startswith("#"))
-    number, heading = next(lines, (1, ""))
-    columns = [name.strip() for name in heading.split(",")]
-    if not set(wanted) <= set(columns):
-        raise InvalidInputError(
-            f"{path}: line {number}: expected columns {','.join(wanted)}, got {heading[:60]!r}"
-        )
-    at = [columns.index(name) for name in wanted]
-    rows = [numbers(line.replace(",", " "), len(columns), f"{path}: line {number}") for number, line in lines]
-    return np.array(rows, dtype=float).reshape(len(rows), len(columns))[:, at]
+    if picture is None:
+        return read_places(path, WORLD)
+    x, y = read_places(path, PICTURE).T
+    return read_plane(picture, mode).cut.world_from_mm(x, y)

@@ -12,9 +12,11 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from speckle3d.core.arrays import BoolArray
     from speckle3d.core.pose_errors import PosedErrors
     from speckle3d.core.surface import Surface
     from speckle3d.core.sweep import ImageGrid
+    from speckle3d.core.volume import Volume
 
 
 @app.command()
@@ -41,7 +43,17 @@ def surface(
             help="reconstruction.h5 that VOLUME was made from, for standard errors of area and volume."
         ),
     ] = None,
-    mode: Annotated[str, typer.Option(help="Poses that VOLUME was made at.")] = "image",
+    mode: Annotated[
+        str | None,
+        typer.Option(help="Poses that VOLUME was made at, if its file does not say (image)."),
+    ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            help="Which voxels are empty, from `speckle3d volume --state`; without it, of a volume of whole "
+            "numbers, zeros that reach its border."
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Find the surface where a volume crosses a grey level, or those of its labels, and measure them.
@@ -54,19 +66,22 @@ def surface(
 
     if labels == (level is not None):
         raise InvalidInputError("expected --level or --labels, one of them")
+    if labels and (below or state is not None):
+        raise InvalidInputError("--labels: expected no --below and no --state beside it")
     if smooth < 0:
         raise InvalidInputError(f"--smooth: expected zero or more passes, got {smooth}")
     suffix = require_suffix(out)
-    errors, grid = _errors(reconstruction, mode)
     volume = read_volume(source)
+    errors, grid = _errors(reconstruction, mode or volume.fields.get("poses", "image"))
+    known = None if state is None else _known(volume, state)
     found: dict[str, Surface] = {}
     if labels:
         for label, each in surfaces_of_labels(volume).items():
             found[str(out.with_name(f"{out.stem}-{label}{suffix}"))] = each
     else:
-        found[str(out)] = surface_of(volume, level or 0.0, "below" if below else "above")
+        found[str(out)] = surface_of(volume, level or 0.0, "below" if below else "above", known)
     for place in found:
-        require_own_place(Path(place), "surface", source, reconstruction)
+        require_own_place(Path(place), "surface", source, reconstruction, state)
     told = []
     for place, each in found.items():
         whole = largest_part(each) if largest else each
@@ -77,6 +92,19 @@ def surface(
         emit_json(told)
     else:
         emit("\n".join(_line(each) for each in told))
+
+
+def _known(volume: Volume, path: Path) -> BoolArray:
+    """Voxels that are not empty by a state file."""
+    from speckle3d.io.volumes import read_volume
+
+    state = read_volume(path)
+    if state.shape != volume.shape:
+        raise InvalidInputError(
+            f"--state: expected {volume.shape} voxels, as the volume's, got {state.shape}"
+        )
+    empty: BoolArray = state.voxels == 0
+    return ~empty
 
 
 def _errors(path: Path | None, mode: str) -> tuple[PosedErrors | None, ImageGrid | None]:

@@ -67,7 +67,7 @@ class Belonging:
     frames : ndarray of int, shape (k, 2)
     weights : ndarray, shape (k, 2)
     gap_mm : ndarray, shape (k,)
-        Distance to the nearer frame's plane.
+        Distance to the nearer frame's image; of points between two frames, within its plane.
     """
 
     frames: IntArray
@@ -115,6 +115,37 @@ class PosedErrors:
             error = self.errors.factors[:, frames]
             moved += weight * (error[:, :, :3] + np.cross(error[:, :, 3:], points - centres[frames]))
         return np.asarray(moved @ self._axes().as_matrix().T)
+
+    def variance(self, points_mm: FloatArray, directions: FloatArray, belonging: Belonging) -> FloatArray:
+        """Variance of points' places along directions, shape (k,), mm2; frames of a pair must be neighbours.
+
+        The same as by `displacements`, from covariances of frames and of neighbours: for many points.
+
+        Parameters
+        ----------
+        points_mm, directions : ndarray, shape (k, 3)
+            In the world; directions of length one.
+        """
+        factors = self.errors.factors
+        along = self._axes().inv()
+        centres = along.apply(self.world_from_image.apply(self.centre_mm))
+        points, towards = along.apply(points_mm), along.apply(directions)
+        arms = [
+            weight[:, None] * np.concatenate([towards, np.cross(points - centres[frame], towards)], axis=1)
+            for frame, weight in zip(belonging.frames.T, belonging.weights.T, strict=True)
+        ]
+        own, next_ = self.errors.covariance(), np.einsum("mia,mib->iab", factors[:, :-1], factors[:, 1:])
+        total = sum(
+            np.einsum("ka,kab,kb->k", arm, own[frame], arm, optimize=True)
+            for arm, frame in zip(arms, belonging.frames.T, strict=True)
+        )
+        first, second = belonging.frames.T
+        forward = second > first
+        pair = (
+            next_[np.clip(np.minimum(first, second), 0, max(len(next_) - 1, 0))] if len(next_) else own[first]
+        )
+        pair = np.where(forward[:, None, None], pair, pair.transpose(0, 2, 1))
+        return np.asarray(total + 2.0 * np.einsum("ka,kab,kb->k", arms[0], pair, arms[1], optimize=True))
 
     def of_gradient(self, points_mm: FloatArray, gradient: FloatArray, belonging: Belonging) -> FloatArray:
         """What a quantity changes by for one deviation of each variable, shape (m,).

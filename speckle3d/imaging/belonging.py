@@ -10,61 +10,58 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.pose_errors import Belonging
 from speckle3d.core.sweep import ImageGrid
 
-_AT_ONCE = 2**22
-"""Points times frames worked on at a time: some 100 MB."""
+REACH_MM = 0.5
+"""Points no farther from the sweep than this are taken to be in it."""
+_AT_ONCE = 2**20
+"""Points times frames worked on at a time: some 40 MB."""
 
 
-def belonging_of(
-    points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform, margin_mm: float = 1e-6
-) -> Belonging:
+def belonging_of(points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform) -> Belonging:
     """Find the frame nearest to each point, and its neighbour on the point's other side.
 
-    Nearest is the frame with the least distance to its plane, among those into whose image, grown by
-    `margin_mm` on all sides, the point projects; if there is none, among all. The neighbour is the frame
-    before or after it on whose other side the point lies; weights are as the distances to the planes have it.
-    Past the last frame the nearest counts alone.
+    Nearest is the frame with the least distance to its image, the rectangle. The neighbour is the frame
+    before or after it on whose other side the point lies; weights are as the distances to the two planes have
+    it. Past the last frame the nearest counts alone.
 
     Parameters
     ----------
     points_mm : ndarray, shape (k, 3)
         In the world.
+    grid : ImageGrid
     world_from_image : RigidTransform, length n
-
-    Returns
-    -------
-    Belonging
-        ``gap_mm`` is infinite for points that project into no image.
     """
     points = np.asarray(points_mm, dtype=float).reshape(-1, 3)
     frames = np.zeros((len(points), 2), dtype=np.int64)
-    weights, gap = np.tile([1.0, 0.0], (len(points), 1)), np.full(len(points), np.inf)
+    weights, gap = np.tile([1.0, 0.0], (len(points), 1)), np.zeros(len(points))
     image_from_world = world_from_image.inv().as_matrix()
     rows = max(_AT_ONCE // len(world_from_image), 1)
     for first in range(0, len(points), rows):
         some = slice(first, first + rows)
-        _place(points[some], image_from_world, grid, margin_mm, frames[some], weights[some], gap[some])
+        _place(points[some], image_from_world, grid, frames[some], weights[some], gap[some])
     return Belonging(frames, weights, gap)
 
 
 def require_inside(
-    points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform, reach_mm: float = 0.5
+    points_mm: FloatArray, grid: ImageGrid, world_from_image: RigidTransform, reach_mm: float = REACH_MM
 ) -> Belonging:
-    """Find frames of points inside the sweep: in an image, and between frames or within `reach_mm` of one.
+    """Find frames of points in the sweep: between two frames, or within `reach_mm` of that.
 
     Raises
     ------
     InvalidInputError
         Naming the first point that lies outside.
     """
+    lost = np.flatnonzero(~np.isfinite(points_mm).all(axis=1))
+    if lost.size:
+        raise InvalidInputError(f"point {lost[0] + 1}: expected a point in the sweep, got one beyond the cut")
     found = belonging_of(points_mm, grid, world_from_image)
-    outside = np.flatnonzero((found.gap_mm > reach_mm) & (found.weights[:, 1] == 0.0))
+    outside = np.flatnonzero(found.gap_mm > reach_mm)
     if outside.size:
         row = int(outside[0])
         x, y, z = points_mm[row]
-        near = found.gap_mm[row]
-        words = "in no frame's image" if np.isinf(near) else f"{near:.2f} mm past the nearest frame"
         raise InvalidInputError(
-            f"point {row + 1} ({x:g}, {y:g}, {z:g}): expected a point inside the sweep, got one {words}"
+            f"point {row + 1} ({x:g}, {y:g}, {z:g}): expected a point in the sweep, got one "
+            f"{found.gap_mm[row]:.2f} mm from its nearest image: is it a point of this mode's world?"
         )
     return found
 
@@ -73,21 +70,18 @@ def _place(
     points: FloatArray,
     image_from_world: FloatArray,
     grid: ImageGrid,
-    margin_mm: float,
     frames: IntArray,
     weights: FloatArray,
     gap: FloatArray,
 ) -> None:
     """Fill the rows of some points."""
     q = points @ image_from_world[:, 2, :3].T + image_from_world[:, 2, 3]
-    away = np.abs(q)
-    anywhere = away.argmin(axis=1)
+    beside = np.zeros_like(q)
     for axis, (low, high) in enumerate(((0.0, grid.width_mm), (grid.first_sample_depth_mm, grid.depth_mm))):
         at = points @ image_from_world[:, axis, :3].T + image_from_world[:, axis, 3]
-        away[(at < low - margin_mm) | (at > high + margin_mm)] = np.inf
+        beside += (at - np.clip(at, low, high)) ** 2
+    away = q**2 + beside
     row, best = np.arange(len(points)), away.argmin(axis=1)
-    gap[:] = away[row, best]
-    best = np.where(np.isinf(gap), anywhere, best)
     frames[:, 0], own = best, q[row, best]
     for step in (-1, 1):
         other = np.clip(best + step, 0, q.shape[1] - 1)
@@ -97,3 +91,4 @@ def _place(
         across &= (weights[:, 1] == 0.0) | (share > weights[:, 1])
         frames[across, 1] = other[across]
         weights[across] = np.column_stack([1.0 - share, share])[across]
+    gap[:] = np.sqrt(np.where(weights[:, 1] > 0.0, beside[row, best], away[row, best]))

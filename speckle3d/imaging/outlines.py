@@ -9,6 +9,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import require_poses
 
+_ON_PLANE_MM = 1e-6
+
 
 def frame_outlines(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
     """Closed outline of every frame, through the centres of its corner samples.
@@ -52,6 +54,7 @@ def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> Floa
     """
     n = len(outlines_mm)
     there = world_from_plane.inv().apply(outlines_mm.reshape(-1, 3)).reshape(n, 5, 3)
+    there[np.abs(there[..., 2]) < _ON_PLANE_MM, 2] = 0.0
     # Along each edge of the outline from 0 at its first corner; edges count from the top one, clockwise.
     start, change = there[:, :-1], np.diff(there, axis=1)
     # A corner on the plane counts as in front of it, so that every line has two ends.
@@ -63,3 +66,44 @@ def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> Floa
     ends = np.take_along_axis(at, nearer[..., None], axis=1)
     ends[crossed.sum(axis=1) != 2] = np.nan
     return ends
+
+
+def sheet_crossings(
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    base_mm: FloatArray,
+    down: FloatArray,
+    heights_mm: FloatArray,
+) -> FloatArray:
+    """Lines in which frames cross a curved sheet, where each crosses it first.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    base_mm : ndarray, shape (columns, 3)
+        Tops of the sheet's columns, in the world.
+    down : ndarray, shape (3,)
+        Unit vector along the columns.
+    heights_mm : ndarray, shape (m,)
+        Along the columns from their tops.
+
+    Returns
+    -------
+    ndarray, shape (n, m)
+        Column, fractional, at every height; NaN where the frame does not cross the sheet.
+    """
+    found = np.full((len(world_from_image), len(heights_mm)), np.nan)
+    for frame, pose in enumerate(world_from_image):
+        image_from_world = pose.inv()
+        for row, height in enumerate(heights_mm):
+            points = image_from_world.apply(base_mm + height * down)
+            at = np.flatnonzero((points[:-1, 2] < 0) != (points[1:, 2] < 0))
+            share = points[at, 2] / (points[at, 2] - points[at + 1, 2])
+            x, y, _ = (points[at] + share[:, None] * (points[at + 1] - points[at])).T
+            inside = (
+                (x >= 0) & (x <= grid.width_mm) & (y >= grid.first_sample_depth_mm) & (y <= grid.depth_mm)
+            )
+            if inside.any():
+                found[frame, row] = (at + share)[inside][0]
+    return found

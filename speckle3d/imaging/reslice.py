@@ -6,23 +6,22 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
+from speckle3d.imaging.nearest import LookUp, NearestImages, in_one_pass
 from speckle3d.imaging.planes import ReslicePlane as ReslicePlane
 from speckle3d.imaging.planes import image_plane
-
-_BATCH = 16
-"""Images read at a time: enough for milliseconds of work per thread, few enough for memory."""
 
 _GRAIN = 32
 """Lines of a cut below which a slice is not worth another thread's while."""
@@ -83,29 +82,27 @@ def reslice_frames(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    from speckle3d.kernels.cuts import keep_nearest
+    return reslice_at(images, grid, [(world_from_image, cut)], max_distance_mm)[0]
 
-    if not (np.isfinite(max_distance_mm) and max_distance_mm > 0):
-        raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {max_distance_mm}")
-    source = PosedImages(images, grid, world_from_image)
-    maps, lines = _index_from_world(source), cut.lines()
-    near = np.flatnonzero(_touches(maps, grid, cut.hull_mm, max_distance_mm))
-    shape = (2, len(lines), cut.shape[1] if cut.along_rows else cut.shape[0])
-    distance_mm = np.full(shape, max_distance_mm, dtype=np.float32)
-    grey = np.full(shape, np.nan, dtype=np.float32)
-    for start in range(0, len(near), _BATCH):
-        batch = near[start : start + _BATCH]
-        images_read = [source.read(int(index)) for index in batch]
 
-        def fill(first: int, stop: int) -> None:
-            band = slice(first, stop)
-            for image, index in zip(images_read, batch, strict=True):  # noqa: B023 (done within the batch)
-                kept = distance_mm[:, band], grey[:, band]
-                keep_nearest(image, maps[index], lines[band], max_distance_mm, *kept)
-
-        in_parallel(fill, len(lines), _GRAIN)
-    blended = _blend(distance_mm, grey)
-    return blended if cut.along_rows else np.ascontiguousarray(blended.T)
+def reslice_at(
+    images: Images,
+    grid: ImageGrid,
+    wanted: Sequence[tuple[RigidTransform, Cut]],
+    max_distance_mm: float,
+) -> list[Float32Array]:
+    """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`."""
+    sought = [
+        LookUp(
+            NearestImages(PosedImages(images, grid, poses), max_distance_mm),
+            cut.lines(),
+            _points_per_line(cut),
+            cut.hull_mm,
+        )
+        for poses, cut in wanted
+    ]
+    found = in_one_pass(sought)
+    return [_upright(cut, sides.blended()[0]) for sides, (_, cut) in zip(found, wanted, strict=True)]
 
 
 def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
@@ -155,49 +152,26 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
     held = np.empty(0, np.uint8) if state is None else _flat(state.astype(np.uint8, copy=False), order)
     index_from_world = np.array(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
     lines, sides = cut.lines(), np.array(volume.shape)
-    out = np.empty((len(lines), cut.shape[1] if cut.along_rows else cut.shape[0]), np.float32)
+    out = np.empty((len(lines), _points_per_line(cut)), np.float32)
 
     def fill(first: int, stop: int) -> None:
         band = slice(first, stop)
         cut_voxels(flat, held, strides, sides, index_from_world, lines[band], out[band])
 
     in_parallel(fill, len(lines), _GRAIN)
-    return out if cut.along_rows else np.ascontiguousarray(out.T)
+    return _upright(cut, out)
+
+
+def _points_per_line(cut: Cut) -> int:
+    rows, columns = cut.shape
+    return columns if cut.along_rows else rows
+
+
+def _upright(cut: Cut, lines: Float32Array) -> Float32Array:
+    """Lines of a cut as an image, shape (rows, columns)."""
+    return lines if cut.along_rows else np.ascontiguousarray(lines.T)
 
 
 def _flat(values: npt.NDArray[Any], order: Literal["C", "F"]) -> npt.NDArray[Any]:
     """Values as they follow in memory, without a copy where that is the order already."""
     return np.asarray(values, order=order).ravel(order)
-
-
-def _index_from_world(source: PosedImages) -> FloatArray:
-    """Per image, the map from the world to (vector, sample, distance in mm): (n, 3, 4)."""
-    image_from_world = source.world_from_image.inv().as_matrix()
-    maps = source.index_from_image() @ image_from_world
-    # "Behind" and "in front" must mean the same for all images, or neighbours of opposite facing
-    # (a probe turned round between two passes) would compete for one side and leave the other empty.
-    normal = image_from_world[:, 2, :3]
-    turned = normal @ normal.sum(axis=0) < 0
-    maps[turned, 2] *= -1.0
-    return np.ascontiguousarray(maps)
-
-
-def _touches(maps: FloatArray, grid: ImageGrid, hull_mm: FloatArray, max_distance_mm: float) -> BoolArray:
-    """Whether each image's slab can reach the cut: no slab face has all of the cut's hull beyond it."""
-    u, v, q = np.moveaxis(maps[:, :, :3] @ hull_mm.T + maps[:, :, 3:], 1, 0)
-    reach = (
-        (u, 0.0, grid.vectors - 1.0),
-        (v, 0.0, grid.samples - 1.0),
-        (q, -max_distance_mm, max_distance_mm),
-    )
-    near = [(c.max(axis=1) > low - 1e-3) & (c.min(axis=1) < high + 1e-3) for c, low, high in reach]
-    return np.asarray(near[0] & near[1] & near[2])
-
-
-def _blend(distance_mm: Float32Array, grey: Float32Array) -> Float32Array:
-    """Interpolate between the nearest images of either side, or take the only one there is."""
-    gap = distance_mm.sum(axis=0)
-    share = np.divide(distance_mm[0], gap, out=np.zeros_like(gap), where=gap > 0)
-    between = grey[0] + share * (grey[1] - grey[0])
-    alone = np.where(np.isnan(grey[0]), grey[1], grey[0])
-    return np.asarray(np.where(np.isnan(between), alone, between), dtype=np.float32)

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
+from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.threads import in_parallel
+from speckle3d.imaging.backward import BYTES_PER_VOXEL, backward_slabs
 from speckle3d.imaging.grid import Slab, VoxelGrid
-from speckle3d.imaging.holes import fill_holes
+from speckle3d.imaging.holes import boxes_within, cubes_within, fill_holes
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
@@ -38,7 +39,8 @@ def compound_slabs(
     source : PosedImages
     voxel_grid : VoxelGrid
     settings : CompoundingSettings, optional
-        `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have them.
+        `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have them. With
+        `backward_mm` neither are `splat`, `rule` and the filling's.
     weights : ndarray of shape (n,), or images of weights, optional
         For the rule "weighted"; samples whose weight is 0 or NaN do not count.
     region : ndarray of bool, shape (vector, sample), optional
@@ -61,6 +63,10 @@ def compound_slabs(
             f"volume: expected at most {chosen.max_file_gb:g} GB, got {size:.3g} GB for {voxel_grid}: take "
             "larger voxels, or check the poses"
         )
+    if chosen.backward_mm > 0:
+        for slab in backward_slabs(source, voxel_grid, chosen.backward_mm, region, chosen.max_memory_gb):
+            yield Slab(slab.first, as_type(slab.voxels, slab.state, chosen.voxel_type), slab.state)
+        return
     placed = Placed.on(voxel_grid, source, weights, region)
     planes = planes_per_slab(voxel_grid, chosen, batch_gb(source))
     for first in range(0, voxel_grid.shape[2], planes):
@@ -76,7 +82,7 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
         If less than a thin slab would.
     """
     n_i, n_j, n_k = voxel_grid.shape
-    around, most = 2 * settings.fill_radius, settings.max_memory_gb
+    around, most = 2 * _halo(boxes_of(voxel_grid, settings)), settings.max_memory_gb
     if working_gb(voxel_grid, settings, frames_gb) <= most:
         return n_k
     # Whoever takes the slabs still has the one before.
@@ -101,18 +107,31 @@ def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: 
 def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:
     size = np.dtype(settings.voxel_type).itemsize
     n_i, n_j, _ = voxel_grid.shape
-    return n_i * n_j * (bytes_per_voxel(settings.splat, settings.rule) + size) / 1e9
+    splatting = bytes_per_voxel(settings.splat, settings.rule)
+    return n_i * n_j * ((BYTES_PER_VOXEL if settings.backward_mm > 0 else splatting) + size) / 1e9
 
 
 def _slab(
     placed: Placed, voxel_grid: VoxelGrid, settings: CompoundingSettings, first: int, stop: int
 ) -> Slab:
-    below = max(first - settings.fill_radius, 0)
-    above = min(stop + settings.fill_radius, voxel_grid.shape[2])
+    boxes = boxes_of(voxel_grid, settings)
+    below, above = max(first - _halo(boxes), 0), min(stop + _halo(boxes), voxel_grid.shape[2])
     voxels, state = splat_block(placed, voxel_grid, settings.splat, settings.rule, below, above)
-    fill_holes(voxels, state, settings.fill_radius, first - below, stop - below)
+    fill_holes(voxels, state, boxes, first - below, stop - below)
     own = slice(first - below, stop - below)
     return Slab(first, as_type(voxels[own], state[own], settings.voxel_type), state[own])
+
+
+def boxes_of(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> IntArray:
+    """Boxes from which holes are filled, smallest first, shape (n, 3): half edges along k, j and i."""
+    if settings.fill_mm > 0:
+        return boxes_within(settings.fill_mm, voxel_grid.spacing_mm)
+    return cubes_within(settings.fill_radius)
+
+
+def _halo(boxes: IntArray) -> int:
+    """Planes beyond a slab that boxes reach."""
+    return int(boxes[:, 0].max(initial=0))
 
 
 def as_type(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:

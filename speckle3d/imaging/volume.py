@@ -54,6 +54,7 @@ def compound(
     weights: Weights | None = None,
     region: BoolArray | None = None,
     fill_radius: int = DEFAULT_FILL_RADIUS,
+    backward_mm: float = 0.0,
     voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
     max_memory_gb: float = MAX_MEMORY_GB,
@@ -85,6 +86,10 @@ def compound(
     fill_radius : int
         Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
         stay empty. The volume also grows by so many voxels beyond the first and the last frame.
+    backward_mm : float
+        For sparse sweeps: if above zero, each voxel is interpolated between the images nearest on either
+        side, up to this far from it, without `splat`, `rule` and `fill_radius`; see
+        `speckle3d.imaging.backward`.
     voxel_type : {"float32", "uint8", "int16", "uint16"}
         With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
         are 0.
@@ -132,6 +137,7 @@ def compound(
             splat=splat,
             rule=rule,
             fill_radius=fill_radius,
+            backward_mm=backward_mm,
             voxel_type=voxel_type,
             max_memory_gb=max_memory_gb,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -88,8 +89,17 @@ def read_surface(path: PathLike) -> Surface:
         raise FileError(f"{path}: cannot be read as {suffix[1:].upper()}: {one_line(error)}") from error
     if not triangles:
         raise InvalidInputError(f"{path}: expected triangles, got none")
+    promised = _promised_cells(Path(path))
+    if promised is not None and promised != sum(len(block.data) for block in mesh.cells):
+        raise FileError(f"{path}: cannot be read: it ends before its {promised} triangles do")
     with naming(str(path)):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
+
+
+def _promised_cells(path: Path) -> int | None:
+    """Number of cells that a VTK file says it has; the other readers find missing ones themselves."""
+    found = re.search(rb"\nCELLS (\d+) ", path.read_bytes()) if path.suffix.lower() == ".vtk" else None
+    return None if found is None else int(found[1])
 
 
 def require_suffix(path: PathLike) -> str:

@@ -95,8 +95,9 @@ def save_cuts(
     ]
     record = json.dumps({"version": VERSION, **(words or {}), "cuts": told})
     with atomic_path(path) as part:
-        drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-        imsave(part, drawn, format="png", dpi=DOTS_PER_INCH, metadata={KEYWORD: record})
+        drawn = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
+        imsave(part, drawn, format="png", dpi=DOTS_PER_INCH, metadata={KEYWORD: record},
+               pil_kwargs={"compress_level": 3})  # fmt: skip
     return path
 
 

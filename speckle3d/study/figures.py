@@ -39,7 +39,7 @@ _MODES = {
 
 _SPARE_COLOURS = ("#F0E442", "#999999", "#44AA99")
 _REFERENCE_COLOUR = "#000000"
-_UNSEEN = "#33415c"
+UNSEEN = "#33415c"
 """Blue-grey of a reslice's pixels that no frame reached."""
 
 _DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)))
@@ -220,7 +220,7 @@ def show_grey(
     levels: tuple[float, float],
 ) -> None:
     """Draw an image in grey from the first of the levels (black) to the second; blue-grey where it is NaN."""
-    greys = colormaps["gray"].with_extremes(bad=_UNSEEN)
+    greys = colormaps["gray"].with_extremes(bad=UNSEEN)
     axes.imshow(image, cmap=greys, vmin=levels[0], vmax=levels[1], aspect="equal", extent=extent_mm,
                 interpolation="nearest")  # fmt: skip
 
@@ -247,7 +247,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
 
 
 def new_figure(
-    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
+    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] | None = "constrained"
 ) -> Figure:
     """Make a figure that needs no window system."""
     figure = Figure(figsize=(width_in, height_in), layout=layout)

@@ -33,11 +33,12 @@ from speckle3d.pipeline import Progress, Tracked, after, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
 from speckle3d.study.crossed import Companion
-from speckle3d.study.cuts import CutPicture, DrawnCut, frame_lines
+from speckle3d.study.cuts import CutPicture, DrawnCut
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_planes
+from speckle3d.study.places import view_of
 from speckle3d.study.request import SUBSET, Request, require_possible
 from speckle3d.study.reslice_figures import save_reslices
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
@@ -313,7 +314,8 @@ def _draw_reslices(
     cuts = {}
     for mode, world_from_image in shown.items():
         image = cut_frames(strip, strip.grid, world_from_image, planes[mode])
-        cuts[mode] = DrawnCut(image, planes[mode], frame_lines(planes[mode], strip.grid, world_from_image))
+        cuts[mode] = DrawnCut.of_sweep(image, planes[mode], strip.grid, world_from_image)
     first = next(iter(shown)) if len(shown) > 1 else None
-    where = f"at lateral {strip.left_mm + strip.grid.width_mm / 2:.4g} mm"
+    view = view_of(planes[compared or "image"], shown[compared or "image"])
+    where = f"at lateral {strip.left_mm + strip.grid.width_mm / 2:.4g} mm, {view}".removesuffix(", ")
     return save_reslices(CutPicture(cuts, place=where, reference=compared or first, name=name), path)

@@ -26,7 +26,8 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
     `image`: what the file holds. `crossed`, `inertial`, `fused`: their own claims; the claimed error of the
     length stretches the whole sweep, and the rest has grown from frame to frame. `orientation`: the images'
     error of length, with the angles' errors of the sensor, which bend the path. `pose` and `image+subset`
-    claim nothing and are taken to be no better than the images.
+    claim nothing and are taken to be no better than the images; in `pose` the sweep's direction is further as
+    uncertain as the image's place on the tracker is.
 
     Parameters
     ----------
@@ -53,10 +54,18 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
         stretched = SharedErrors(0.0, own.length_sigma, np.zeros(2))
         return joint_errors(own.covariance, poses, centre, stretched)
     image = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
-    if mode != "orientation":
-        return image
     config = config_from_toml(reconstruction.config_toml) if reconstruction.config_toml else Config()
-    return _sensed(image, poses, centre, reconstruction.frame_time_s, config)
+    if mode == "orientation":
+        return _sensed(image, poses, centre, reconstruction.frame_time_s, config)
+    return _tracked(image, poses, centre, config) if mode == "pose" else image
+
+
+def _tracked(image: PoseErrors, poses: RigidTransform, centre_mm: FloatArray, config: Config) -> PoseErrors:
+    """Errors of the images, and a path that goes off at an angle as the image may sit on the tracker."""
+    path = (poses[0].inv() * poses).apply(centre_mm) - centre_mm
+    factors = np.zeros((3, len(poses), 6))
+    factors[:, :, :3] = np.cross(config.fused.mounting_sigma_rad * np.eye(3)[:, None], path)
+    return PoseErrors(np.concatenate([image.factors, factors]))
 
 
 def _sensed(

@@ -1,18 +1,21 @@
-"""Pictures of reslices: cuts side by side under one grey scale, and what sets each apart from a reference.
+"""Pictures of reslices: cuts of several modes under one grey scale, and what sets them apart.
 
-Below each cut it is laid over the reference's, the first frames on each other: what both show at one place is
-grey, what only one shows is green or magenta. Lines are where some of the frames cross the cut; arrows lead
-from where the reference has a frame to where the mode has it.
+Each cut is also laid over the reference's, the first frames on each other: what both show at one place is
+grey, what only this mode shows is magenta, what only the reference shows is green. Below, on a scale of its
+own, stands where every mode has the frames along the sweep: a mode that is too long has a longer row.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
@@ -20,17 +23,24 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.study.cut_geometry import save_cuts
+from speckle3d.study.cut_panels import add_axes_in, laid_out, name_axes
 from speckle3d.study.cuts import CutPicture, DrawnCut
-from speckle3d.study.figures import colour_of, label_of, name_figure, new_figure, show_grey, wrapped
-
-LINES = 8
-"""Frames, about, whose lines are drawn."""
+from speckle3d.study.figures import UNSEEN, colour_of, label_of, name_figure, new_figure, show_grey, wrapped
 
 _BRIGHTEST_PERCENTILE = 99.9
 """A single specular echo must not darken the tissue."""
 
-_LARGEST_IN = (10.0, 9.0)
-_OUTLINED = [withStroke(linewidth=2.0, foreground="black")]
+_OVERLAY_PERCENTILES = (5.0, 99.5)
+"""Levels of the reference that are dark and bright in an overlay, so that its colours are strong."""
+
+_MAGENTA, _GREEN = "#FF30FF", "#20FF20"
+
+_ROW_IN = 0.24
+_FRAME_IN = 0.3
+"""Width of the number of a frame."""
+
+_STEPS = np.outer(10 ** np.arange(6), [1, 2, 5]).ravel()
+"""Round numbers of frames from one line to the next."""
 
 
 def save_reslices(picture: CutPicture, path: Path) -> Path:
@@ -49,198 +59,242 @@ def save_reslices(picture: CutPicture, path: Path) -> Path:
     return save_cuts(figure, path, cuts, panels, words)
 
 
-def figure_outlines(outlines_mm: Mapping[str, FloatArray], title: str = "") -> Figure:
-    """Draw outlines of frames in space, at the poses of every mode.
-
-    Parameters
-    ----------
-    outlines_mm : mapping of str to ndarray, shape (n, 5, 3)
-        By mode, in one world: from `frame_outlines`.
-    """
-    figure = new_figure(7.0, 6.0)
-    axes = figure.add_subplot(projection="3d")
-    points = np.concatenate([each.reshape(-1, 3) for each in outlines_mm.values()])
-    for mode, outlines in outlines_mm.items():
-        some = outlines[_shown_frames(outlines, 4 * LINES)]
-        # Depth down: the image's y is the picture's -z.
-        lines = [each[:, [0, 2, 1]] for each in some]
-        colour = colour_of(mode, list(outlines_mm))
-        axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.7, label=label_of(mode)))
-    low, high = points.min(axis=0), points.max(axis=0)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]), zlim=(high[1], low[1]))
-    axes.set_box_aspect(np.maximum(high - low, 1e-3)[[0, 2, 1]])
-    axes.set(xlabel="lateral / mm", ylabel="along the sweep / mm", zlabel="depth / mm")
-    axes.legend(frameon=False, fontsize="small")
-    name_figure(figure, f"{title}: frames, from the first one's place")
-    return figure
-
-
 def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, list[Axes]]]:
     """Draw cuts of several modes under one grey scale, and each laid over the reference's.
+
+    Returns
+    -------
+    (Figure, dict of str to list of Axes)
+        The panels of each mode: its cut, and its overlay if it has one.
 
     Raises
     ------
     InvalidInputError
         If no cut shows anything.
     """
+    picture = _reference_last(picture)
     cuts, reference = picture.cuts, picture.reference
     levels = picture.levels or _levels(cuts, picture.unit)
-    wide = _is_wide(cuts)
-    figure, rows = _panels(cuts, reference is not None, wide)
-    panels: dict[str, list[Axes]] = {}
-    for i, (mode, drawn) in enumerate(cuts.items()):
-        axes = rows[0][i]
-        panels[mode] = [axes]
-        show_grey(axes, drawn.image, drawn.cut.extent_mm, levels)
-        colour = colour_of(mode, list(cuts))
-        name = wrapped(label_of(mode), figure.get_figwidth() / (len(rows) if wide else len(cuts)))
-        axes.set_title(name, fontsize="medium", color=colour, parse_math=False)
-        _draw_frames(axes, drawn.frames, colour)
-        _draw_length(axes, drawn.frames)
-        _draw_scale(axes, drawn.cut.extent_mm)
-        if reference is not None:
-            panels[mode].append(rows[1][i])
-            _draw_difference(rows[1][i], mode, drawn, reference, cuts[reference], levels)
-    shown = [each for row in rows for each in row]
-    for each in shown:
-        each.label_outer()
-    for each in shown:
-        each.set_xlabel(f"{picture.axes[0]} / mm")
-        each.set_ylabel(f"{picture.axes[1]} / mm")
-    figure.colorbar(rows[0][0].images[0], ax=shown, label=picture.unit, shrink=0.6, pad=0.02)
-    name_figure(figure, f"{picture.name}: {picture.place}")
+    largest = [
+        max(side) for side in zip(*((d.cut.width_mm, d.cut.height_mm) for d in cuts.values()), strict=True)
+    ]
+    layout = laid_out(len(cuts), (largest[0], largest[1]), reference is not None)
+    rows = _sweep_rows(picture)
+    figure = layout.figure(0.8 + _ROW_IN * len(rows) if rows else 0.0)
+    panels = {mode: [layout.add_panel(figure, i, False)] for i, mode in enumerate(cuts)}
+    for mode, drawn in cuts.items():
+        _draw_cut(
+            panels[mode][0], drawn, (label_of(mode), colour_of(mode, list(cuts))), levels, layout.panel_in[0]
+        )
+    if reference is not None:
+        contrast = _contrast(cuts[reference], levels)
+        for i, mode in enumerate(cuts):
+            panel = layout.add_panel(figure, i, True)
+            if mode == reference:
+                _explain_overlays(panel, label_of(reference), layout.panel_in[0])
+            else:
+                panels[mode].append(panel)
+                _draw_overlay(panel, cuts[mode], cuts[reference], label_of(reference), contrast)
+    name_axes([each for row in panels.values() for each in row], picture.axes)
+    _draw_colours(figure, panels[next(iter(cuts))][0], picture.unit)
+    if rows:
+        _draw_rows(figure, rows, reference)
+    name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
     return figure, panels
 
 
-def _is_wide(cuts: Mapping[str, DrawnCut]) -> bool:
-    return all(drawn.cut.width_mm > drawn.cut.height_mm for drawn in cuts.values())
+def figure_outlines(outlines_mm: Mapping[str, FloatArray], title: str = "") -> Figure:
+    """Draw outlines of frames in space, at the poses of every mode.
+
+    Parameters
+    ----------
+    outlines_mm : mapping of str to ndarray, shape (n, 5, 3)
+        By mode, in one world, that of the first frame: from `frame_outlines`.
+    """
+    figure = new_figure(7.0, 6.5, None)
+    axes: Any = figure.add_axes((0.02, 0.05, 0.86, 0.85), projection="3d")
+    for mode, outlines in outlines_mm.items():
+        # Depth down: the image's y is the picture's -z.
+        lines = [each[:, [0, 2, 1]] for each in outlines[_shown_frames(len(outlines), 30)]]
+        colour = colour_of(mode, list(outlines_mm))
+        axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.6, label=label_of(mode)))
+    points = np.concatenate([each.reshape(-1, 3) for each in outlines_mm.values()])
+    low, high = points.min(axis=0), points.max(axis=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]), zlim=(high[1], low[1]))
+    axes.set_box_aspect(np.maximum(high - low, 1e-3)[[0, 2, 1]], zoom=0.9)
+    axes.view_init(elev=22.0, azim=-35.0)
+    axes.set(xlabel="lateral / mm", ylabel="along the sweep / mm", zlabel="depth / mm")
+    axes.locator_params(nbins=5)
+    figure.legend(frameon=False, fontsize="small", loc="lower right")
+    name_figure(figure, f"{title}: frames, all from the first one's place")
+    return figure
 
 
-def _panels(cuts: Mapping[str, DrawnCut], compared: bool, wide: bool) -> tuple[Figure, list[list[Axes]]]:
-    n, rows = len(cuts), 1 + compared
-    width = max(d.cut.width_mm for d in cuts.values())
-    height = max(d.cut.height_mm for d in cuts.values())
-    across, down = (rows, n) if wide else (n, rows)
-    scale = min(_LARGEST_IN[0] / (across * width), _LARGEST_IN[1] / (down * height), 4.0 / min(width, height))
-    figure = new_figure(max(scale * across * width + 1.8, 5.0), scale * down * height + 1.3 + 0.4 * down)
-    places = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    grid = places.T if wide else places
-    return figure, [list(row) for row in grid]
+def _reference_last(picture: CutPicture) -> CutPicture:
+    order = sorted(picture.cuts, key=lambda mode: mode == picture.reference)
+    return replace(picture, cuts={mode: picture.cuts[mode] for mode in order})
+
+
+def _draw_cut(
+    axes: Axes, drawn: DrawnCut, name: tuple[str, str], levels: tuple[float, float], width_in: float
+) -> None:
+    """Draw a cut under its name and colour, with lines of some frames and their numbers."""
+    label, colour = name
+    show_grey(axes, drawn.image, drawn.cut.extent_mm, levels)
+    title = wrapped(label, width_in)
+    axes.set_title(title, fontsize="medium", color=colour, y=1.0, pad=12, parse_math=False)
+    shown = _shown_frames(len(drawn.frames), max(2, int(width_in / _FRAME_IN)))
+    # A black line in a grey picture would be taken for tissue.
+    _draw_frames(axes, drawn.frames[shown], "#FFD700" if colour == "#000000" else colour)
+    for number, line in zip(shown, drawn.frames[shown], strict=True):
+        if np.isfinite(line).any():
+            x = line[np.nanargmin(line[:, 1]), 0]
+            if drawn.cut.extent_mm[0] <= x <= drawn.cut.extent_mm[1]:
+                _write(axes, str(number), (x, drawn.cut.extent_mm[3]), 1, "0.4")
+    _draw_scale(axes, drawn.cut.extent_mm, width_in)
+
+
+def _draw_overlay(
+    axes: Axes, drawn: DrawnCut, reference: DrawnCut, name: str, contrast: tuple[float, float]
+) -> None:
+    """Lay a mode's cut (magenta) over the reference's (green)."""
+    low, high = contrast
+    one, other = (np.clip((each.image - low) / (high - low), 0.0, 1.0) for each in (drawn, reference))
+    colours = np.stack([one, other, one], axis=-1)
+    neither = np.isnan(one) & np.isnan(other)
+    colours = np.nan_to_num(colours)
+    colours[neither] = to_rgb(UNSEEN)
+    axes.imshow(colours, aspect="equal", extent=drawn.cut.extent_mm, interpolation="nearest")
+    shown = _shown_frames(len(drawn.frames), 8)
+    _draw_frames(axes, reference.frames[shown], _GREEN)
+    _draw_frames(axes, drawn.frames[shown], _MAGENTA)
+    axes.set_title(f"over {name}", fontsize="small", color="0.3", y=1.0, pad=3, parse_math=False)
+
+
+def _explain_overlays(axes: Axes, reference: str, width_in: float) -> None:
+    """Say in the reference's own panel, which would show nothing, what colours mean."""
+    axes.set_axis_off()
+    words = (
+        ("grey: both", "0.5"),
+        ("magenta: the mode alone", "#C000C0"),
+        (f"green: {reference} alone", "#008000"),
+    )
+    for i, (text, colour) in enumerate(words):
+        axes.annotate(
+            wrapped(text, width_in + 0.7),
+            (0, 1),
+            (0, -2 - 26 * i),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            fontsize="x-small",
+            va="top",
+            color=colour,
+            parse_math=False,
+        )
+
+
+def _write(
+    axes: Axes, text: str, place: tuple[float, float], up_points: float, colour: str, **look: Any
+) -> None:
+    """Write small above a place of the axes, on them or not."""
+    axes.annotate(
+        text,
+        place,
+        (0, up_points),
+        textcoords="offset points",
+        ha="center",
+        color=colour,
+        annotation_clip=False,
+        **{"fontsize": "xx-small", **look},
+    )
+
+
+def _draw_frames(axes: Axes, lines: FloatArray, colour: str) -> None:
+    axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=0.7, alpha=0.7), autolim=False)
+
+
+def _draw_scale(axes: Axes, extent_mm: tuple[float, float, float, float], width_in: float) -> None:
+    left, right, bottom, top = extent_mm
+    span = right - left
+    # Room for the words below it.
+    wanted = span * min(0.5, max(0.15, 0.35 / width_in))
+    tenths = [0.1 * step for step in _STEPS]
+    length = min((each for each in tenths if each >= wanted), default=wanted)
+    length = length if length < 0.9 * span else wanted
+    x, y = left + 0.05 * span, bottom - 0.04 * (bottom - top)
+    look: dict[str, Any] = {"color": "white", "linewidth": 2.5, "solid_capstyle": "butt"}
+    axes.plot([x, x + length], [y, y], path_effects=[withStroke(linewidth=4.5, foreground="black")], **look)
+    edge = [withStroke(linewidth=2.0, foreground="black")]
+    _write(axes, f"{length:g} mm", (x + length / 2, y), 4, "white", fontsize="x-small", path_effects=edge)
+
+
+def _draw_colours(figure: Figure, axes: Axes, unit: str) -> None:
+    place, width = axes.get_position(), figure.get_figwidth()
+    right = max(each.get_position().x1 for each in figure.axes)
+    tall = min(place.height, 3.0 / figure.get_figheight())
+    bar = figure.add_axes((right + 0.15 / width, place.y0, 0.14 / width, tall))
+    figure.colorbar(axes.images[0], cax=bar, label=unit)
+    bar.tick_params(labelsize="small")
+
+
+def _sweep_rows(picture: CutPicture) -> dict[str, FloatArray]:
+    """Where every mode has the frames along the sweep, by the picture's x; nothing for other cuts."""
+    if picture.axes[0] != "along the sweep" or not all(len(drawn.centres) for drawn in picture.cuts.values()):
+        return {}
+    return {mode: drawn.centres for mode, drawn in picture.cuts.items()}
+
+
+def _draw_rows(figure: Figure, rows: Mapping[str, FloatArray], reference: str | None) -> None:
+    """Draw every mode's frames on a line of its own; dotted is where the reference has them."""
+    axes = add_axes_in(figure, 1.7, 0.5, figure.get_figwidth() - 3.4, _ROW_IN * len(rows))
+    there = rows[reference or next(iter(rows))]
+    shown = _shown_frames(len(there), 14)
+    axes.vlines(there[shown], -0.5, len(rows) - 0.5, colors="0.7", linestyles=":", linewidths=0.8)
+    length = float(np.ptp(there))
+    look: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "fontsize": "small", "va": "center"}
+    for y, (mode, x) in enumerate(rows.items()):
+        colour = colour_of(mode, list(rows))
+        low, high = float(x.min()), float(x.max())
+        axes.plot([low, high], [y, y], color=colour, linewidth=1.5)
+        axes.vlines(x[shown], y - 0.28, y + 0.28, colors=colour, linewidths=1.5)
+        percent = (
+            f"  {100 * ((high - low) / length - 1):+.1f} %"
+            if mode != reference and reference and length
+            else ""
+        )
+        axes.annotate(f"{high - low:.2f} mm{percent}", (1.01, y), color=colour, **look)
+        axes.annotate(label_of(mode), (-0.01, y), color=colour, ha="right", parse_math=False, **look)
+    for number in shown:
+        _write(axes, str(number), (there[number], -0.55), 1, "0.4")
+    axes.set(ylim=(len(rows) - 0.5, -0.5), yticks=[])
+    axes.spines[["left", "right", "top"]].set_visible(False)
+    axes.tick_params(labelsize="small")
+    axes.set_xlabel("frames' centres along the sweep, mm from the first", fontsize="small")
 
 
 def _levels(cuts: Mapping[str, DrawnCut], unit: str) -> tuple[float, float]:
-    finite: FloatArray = np.concatenate([d.image[np.isfinite(d.image)] for d in cuts.values()])
+    finite: FloatArray = np.concatenate([each.image[np.isfinite(each.image)] for each in cuts.values()])
     if not finite.size:
         raise InvalidInputError(f"reslices of {', '.join(cuts)}: expected a finite value in one, got none")
     brightest = float(np.percentile(finite, _BRIGHTEST_PERCENTILE))
-    return (brightest - 50.0 if unit == "dB" else float(finite.min())), brightest
+    black = brightest - 50.0 if unit == "dB" else float(finite.min())
+    return min(black, brightest - 1e-6), brightest
 
 
-def _shown_frames(frames: FloatArray, most: int = LINES) -> IntArray:
-    """Numbers of the frames whose lines are drawn: the first, the last, and a round number apart between."""
-    n = len(frames)
-    every = next(
-        (step for step in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000) if n / step <= most + 1), n
-    )
-    picked = np.unique([0, *range(0, n, every), n - 1])
-    if len(picked) > 2 and picked[-1] - picked[-2] < every / 2:
+def _contrast(drawn: DrawnCut, levels: tuple[float, float]) -> tuple[float, float]:
+    finite = drawn.image[np.isfinite(drawn.image)]
+    if not finite.size:
+        return levels
+    low, high = (float(each) for each in np.percentile(finite, _OVERLAY_PERCENTILES))
+    return (low, high) if high > low else levels
+
+
+def _shown_frames(count: int, most: int) -> IntArray:
+    """Numbers of the frames that are drawn: the first, the last, and a round number apart between."""
+    if count == 0:
+        return np.empty(0, dtype=np.int64)
+    every = next((int(step) for step in _STEPS if count / step <= most), count)
+    picked = np.unique([0, *range(0, count, every), count - 1])
+    if len(picked) > 2 and picked[-1] - picked[-2] < 0.7 * every:
         picked = np.delete(picked, -2)
     return picked
-
-
-def _draw_frames(axes: Axes, frames: FloatArray, colour: str, **look: Any) -> None:
-    if not len(frames):
-        return
-    for number in _shown_frames(frames):
-        line = frames[number]
-        if np.isfinite(line).any():
-            axes.plot(*line.T, color=colour, **{"linewidth": 0.8, "alpha": 0.8, **look})
-            axes.annotate(
-                str(number),
-                line[0],
-                (0, 2),
-                textcoords="offset points",
-                fontsize="xx-small",
-                ha="center",
-                color="0.3",
-                annotation_clip=False,
-            )
-
-
-def _draw_length(axes: Axes, frames: FloatArray) -> None:
-    if len(frames) < 2 or not np.isfinite(frames[[0, -1]]).all():
-        return
-    a, b = frames[0][-1], frames[-1][-1]
-    y = max(a[1], b[1])
-    axes.annotate(
-        "",
-        (b[0], y),
-        (a[0], y),
-        arrowprops={"arrowstyle": "<|-|>", "color": "white", "shrinkA": 0, "shrinkB": 0},
-    )
-    middle = (frames[0].mean(axis=0), frames[-1].mean(axis=0))
-    text = f"{np.linalg.norm(middle[1] - middle[0]):.2f} mm"
-    axes.annotate(
-        text,
-        ((a[0] + b[0]) / 2, y),
-        (0, 3),
-        textcoords="offset points",
-        ha="center",
-        fontsize="small",
-        color="white",
-        path_effects=_OUTLINED,
-    )
-
-
-def _draw_scale(axes: Axes, extent: tuple[float, float, float, float]) -> None:
-    left, right, bottom, top = extent
-    span = right - left
-    length = max(s for s in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if s <= max(span / 3, 0.1))
-    x, y = left + 0.04 * span, top + 0.06 * (bottom - top)
-    axes.plot(
-        [x, x + length],
-        [y, y],
-        color="white",
-        linewidth=3,
-        path_effects=[withStroke(linewidth=5, foreground="black")],
-    )
-    axes.annotate(
-        f"{length:g} mm",
-        (x + length / 2, y),
-        (0, -4),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize="x-small",
-        color="white",
-        path_effects=_OUTLINED,
-    )
-
-
-def _draw_difference(
-    axes: Axes, mode: str, drawn: DrawnCut, reference: str, there: DrawnCut, levels: tuple[float, float]
-) -> None:
-    low, high = levels
-    one, other = (np.clip((d.image - low) / (high - low), 0, 1) for d in (drawn, there))
-    rgb = np.stack([one, other, one], axis=-1)
-    unseen = np.isnan(one) & np.isnan(other)
-    rgb = np.nan_to_num(rgb)
-    rgb[unseen] = (0.2, 0.25, 0.36)
-    axes.imshow(rgb, extent=drawn.cut.extent_mm, interpolation="nearest")
-    _draw_frames(axes, there.frames, "#7CFC00")
-    if mode != reference:
-        _draw_frames(axes, drawn.frames, "#FF00FF")
-        for number in _shown_frames(drawn.frames):
-            a, b = there.frames[number].mean(axis=0), drawn.frames[number].mean(axis=0)
-            axes.annotate(
-                "",
-                b,
-                a,
-                arrowprops={
-                    "arrowstyle": "-|>",
-                    "color": "white",
-                    "shrinkA": 0,
-                    "shrinkB": 0,
-                    "linewidth": 1.2,
-                },
-            )

@@ -150,13 +150,6 @@ def test_volume(run, reconstructed, tmp_path, name):
     assert (voxels > 0).mean() > 0.3
 
 
-@pytest.mark.parametrize("options", [(), ("--lateral-mm", "2"), ("--depth-mm", "10")])
-def test_reslice(run, reconstructed, tmp_path, options):
-    code, _, err = run("reslice", reconstructed / "reconstruction.h5", "-o", tmp_path / "r.png", *options)
-    assert code == 0, err
-    assert (tmp_path / "r.png").read_bytes().startswith(PNG)
-
-
 @pytest.mark.parametrize(("options", "packing"), [((), "gzip"), (("--compression", "none"), None)])
 def test_convert_copies_a_sweep(run, bench, tmp_path, options, packing):
     code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5", *options)

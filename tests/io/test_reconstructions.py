@@ -8,7 +8,7 @@ import sweep_examples
 from image_examples import grey, write_mha
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.reconstruction import FramePairs, Provenance, SourceFile, Trust
+from speckle3d.core.reconstruction import FramePairs, ModeErrors, Provenance, SharedErrors, SourceFile, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.describe import describe
 from speckle3d.io.load import import_record
@@ -42,7 +42,12 @@ def pairs(first, seed=0):
 POSES = {"image": sweep_examples.poses(N), "pose": sweep_examples.poses(N, 1)}
 
 
-TRUST = Trust(np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (N, 1, 1)), np.array([0, 0, 1, 0, 16, 0, 0, 8]))
+TRUST = Trust(
+    np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (N, 1, 1)),
+    np.array([0, 0, 1, 0, 16, 0, 0, 8]),
+    SharedErrors(0.02, 0.07, np.array([1e-3, 2e-3])),
+    {"fused": ModeErrors(np.tile(np.eye(6), (N, 1, 1)), 0.004)},
+)
 
 
 def write(path, chunks=(), poses=POSES, finish=True, trust=TRUST):
@@ -78,6 +83,15 @@ def test_how_far_poses_may_be_trusted_comes_back(path, tmp_path):
     got = read_reconstruction(path).trust
     np.testing.assert_array_equal(got.covariance, TRUST.covariance)
     np.testing.assert_array_equal(got.flags, TRUST.flags)
+    assert (got.shared.scale_sigma, got.shared.curves_sigma) == (0.02, 0.07)
+    np.testing.assert_array_equal(got.shared.turn_sigma_per_mm, [1e-3, 2e-3])
+    assert list(got.modes) == ["fused"]
+    assert got.modes["fused"].length_sigma == 0.004
+    np.testing.assert_array_equal(got.modes["fused"].covariance, TRUST.modes["fused"].covariance)
+    write(tmp_path / "old.h5", trust=Trust(TRUST.covariance, TRUST.flags))
+    old = read_reconstruction(tmp_path / "old.h5").trust
+    assert old.shared is None
+    assert old.modes == {}
     write(tmp_path / "older.h5", trust=None)
     assert read_reconstruction(tmp_path / "older.h5").trust is None
 

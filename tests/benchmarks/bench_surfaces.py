@@ -1,0 +1,301 @@
+"""How sure, and is that so: distances, spheres and a helix against what is known of them.
+
+Run: ``python tests/benchmarks/bench_surfaces.py [--first-seed N] [--count 24] [--workers 2]``.
+
+First the digital phantom at known poses: spheres and a helix, cut by formula along a curved freehand path and
+compounded in three ways. Then simulated sweeps (`corpus.py`), each reconstructed once and kept: how often two
+points picked in different frames are as far apart as claimed (68 % and 95 % of them should be), by mode; and
+the digital phantom cut at their true poses and compounded at the reconstructed ones: how often volumes of
+spheres and distances between their centres are as claimed. Rows of one sweep are wrong together, so that the
+shares say less than their number suggests; the median over sweeps of each one's own root mean square, in
+claimed deviations, stands beside them.
+"""
+
+import argparse
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+
+import numpy as np
+from cache import DEFAULT, key_of
+from corpus import CURVES, good_sweep
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Helix, Phantom, curved_path
+from scipy.optimize import least_squares
+
+import speckle3d
+from speckle3d.config import Config
+from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.pose_errors import Belonging
+from speckle3d.core.reconstruction import Provenance, Reconstruction
+from speckle3d.core.surface import Surface
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.volume import Volume
+from speckle3d.corrections import correct
+from speckle3d.imaging.backward import backward_slabs
+from speckle3d.imaging.belonging import belonging_of
+from speckle3d.imaging.grid import grid_around
+from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.measure import measured
+from speckle3d.imaging.surface import measures_of, surface_of
+from speckle3d.imaging.volume import compound
+from speckle3d.io.curves import read_curves
+from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
+from speckle3d.pipeline import track
+from speckle3d.study.details import trust_of
+from speckle3d.study.pose_errors import posed_errors_of
+
+FIRST_SEED = 41001
+MODES = ("orientation", "pose", "inertial", "fused")
+_ESTIMATORS = ("matching", "motion", "correction")
+STEP_MM = 0.25
+PAIRS, LEAST_APART_MM, VOXEL_MM = 60, 1.0, 0.3
+BALL_MM, ROOM_MM = 1.2, 1.8
+
+
+@dataclass(frozen=True)
+class Found:
+    """One quantity against the truth: its error and its claimed deviation."""
+
+    sweep: str
+    mode: str
+    what: str
+    error: float
+    sigma: float
+
+
+def at_known_poses() -> None:
+    """Print sizes of spheres and a helix from volumes made at known poses."""
+    balls = [
+        Ball((5.0, 6.0, 6.0), 3.0),
+        Ball((14.0, 7.0, 7.0), 4.0),
+        Ball((6.0, 16.0, 9.0), 5.0),
+        Ball((15.0, 17.0, 18.0), 2.0),
+    ]
+    helix = Helix((10.0, 12.0, 34.0), 4.0, 4.0, 2.5, 0.9)
+    phantom = Phantom((*balls, helix), ImageGrid(200, 230, 0.1, 0.1))
+    poses = curved_path(480, 46.0)
+    images, grid = phantom.images(poses), phantom.grid
+    voxel_grid = grid_around(grid, poses, STEP_MM)
+    print(f"known poses; voxels of {STEP_MM} mm, images 0.1 mm apart with pixels of 0.1 mm")
+    print(f"{'':16}{'radius':>9}{'volume, % of voxels':>21}{'of mesh':>9}{'vertices off, voxels':>22}  rms")
+    for way in ("nearest, mean", "linear, mean", "backward"):
+        volume = _volume(way, images, grid, poses, voxel_grid)
+        surface = surface_of(volume, LEVEL)
+        part, middles = surface.parts(), surface.vertices_mm[surface.triangles].mean(axis=1)
+        for body in (*balls, helix):
+            own = surface.of_triangles(part == part[np.abs(body.depth(middles)).argmin()])
+            away = np.abs(body.depth(own.vertices_mm)) / STEP_MM
+            size = f"{away.max():22.2f}{np.sqrt((away**2).mean()):5.2f}"
+            if isinstance(body, Helix):
+                print(f"{way:16}{'helix':>9}{'':30}{size}; {_helix_errors(own, body)}")
+                continue
+            sizes = [_voxel_volume(volume, body), own.volume_mm3]
+            of_voxels, of_mesh = (100 * (size / body.volume_mm3 - 1) for size in sizes)
+            print(f"{way:16}{body.radius_mm:6.1f} mm{of_voxels:+21.2f}{of_mesh:+9.2f}{size}")
+
+
+def _volume(way: str, images, grid: ImageGrid, poses, voxel_grid) -> Volume:
+    if way != "backward":
+        return compound(images, grid, poses, voxel_grid=voxel_grid, splat=way.split(",")[0])
+    slabs = list(backward_slabs(PosedImages(images, grid, poses), voxel_grid, 0.5))
+    voxels = np.concatenate([slab.voxels for slab in slabs]).T
+    return Volume(voxels, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
+
+
+def _voxel_volume(volume: Volume, ball: Ball) -> float:
+    """Volume of a sphere by its voxels' grey levels, each counted by its share of the inside."""
+    index = np.moveaxis(np.indices(volume.shape), 0, -1)
+    near = ball.depth(volume.world_from_grid.apply(index.reshape(-1, 3) * volume.spacing_mm)) > -3 * STEP_MM
+    share = (volume.voxels.reshape(-1)[near] - OUTSIDE) / (INSIDE - OUTSIDE)
+    return float(np.nansum(share) * np.prod(volume.spacing_mm))
+
+
+def _helix_errors(surface: Surface, helix: Helix) -> str:
+    """Radius, pitch and length of the helix that lies one tube's radius inside the surface, fitted."""
+    places = surface.vertices_mm[:: max(len(surface.vertices_mm) // 4000, 1)]
+    angle = helix.nearest_angle(places)
+    places = places[(angle > 0.5) & (angle < 2 * np.pi * helix.turns - 0.5)]
+
+    def off(values):
+        x, y, z, radius, pitch, tube = values
+        return replace(helix, centre_mm=(x, y, z), radius_mm=radius, pitch_mm=pitch, tube_mm=tube).depth(
+            places
+        )
+
+    start = np.array([*helix.centre_mm, 1.05 * helix.radius_mm, 0.97 * helix.pitch_mm, 0.9 * helix.tube_mm])
+    *_, radius, pitch, tube = least_squares(off, start).x
+    length = helix.turns * np.hypot(2 * np.pi * radius, pitch)
+    pairs = (
+        ("radius", radius, helix.radius_mm),
+        ("pitch", pitch, helix.pitch_mm),
+        ("length", length, helix.length_mm),
+        ("tube", tube, helix.tube_mm),
+    )
+    return ", ".join(f"{name} {100 * (found / true - 1):+.2f} %" for name, found, true in pairs)
+
+
+def reconstructed(number: int, first_seed: int, folder: Path) -> Path | None:
+    """Reconstruction of a sweep in all modes it has, made once; None if it is refused."""
+    source = good_sweep(number, first_seed, folder)
+    package = Path(speckle3d.__file__).parent
+    files = [path for room in _ESTIMATORS for path in sorted((package / room).rglob("*.py"))]
+    text = "".join(path.read_text(encoding="utf-8") for path in files if path.stem != "joint_errors")
+    path = folder / f"{source.stem}-{key_of(text)[:8]}-poses.h5"
+    if path.is_file():
+        return path
+    sweep = load_sweep(source)
+    shown, corrections = replace(sweep, truth=None), {}
+    try:
+        tracked = track(shown, read_curves(CURVES))
+    except Speckle3DError:
+        return None
+    for mode in MODES:
+        try:
+            corrections |= correct(tracked, shown, [mode])
+        except Speckle3DError:
+            continue
+    poses = {"image": tracked.image} | {mode: each.poses for mode, each in corrections.items()}
+    with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
+        made = Provenance(str(source), "", "")
+        writer.finish(poses, made, Config().to_toml(), trust_of(tracked, corrections))
+    return path
+
+
+def judged(number: int, first_seed: int, folder: Path) -> list[Found]:
+    """Everything that is measured in one sweep."""
+    path = reconstructed(number, first_seed, folder)
+    if path is None:
+        return []
+    held = read_reconstruction(path)
+    sweep = load_sweep(Path(held.provenance.input_path))
+    found = []
+    for mode in held.poses:
+        found += distances(sweep, held, mode, np.random.default_rng(number))
+        found += bodies(sweep, held, mode)
+    return found
+
+
+def distances(sweep: Sweep, held: Reconstruction, mode: str, rng: np.random.Generator) -> list[Found]:
+    """Distances between points of two frames each, half of them the same point of the image."""
+    errors, found = posed_errors_of(held, mode), []
+    grid, none = sweep.grid, np.zeros(2)
+    for _ in range(PAIRS):
+        frames = np.sort(rng.choice(len(sweep), 2, replace=False))
+        points = np.zeros((2, 3))
+        points[:, 0] = rng.uniform(0.0, grid.width_mm, 2)
+        points[:, 1] = rng.uniform(grid.first_sample_depth_mm, grid.depth_mm, 2)
+        same = rng.random() < 0.5
+        points[1] = points[0] if same else points[1]
+        true, own = (_at(poses, frames, points) for poses in (sweep.truth, held.poses[mode]))
+        apart = float(np.linalg.norm(true[1] - true[0]))
+        if apart < LEAST_APART_MM:
+            continue
+        belonging = Belonging(np.column_stack([frames, frames]), np.tile([1.0, 0.0], (2, 1)), none)
+        (row,) = measured(own, belonging, errors, 0.0)
+        what = "distance along" if same else "distance across"
+        found.append(Found(sweep.name, mode, what, row.value - apart, row.pose_sigma))
+    return found
+
+
+def _at(poses, frames, points):
+    return np.array([poses[int(frame)].apply(point) for frame, point in zip(frames, points, strict=True)])
+
+
+def bodies(sweep: Sweep, held: Reconstruction, mode: str) -> list[Found]:
+    """Volumes of spheres in the sweep, and distances between their middles.
+
+    Cut at the true poses and compounded at the reconstructed ones, against the same compounded at the true
+    ones: what voxels and marching cubes do to a sphere is judged at known poses.
+    """
+    image, truth, poses = sweep.grid, sweep.truth, held.poses[mode]
+    depth = min(image.depth_mm - image.first_sample_depth_mm, 8.0)
+    shallow = (image.depth_mm + image.first_sample_depth_mm - depth) / 2
+    grid = ImageGrid(int(image.width_mm / 0.15), int(depth / 0.15), 0.15, 0.15, shallow)
+    frames = _apart(truth, grid.centre_mm)
+    if len(frames) < 2:
+        return []
+    middles = [truth[frame].apply(grid.centre_mm) for frame in frames]
+    images = Phantom(tuple(Ball(tuple(middle), BALL_MM) for middle in middles), grid).images(truth)
+    errors, found = posed_errors_of(held, mode), []
+    pairs = list(zip(_balls(images, grid, poses, frames), _balls(images, grid, truth, frames), strict=True))
+    for own, true in pairs:
+        told, wanted = measures_of(own, errors, image), measures_of(true)
+        if told.volume_mm3 is not None and wanted.volume_mm3 is not None:
+            shares = (told.volume_mm3 - wanted.volume_mm3, told.volume_sigma_mm3)
+            found.append(
+                Found(sweep.name, mode, "sphere's volume, %", *(100 * v / wanted.volume_mm3 for v in shares))
+            )
+    own_mm, true_mm = (
+        np.array([each.vertices_mm.mean(axis=0) for each in side]) for side in zip(*pairs, strict=True)
+    )
+    rows = measured(own_mm, belonging_of(own_mm, image, poses), errors, 0.0)
+    for row in rows:
+        if row.kind == "distance":
+            apart = float(np.linalg.norm(np.diff(true_mm[list(row.points)], axis=0)))
+            found.append(Found(sweep.name, mode, "spheres' distance", row.value - apart, row.pose_sigma))
+    return found
+
+
+def _apart(truth, centre: np.ndarray) -> list[int]:
+    """Frames at which spheres have room, one after the other along the first pass."""
+    z = np.abs((truth[0].inv() * truth).apply(centre)[:, 2])
+    way = np.maximum.accumulate(z[: int(z.argmax()) + 1])
+    wanted = np.arange(ROOM_MM, way[-1] - ROOM_MM, 2 * BALL_MM + 0.6)
+    chosen = np.unique(np.linspace(0, len(wanted) - 1, 3).round().astype(int)) if len(wanted) else []
+    return [int(np.searchsorted(way, wanted[k])) for k in chosen]
+
+
+def _balls(images, grid: ImageGrid, poses, frames: list[int]) -> list[Surface]:
+    """The surface round the middle of each of some frames' images, in the world of `poses`."""
+    surface = surface_of(compound(images, grid, poses, VOXEL_MM, splat="linear"), LEVEL)
+    part, middles = surface.parts(), surface.vertices_mm[surface.triangles].mean(axis=1)
+    places = [poses[frame].apply(grid.centre_mm) for frame in frames]
+    nearest = [np.linalg.norm(middles - place, axis=1).argmin() for place in places]
+    return [surface.of_triangles(part == part[each]) for each in nearest]
+
+
+def report(rows: list[Found]) -> None:
+    """Print shares by mode and quantity."""
+    heads = "".join(f"{word:>9}" for word in ("rows", "sweeps", "68 %", "95 %", "median", "error", "claimed"))
+    print(f"\n{'mode':12} {'what':20}{heads}")
+    for mode in dict.fromkeys(row.mode for row in rows):
+        for what in dict.fromkeys(row.what for row in rows):
+            mine = [row for row in rows if (row.mode, row.what) == (mode, what)]
+            if not mine:
+                continue
+            error, sigma = np.array([(row.error, row.sigma) for row in mine]).T
+            z, names = error / sigma, np.array([row.sweep for row in mine])
+            own = [np.sqrt(np.mean(z[names == name] ** 2)) for name in np.unique(names)]
+            shares = [100 * np.mean(np.abs(z) < most) for most in (1.0, 1.959964)]
+            head = f"{mode:12} {what:20}{len(mine):9}{len(own):9}{shares[0]:9.0f}{shares[1]:9.0f}"
+            size = f"{np.median(own):9.2f}{np.sqrt(np.mean(error**2)):9.3f}{np.median(sigma):9.3f}"
+            print(head + size)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--count", type=int, default=24)
+    parser.add_argument("--workers", type=int, default=2, help="sweeps at a time, a process each")
+    parser.add_argument("--cache", type=Path, default=DEFAULT)
+    options = parser.parse_args()
+    at_known_poses()
+    rows: list[Found] = []
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        waiting = [pool.submit(judged, n, options.first_seed, options.cache) for n in range(options.count)]
+        for future in waiting:
+            rows += future.result()
+    report(rows)
+
+
+if __name__ == "__main__":
+    main()

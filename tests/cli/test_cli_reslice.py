@@ -1,0 +1,141 @@
+"""``speckle3d reslice``: every place, pictures and volumes, and what is refused."""
+
+import numpy as np
+import pytest
+
+from speckle3d.core.volume import Volume
+from speckle3d.io.load import load_sweep
+from speckle3d.io.volumes import read_volume, write_volume
+from speckle3d.study.cut_geometry import read_cuts, read_plane
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture
+def curve(bench, tmp_path):
+    """A curve across the sweep at depth 10, in the true world."""
+    truth = load_sweep(bench / "sweep.h5").truth
+    points = [truth[frame].apply([x, 10.0, 0.0]) for frame, x in ((0, 1.0), (12, 3.0), (23, 6.0))]
+    path = tmp_path / "curve.csv"
+    np.savetxt(path, points, delimiter=",", header="x_mm,y_mm,z_mm", comments="", fmt="%.6f")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "axes"),
+    [
+        ((), ("along the sweep", "depth")),
+        (("--lateral-mm", "2", "--mode", "image", "--mode", "pose"), ("along the sweep", "depth")),
+        (("--depth-mm", "10"), ("along the sweep", "lateral")),
+        (("--frame", "5"), ("lateral", "depth")),
+    ],
+)
+def test_pictures_say_what_they_show_and_where(run, reconstructed, tmp_path, options, axes):
+    out = tmp_path / "r.png"
+    code, _, err = run("reslice", reconstructed / "reconstruction.h5", "-o", out, *options)
+    assert code == 0, err
+    assert out.read_bytes().startswith(PNG)
+    cuts = read_cuts(out)
+    # Several modes are compared with the truth, which the sweep holds.
+    assert [each.mode for each in cuts] == (["image", "pose", "truth"] if "pose" in options else ["image"])
+    assert out.read_bytes().count(f'"axes": ["{axes[0]}", "{axes[1]}"]'.encode()) == 1
+
+
+def test_a_cut_in_a_frames_plane_lies_there_and_is_that_frame(run, bench, tmp_path):
+    sweep = load_sweep(bench / "sweep.h5")
+    for name in ("f.nrrd", "f.nii.gz", "f.png"):
+        assert run("reslice", bench / "sweep.h5", "-o", tmp_path / name, "--frame", 7)[0] == 0
+    shown = read_plane(tmp_path / "f.png")
+    x, y = np.array([1.0, 3.0]), np.array([5.0, 20.0])
+    expected = sweep.truth[7].apply(np.column_stack([x, y, [0, 0]]))
+    np.testing.assert_allclose(shown.cut.world_from_mm(x, y), expected, atol=1e-9)
+    for name in ("f.nrrd", "f.nii.gz"):
+        volume = read_volume(tmp_path / name)
+        assert volume.shape[2] == 1
+        assert volume.voxels.mean() > 50
+        there = sweep.truth[7].inv().as_matrix() @ volume.world_from_index
+        # Pixels of 0.2 mm along x and y of the image; single precision in NIfTI.
+        np.testing.assert_allclose(there[:3, :3], 0.2 * np.eye(3), atol=1e-6)
+        assert abs(there[2, 3]) < 1e-4
+
+
+def test_along_a_curve_and_along_one_picked_in_a_picture(run, bench, curve, tmp_path):
+    sheet = tmp_path / "sheet.png"
+    code, _, err = run("reslice", bench / "sweep.h5", "-o", sheet, "--curve", curve, "--straight")
+    assert code == 0, err
+    cut = read_plane(sheet).cut
+    points = np.loadtxt(curve, delimiter=",", skiprows=1)
+    # Depth is that of the frame where the curve begins.
+    np.testing.assert_allclose(cut.world_from_mm(0.0, 10.0), points[0], atol=1e-5)
+    top = tmp_path / "top.png"
+    assert run("reslice", bench / "sweep.h5", "-o", top, "--depth-mm", "10")[0] == 0
+    picked = tmp_path / "picked.csv"
+    picked.write_text("x_mm,y_mm\n0.2,1.0\n1.0,2.0\n2.0,2.5\n")
+    again = tmp_path / "again.png"
+    code, _, err = run("reslice", bench / "sweep.h5", "-o", again, "--curve", picked, "--on", top)
+    assert code == 0, err
+    begin = read_plane(top).cut.world_from_mm(0.2, 1.0)
+    found = read_plane(again).cut
+    along = (found.world_from_mm(0.0, 0.0) - begin) @ found.down
+    np.testing.assert_allclose(found.world_from_mm(0.0, -along), begin, atol=1e-6)
+
+
+def test_a_volume_is_cut_at_its_place_and_in_the_terms_of_its_sweep(run, bench, tmp_path):
+    turned = load_sweep(bench / "sweep.h5").truth[0]
+    levels = np.broadcast_to(np.arange(1.0, 31.0, dtype=np.float32)[:, None, None], (30, 40, 20))
+    volume = Volume(np.asfortranarray(levels), (0.3, 0.5, 0.25), turned)
+    write_volume(tmp_path / "v.nrrd", volume)
+    middle = tmp_path / "m.nrrd"
+    assert run("reslice", tmp_path / "v.nrrd", "-o", middle)[0] == 0
+    there = np.linalg.inv(turned.as_matrix()) @ read_volume(middle).world_from_index
+    assert there[2, 3] == pytest.approx(9.5 * 0.25, abs=1e-6)
+    out = tmp_path / "s.png"
+    code, _, err = run(
+        "reslice", bench / "sweep.h5", "-o", out, "--volume", tmp_path / "v.nrrd", "--frame", "0"
+    )
+    assert code == 0, err
+
+
+def test_outlines_are_a_picture(run, reconstructed, tmp_path):
+    out = tmp_path / "o.png"
+    modes = ("--mode", "image", "--mode", "pose", "--outlines")
+    assert run("reslice", reconstructed / "reconstruction.h5", "-o", out, *modes)[0] == 0
+    assert out.read_bytes().startswith(PNG)
+
+
+def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp_path):
+    sweep, out = bench / "sweep.h5", tmp_path / "r.png"
+
+    def told(*options, source=sweep, to=out):
+        return refused("reslice", source, "-o", to, *options)
+
+    assert "--depth-mm" in told("--lateral-mm", "2", "--depth-mm", "3")
+    assert "between (" in told("--points", "500,0,0 500,1,0 500,0,1")
+    assert "not on one line" in told("--points", "0,0,0 1,1,1 2,2,2")
+    assert "--points" in told("--points", "0,0,0 1,x,0 2,2,2")
+    assert "three" in told("--points", "0,0,0 1,1,0")
+    assert "0 to 23" in told("--frame", "24")
+    assert "--frame" in told("--angle-deg", "30")
+    assert "--right" in told("--origin", "0", "0", "0")
+    assert "--curve" in told("--on", out)
+    assert "100000000" in told("--pixel-mm", "0.0001")
+    assert "curved" in told("--curve", curve, to=tmp_path / "r.nrrd")
+    assert "none.png" in told("--curve", curve, "--on", curve.parent / "none.png")
+    assert "inside the image" in told("--depth-mm", "900")
+    far = tmp_path / "far.csv"
+    far.write_text("x_mm,y_mm,z_mm\n900,0,0\n910,0,0\n")
+    assert "between (" in told("--curve", far)
+    write_volume(
+        tmp_path / "v.nrrd", Volume(np.zeros((3, 4, 5), np.uint8), (1, 1, 1), load_sweep(sweep).truth[0])
+    )
+    assert "--points" in told("--depth-mm", "1", source=tmp_path / "v.nrrd")
+    assert "got a volume" in told("--mode", "image", source=tmp_path / "v.nrrd")
+    assert "meets the volume" in told("--points", "99,0,0 99,1,0 99,0,1", source=tmp_path / "v.nrrd")
+    assert not out.exists()
+
+
+def test_several_modes_need_a_picture(refused, reconstructed, tmp_path):
+    both = ("--mode", "image", "--mode", "pose")
+    path = reconstructed / "reconstruction.h5"
+    assert "one mode" in refused("reslice", path, "-o", tmp_path / "r.mha", *both)
+    assert "got 'crossed'" in refused("reslice", path, "-o", tmp_path / "r.png", "--difference-to", "crossed")

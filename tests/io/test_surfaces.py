@@ -1,0 +1,79 @@
+"""Surfaces as files: what readers of other makers see, and damaged files."""
+
+import numpy as np
+import pytest
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.surface import Surface
+from speckle3d.io.surfaces import SUFFIXES, read_surface, write_surface
+
+CORNERS = np.array([[10.0, -20, 30], [11, -20, 30], [10, -19, 30], [10, -20, 31]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+@pytest.fixture(params=SUFFIXES)
+def path(request, tmp_path):
+    path = tmp_path / f"t{request.param}"
+    write_surface(path, Surface(CORNERS, FACES))
+    return path
+
+
+def test_what_is_read_is_what_was_written(path):
+    back = read_surface(path)
+    np.testing.assert_allclose(back.vertices_mm[back.triangles], CORNERS[FACES], atol=1e-5)
+    assert back.volume_mm3 == pytest.approx(1 / 6)
+
+
+def test_headers_say_the_axes_as_slicer_looks_for_them(path):
+    """In the header of STL and VTK, in a comment of PLY; see `vtkMRMLModelStorageNode` of 3D Slicer."""
+    start = path.read_bytes()
+    if path.suffix == ".stl":
+        assert b"SPACE=LPS" in start[:80]
+        assert not start.startswith(b"solid")
+        assert len(start) == 84 + 50 * len(FACES)
+    elif path.suffix == ".ply":
+        assert b"\ncomment SPACE=LPS\n" in start
+    else:
+        assert b"SPACE=LPS" in start.split(b"\n")[1]
+
+
+def test_vtk_reads_the_same_points_and_header(path):
+    vtk = pytest.importorskip("vtk")
+    reader = {".stl": vtk.vtkSTLReader, ".ply": vtk.vtkPLYReader, ".vtk": vtk.vtkUnstructuredGridReader}[
+        path.suffix
+    ]()
+    reader.SetFileName(str(path))
+    reader.Update()
+    found = reader.GetOutput()
+    assert found.GetNumberOfCells() == len(FACES)
+    np.testing.assert_allclose(found.GetBounds(), [10, 11, -20, -19, 30, 31], atol=1e-5)
+    if path.suffix == ".ply":
+        comments = reader.GetComments()
+        assert "SPACE=LPS" in [comments.GetValue(k) for k in range(comments.GetNumberOfValues())]
+    else:
+        assert "SPACE=LPS" in reader.GetHeader()
+
+
+def test_damaged_files_are_one_clear_error(path):
+    whole = path.read_bytes()
+    for cut in (0, 10, 90, len(whole) - 7):
+        path.write_bytes(whole[:cut])
+        with pytest.raises((FileError, InvalidInputError), match=path.name):
+            read_surface(path)
+
+
+def test_what_cannot_be_written_leaves_nothing(tmp_path):
+    surface = Surface(CORNERS, FACES)
+    with pytest.raises(InvalidInputError, match=r"\.stl, \.ply, \.vtk"):
+        write_surface(tmp_path / "t.obj", surface)
+    with pytest.raises(InvalidInputError, match="at least one triangle"):
+        write_surface(tmp_path / "t.stl", Surface(CORNERS, FACES[:0]))
+    with pytest.raises(FileError):
+        write_surface(tmp_path / "none" / "t.stl", surface)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_triangles_without_area_are_written_too(tmp_path):
+    flat = Surface(CORNERS, np.array([[0, 1, 2], [0, 1, 1]]))
+    write_surface(tmp_path / "t.stl", flat)
+    assert len(read_surface(tmp_path / "t.stl")) == 2

@@ -1,0 +1,92 @@
+"""Joint errors of the poses of a reconstruction's modes, from what its file claims."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.config import Config
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, SharedErrors, Trust
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.motion.uncertainty import shared_covariance
+from speckle3d.study.pose_errors import errors_of, posed_errors_of
+
+GRID = ImageGrid(41, 81, 0.5, 0.5)
+N = 61
+Z_MM = np.linspace(0, 20, N)
+SHARED = SharedErrors(0.02, 0.07, np.array([1e-3, 2e-3]))
+IMAGE = RigidTransform.from_translation(np.column_stack([0 * Z_MM, 0 * Z_MM, Z_MM]))
+WORLD = RigidTransform.from_components([90.0, 0.0, 7.0], Rotation.from_euler("x", 0.9))
+
+
+def made(modes=("orientation", "pose", "fused"), shared=SHARED, trust=True):
+    covariance = shared_covariance(IMAGE, GRID.centre_mm, SHARED)
+    own = np.zeros((N, 6, 6))
+    own[:, 2, 2] = (0.004 * Z_MM) ** 2 + 1e-4 * Z_MM
+    poses = {"image": IMAGE} | dict.fromkeys(modes, WORLD * IMAGE)
+    claims = {"fused": ModeErrors(own, 0.004)} if "fused" in modes else {}
+    held = Trust(covariance, np.zeros(N, dtype=np.int64), shared, claims) if trust else None
+    provenance = Provenance("sweep.h5", "", "")
+    return Reconstruction(np.arange(N) / 20.0, GRID, poses, provenance, Config().to_toml(), None, held)
+
+
+def along(errors, i, j):
+    """Deviation of how far apart two frames are along the sweep."""
+    return float(np.linalg.norm(errors.factors[:, j, 2] - errors.factors[:, i, 2]))
+
+
+def test_an_images_length_is_as_sure_as_the_file_claims():
+    held = made()
+    errors = errors_of(held)
+    assert along(errors, 0, N - 1) == pytest.approx(np.sqrt(held.trust.covariance[-1, 2, 2]), rel=1e-3)
+    # What is common stretches: half as far, half the error; what changes along the way is a little more.
+    half = along(errors, 20, 50)
+    assert half == pytest.approx(np.sqrt((0.0728**2 * 10**2) + 0.02**2 * 2.0 * 10), rel=0.01)
+
+
+def test_an_older_files_errors_are_taken_to_have_grown_on_the_way():
+    split, old = errors_of(made()), errors_of(made(shared=None))
+    np.testing.assert_allclose(old.covariance(), split.covariance(), rtol=1e-6, atol=1e-12)
+    assert along(old, 20, 50) > along(split, 20, 50)
+
+
+def test_a_mode_with_claims_of_its_own_has_these():
+    errors = errors_of(made(), "fused")
+    assert along(errors, 0, N - 1) == pytest.approx(np.sqrt((0.004 * 20) ** 2 + 1e-4 * 20), rel=1e-3)
+
+
+def test_orientation_keeps_the_images_length_and_has_the_sensors_angles():
+    errors, image = errors_of(made(), "orientation"), errors_of(made())
+    assert along(errors, 0, N - 1) == pytest.approx(along(image, 0, N - 1), rel=1e-3)
+    settings, seconds = Config().fused, (N - 1) / 20.0
+    wander = np.sqrt(2 * (1 - np.exp(-seconds / settings.wander_s)))
+    turned = np.sqrt(errors.covariance()[-1].diagonal()[3:])
+    # The world's z, the heading, is up: in the image here a mix of depth and elevation.
+    size = np.sqrt(2 * settings.inclination_sigma_rad**2 + settings.heading_sigma_rad**2)
+    assert np.linalg.norm(turned) == pytest.approx(wander * size, rel=1e-3)
+    assert turned[0] == pytest.approx(wander * settings.inclination_sigma_rad, rel=1e-3)
+
+
+def test_the_trackers_mounting_makes_a_path_go_off_at_an_angle():
+    errors, image = errors_of(made(), "pose"), errors_of(made())
+    more = errors.covariance()[-1] - image.covariance()[-1]
+    sideways = (Config().fused.mounting_sigma_rad * 20.0) ** 2
+    np.testing.assert_allclose(more.diagonal(), [sideways, sideways, 0, 0, 0, 0], rtol=1e-3, atol=1e-9)
+
+
+def test_errors_come_with_the_poses_they_are_of():
+    posed = posed_errors_of(made(), "fused")
+    np.testing.assert_allclose(posed.world_from_image.translation, (WORLD * IMAGE).translation)
+    np.testing.assert_allclose(posed.centre_mm, GRID.centre_mm)
+
+
+def test_what_claims_nothing_is_refused():
+    with pytest.raises(InsufficientDataError, match="older one"):
+        errors_of(made(trust=False))
+    with pytest.raises(InvalidInputError, match="--mode: expected one of image"):
+        errors_of(made(modes=()), "fused")
+    wrong = replace(made().trust, modes={"fused": ModeErrors(np.zeros((N - 1, 6, 6)), 0.1)})
+    with pytest.raises(InvalidInputError, match="covariance of mode fused: expected shape"):
+        replace(made(), trust=wrong)
