@@ -99,7 +99,10 @@ def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, list[Axes]]]:
     _draw_colours(figure, panels[next(iter(cuts))][0], picture.unit)
     if rows:
         _draw_rows(figure, rows, reference)
-    name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
+    # The suptitle's letters are a fifth larger than those that `wrapped` counts on.
+    name_figure(
+        figure, wrapped(": ".join(filter(None, [picture.name, picture.place])), figure.get_figwidth() / 1.2)
+    )
     return figure, panels
 
 
@@ -112,7 +115,7 @@ def figure_outlines(outlines_mm: Mapping[str, FloatArray], title: str = "") -> F
         By mode, in one world, that of the first frame: from `frame_outlines`.
     """
     figure = new_figure(7.0, 6.5, None)
-    axes: Any = figure.add_axes((0.02, 0.05, 0.86, 0.85), projection="3d")
+    axes: Any = figure.add_axes((0.08, 0.1, 0.8, 0.8), projection="3d")
     for mode, outlines in outlines_mm.items():
         # Depth down: the image's y is the picture's -z.
         lines = [each[:, [0, 2, 1]] for each in outlines[_shown_frames(len(outlines), 30)]]
@@ -149,8 +152,9 @@ def _draw_cut(
     for number, line in zip(shown, drawn.frames[shown], strict=True):
         if np.isfinite(line).any():
             x = line[np.nanargmin(line[:, 1]), 0]
-            if drawn.cut.extent_mm[0] <= x <= drawn.cut.extent_mm[1]:
-                _write(axes, str(number), (x, drawn.cut.extent_mm[3]), 1, "0.4")
+            left, right, _, top = drawn.cut.extent_mm
+            if abs(2 * x - left - right) <= 1.04 * (right - left):
+                _write(axes, str(number), (x, top), 1, "0.4")
     _draw_scale(axes, drawn.cut.extent_mm, width_in)
 
 

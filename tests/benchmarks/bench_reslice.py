@@ -171,7 +171,7 @@ def test_reslice_of_voxels_against_scipy_itk_and_vtk(benchmark, kind, name):
     took = seconds(reslice_volume, volume, plane, rounds=9)
     told = []
     for peer, cut in ways.items():
-            # Single precision of grids and of levels up to 255.
+        # Single precision of grids and of levels up to 255.
         np.testing.assert_allclose(cut(), ours, atol=0.51 if kind == "uint8" else 1e-2)
         theirs = seconds(cut, rounds=5)
         told.append(f"{peer} {1e3 * theirs:.1f} ms ({theirs / took:.1f} times as long)")
