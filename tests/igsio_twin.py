@@ -96,33 +96,38 @@ def grid_of(reference_from_image, clip, width, height, spacing_mm):
     return low, tuple((np.rint((high - low) / spacing_mm).astype(int) + 1).tolist())
 
 
-def paste(images, voxel_from_pixel, shape, clip, linear=False, rule="mean"):
+def paste(images, voxel_from_pixel, shape, clip, linear=False, rule="mean", point=POINT):
     """Volume and weights, both indexed [i, j, k], of images (frame, row, column) put in one after another.
 
     Parameters
     ----------
     voxel_from_pixel : ndarray, shape (n, 3, 4)
         Affine maps from (column, row, 0, 1) to voxel indices.
+    point : int
+        Binary places of places and shares; with 24, a place is off by 0.00002 voxel over 820 pixels.
     """
     height, width = images.shape[1:]
     volume, weight = np.zeros(shape, np.uint8), np.zeros(shape, np.uint16)
-    maps = np.rint(np.asarray(voxel_from_pixel) * 2.0**POINT).astype(np.int64)[:, :, [0, 1, 3]]
+    maps = np.rint(np.asarray(voxel_from_pixel) * 2.0**point).astype(np.int64)[:, :, [0, 1, 3]]
     spans = clip.spans(width, height)
     number = {"mean": 0, "maximum": 1, "latest": 2}[rule]
+    put = _linear if linear else _nearest
+    if images.size < 10_000:  # sooner done than compiled
+        put = put.py_func
     for image, axes in zip(images, maps, strict=True):
-        (_linear if linear else _nearest)(np.ascontiguousarray(image), axes, spans, volume, weight, number)
+        put(np.ascontiguousarray(image), axes, spans, volume, weight, number, point)
     return volume, weight
 
 
 @njit(cache=True, fastmath=False)
-def _nearest(image, axes, spans, volume, weight, rule):
+def _nearest(image, axes, spans, volume, weight, rule, point):
     n_i, n_j, n_k = volume.shape
-    half = 1 << (POINT - 1)
+    half = 1 << (point - 1)
     for row in range(image.shape[0]):
         for piece in range(2):
             for column in range(spans[row, piece, 0], spans[row, piece, 1] + 1):
                 place = axes[:, 2] + row * axes[:, 1] + column * axes[:, 0]
-                i, j, k = (place + half) >> POINT
+                i, j, k = (place + half) >> point
                 if not (0 <= i < n_i and 0 <= j < n_j and 0 <= k < n_k):
                     continue
                 level, so_far, held = int(image[row, column]), int(weight[i, j, k]), int(volume[i, j, k])
@@ -140,16 +145,16 @@ def _nearest(image, axes, spans, volume, weight, rule):
 
 
 @njit(cache=True, fastmath=False)
-def _linear(image, axes, spans, volume, weight, rule):
+def _linear(image, axes, spans, volume, weight, rule, point):
     n_i, n_j, n_k = volume.shape
-    one = 1 << POINT
+    one = 1 << point
     half = one >> 1
     share = np.zeros((3, 2), np.int64)
     for row in range(image.shape[0]):
         for piece in range(2):
             for column in range(spans[row, piece, 0], spans[row, piece, 1] + 1):
                 place = axes[:, 2] + row * axes[:, 1] + column * axes[:, 0]
-                i, j, k = place >> POINT
+                i, j, k = place >> point
                 share[:, 1] = place & (one - 1)
                 share[:, 0] = one - share[:, 1]
                 if i < 0 or j < 0 or k < 0:
@@ -163,22 +168,22 @@ def _linear(image, axes, spans, volume, weight, rule):
                 level = int(image[row, column])
                 for corner in range(7, -1, -1):
                     a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
-                    f = (share[1, b] * share[2, c] + half) >> POINT
-                    f = (share[0, a] * f + half) >> POINT
+                    f = (share[1, b] * share[2, c] + half) >> point
+                    f = (share[0, a] * f + half) >> point
                     if f == 0:
                         continue
                     held, so_far = int(volume[i + a, j + b, k + c]), int(weight[i + a, j + b, k + c])
                     if rule == 0:
-                        r = so_far << (POINT - 8)
+                        r = so_far << (point - 8)
                         mean = np.rint((f * level + r * held) / (f + r) * one)
-                        volume[i + a, j + b, k + c] = (int(mean) + half) >> POINT
+                        volume[i + a, j + b, k + c] = (int(mean) + half) >> point
                         new = (f + r) << 8
                     elif 8 * f >= one and (rule == 2 or level > held):
                         volume[i + a, j + b, k + c] = level
                         new = f << 8
                     else:
                         continue
-                    weight[i + a, j + b, k + c] = min((new + half) >> POINT, MOST)
+                    weight[i + a, j + b, k + c] = min((new + half) >> point, MOST)
 
 
 def exact_mean(images, voxel_from_pixel, shape, clip, linear=False, true_places=False):
@@ -258,5 +263,6 @@ def _across(volume, weight, sticks, longest, filled):
 def fill_with_sticks(volume, weight, longest=9):
     """Fill each hole across the shortest stick between measured voxels; equally short ones count alike."""
     filled = volume.copy()
-    _across(volume, weight, STICKS, longest, filled)
+    across = _across.py_func if volume.size < 10_000 else _across
+    across(volume, weight, STICKS, longest, filled)
     return filled

@@ -55,6 +55,41 @@ def bin_mean(images, image_points_world, world_from_grid, spacing_mm, shape):
     return np.divide(total, count, out=np.full(shape, np.nan), where=count > 0)
 
 
+def splat(images, index, shape, splat, rule, weights):
+    """Twin of the kernels in `speckle3d.kernels.splatting`: every sample of every image, corner by corner.
+
+    images, weights: (n, vector, sample); index: (n, vector, sample, 3), fractional. NaN where nothing is.
+    """
+    mean, over, best = np.zeros(shape), np.zeros(shape), np.full(shape, np.nan)
+    for levels, points, weight in zip(images.astype(float), index, weights, strict=True):
+        own, own_over = np.zeros(shape), np.zeros(shape)
+        for at, share in _reached(points, splat):
+            kept = ((at >= 0) & (at < shape)).all(axis=-1) & ~np.isnan(levels) & (share > 0) & (weight > 0)
+            if rule in ("latest", "maximum") and splat == "linear":
+                kept &= share >= 0.125
+            where = tuple(at[kept].T)
+            np.add.at(own, where, (share * weight * levels)[kept])
+            np.add.at(own_over, where, (share * weight)[kept])
+            np.fmax.at(best, where, levels[kept])
+        if rule == "latest":
+            mean[own_over > 0], over[own_over > 0] = 0.0, 0.0
+        mean, over = mean + own, over + own_over
+    if rule == "maximum":
+        return best
+    return np.divide(mean, over, out=np.full(shape, np.nan), where=over > 0)
+
+
+def _reached(points, splat):
+    """Voxels (..., 3) that points give something, one for each corner, and the share they give it."""
+    if splat == "nearest":
+        yield np.floor(points + 0.5 + 2.0**-24).astype(int), np.ones(points.shape[:-1])
+        return
+    points = np.round(points * 1024) / 1024
+    low = np.floor(points)
+    for corner in np.ndindex(2, 2, 2):
+        yield (low + corner).astype(int), np.prod(1 - np.abs(points - low - corner), axis=-1)
+
+
 def fill_holes(voxels, cap):
     """Twin of `speckle3d.imaging.holes.fill_holes`: grow a cube until it holds a value."""
     filled = voxels.copy()

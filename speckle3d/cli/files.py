@@ -228,7 +228,7 @@ def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.plus.write import SUFFIXES
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.sequences import write_posed_sequence
+    from speckle3d.study.sequences import PosedSequence
 
     if out.suffix.lower() not in SUFFIXES:
         raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")
@@ -239,4 +239,4 @@ def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
     posed = open_posed(source, options["mode"], options["sweep_file"])
     range_db, packs = options["dynamic_range_db"] or 60.0, options["compression"] != "none"
     with progress_bar(f"writing {out.name}") as progress:
-        write_posed_sequence(out, posed, range_db, progress, packs)
+        PosedSequence.of(posed, range_db).write(out, progress, packs)

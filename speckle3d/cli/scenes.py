@@ -7,10 +7,29 @@ from typing import Annotated
 
 import typer
 
-from speckle3d.cli.common import DynamicRange, PosedFile, SweepFile, app, progress_bar
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    ConfigFile,
+    PosedFile,
+    SweepFile,
+    Transform,
+    app,
+    from_options,
+    load_settings,
+    note,
+    progress_bar,
+)
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+    given_settings,
+)
 
 
-@app.command()
+@app.command(cls=Importing)
 def scene(
     source: PosedFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder to write; open its scene.mrml.")],
@@ -21,17 +40,55 @@ def scene(
             "reconstruction; tracker, truth of a recording. May be repeated."
         ),
     ] = None,
-    voxel_mm: Annotated[float, typer.Option(help="Side of a voxel.")] = 0.2,
+    images: Annotated[
+        bool, typer.Option("--images", help="Also the images, which play as they move through the volume.")
+    ] = False,
+    deviation: Annotated[
+        bool, typer.Option("--deviation", help="Also each voxel's standard deviation of position, mm.")
+    ] = False,
+    voxel_mm: Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")] = None,
+    splat: Annotated[
+        str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
+    ] = None,
+    rule: Annotated[
+        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
+    ] = None,
+    fill_radius: Annotated[
+        int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
+    ] = None,
+    dynamic_range_db: Annotated[
+        float | None, typer.Option(help="Range of log-compressed grey levels (60).")
+    ] = None,
     sweep_file: SweepFile = None,
-    dynamic_range_db: DynamicRange = 60.0,
+    calibration: CalibrationFiles = None,
+    plus_config: PlusConfig = None,
+    transform: Transform = None,
+    reference_transform: ReferenceTransform = None,
+    column_pitch_mm: Number = None,
+    row_spacing_mm: Number = None,
+    frame_rate_hz: Number = None,
+    config_file: ConfigFile = None,
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames."""
+    from speckle3d.imaging.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.scene import SceneSettings, require_scene_place, write_scene
+    from speckle3d.study.scene import SceneRequest, require_scene_place, write_scene
 
-    require_scene_place(out, source, sweep_file)
+    options = locals()
+    require_scene_place(out, source, sweep_file, *files_of(plus_config, calibration))
+    base = load_settings(config_file).volume.model_dump()
+    given = {name: value for name, value in options.items() if name in base and value is not None}
+    settings = from_options(CompoundingSettings, base | given)
+    # The range is that of the volume's levels; a recording's own is said beside it.
+    imported = given_settings(source, {**options, "dynamic_range_db": None})
     modes: list[str | None] = list(mode) if mode else [None]
-    posed = [open_posed(source, each, sweep_file) for each in modes]
-    settings = SceneSettings(voxel_mm=voxel_mm, dynamic_range_db=dynamic_range_db)
+    posed = [
+        open_posed(source, each, sweep_file, imported, calibration or (), dynamic_range_db) for each in modes
+    ]
+    for line in posed[0].notes():
+        note(line)
+    request = SceneRequest(settings, with_images=images, with_deviation=deviation)
     with progress_bar(f"writing {out.name}") as progress:
-        write_scene(out, posed, settings, progress)
+        reports = write_scene(out, posed, request, progress)
+    for report in reports:
+        note(report.line)

@@ -50,6 +50,9 @@ def volume(
     fill_radius: Annotated[
         int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
     ] = None,
+    fill_mm: Annotated[
+        float | None, typer.Option(help="Instead, in mm along each axis, whatever the voxels' shape.")
+    ] = None,
     voxel_type: Annotated[
         str | None, typer.Option(help="uint8, int16, uint16 or float32, in which empty voxels are NaN.")
     ] = None,
@@ -68,11 +71,17 @@ def volume(
     shape: Annotated[
         tuple[int, int, int] | None, typer.Option(help="Number of voxels along each axis.")
     ] = None,
+    size_mm: Annotated[Three | None, typer.Option(help="Instead: size along each axis, mm.")] = None,
+    within_gb: Annotated[
+        float | None,
+        typer.Option(help="Instead of a spacing: the finest round one of a volume no larger than this."),
+    ] = None,
     like: Annotated[Path | None, typer.Option(help="A volume whose grid to take.")] = None,
     region: Annotated[
         str | None,
         typer.Option(
-            help='What counts of an image: "rectangle x,y x,y", "fan ..." or "polygon x,y ..." in mm.'
+            help="What counts of an image, in mm and degrees: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' "
+            "or 'fan x,y angle,angle radius,radius'; several joined by ' and '."
         ),
     ] = None,
     state: Annotated[
@@ -112,11 +121,13 @@ def volume(
             require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
+    if levels == "linear" and voxel_type is None:  # most amplitudes are less than one
+        given["voxel_type"] = "float32"
     settings = from_options(CompoundingSettings, base | given)
     request = VolumeRequest(
         out,
         settings,
-        GridRequest(axes, spacing_mm, origin_mm, shape, like),
+        GridRequest(axes, spacing_mm, origin_mm, shape, size_mm, within_gb, like),
         None if region is None else Region.from_text(region),
         state,
         deviation,

@@ -282,7 +282,7 @@ class Tracker(_Sensor[RigidTransform]):
     image_skew_rad : float
         What a measured calibration of pixels has beyond the rigid `sensor_from_image`, which is the nearest
         to it: its columns and its rows lean towards each other by so much in all, half of it each. Only
-        compounding looks at it.
+        volumes and pictures of the tracker's poses look at it.
     """
 
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")

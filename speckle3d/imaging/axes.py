@@ -16,8 +16,10 @@ from speckle3d.imaging.images import require_poses
 _LEAST_COMMON = 0.5
 """Length of a mean of unit vectors that makes it a direction: as of a spread of 110 degrees either way."""
 
-_STARTS = Rotation.from_rotvec(0.4 * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]))
-"""Turns from which the smallest box is looked for, since it is not the only minimum."""
+_TURNS = Rotation.from_rotvec(np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 7)] * 3), axis=-1).reshape(-1, 3))
+"""Turns at which the smallest box is looked for: with quarter turns, near any orientation there is."""
+_REFINED = 3
+"""Of those, how many are searched from: the smallest box is not the only minimum."""
 _SIMPLEX = np.vstack([np.zeros(3), 0.15 * np.eye(3)])
 """Turns with which each search begins, rad."""
 
@@ -47,7 +49,7 @@ def sweep_axes(world_from_image: RigidTransform) -> Rotation:
     require_poses(world_from_image)
     images = world_from_image.rotation
     matrices = images.as_matrix()
-    lateral, elevational = (matrices[:, :, axis] @ _line_along(matrices[:, :, axis]) for axis in (0, 2))
+    lateral, elevational = (matrices[:, :, axis] @ line_along(matrices[:, :, axis]) for axis in (0, 2))
     half_turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
     turned = (lateral < 0) & (elevational < 0)
     facing = Rotation.concatenate([images[~turned], images[turned] * half_turn])
@@ -63,8 +65,8 @@ def sweep_axes(world_from_image: RigidTransform) -> Rotation:
 def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotation:
     """Axes of the smallest box around a sweep's images, nearest to lateral, axial and elevational.
 
-    The volume of the box is minimised from several orientations. Unless another is smaller by 0.01 %, it is
-    `sweep_axes`, then the world's axes.
+    The volume of the box is minimised from the best of many orientations. Unless another is smaller by
+    0.01 %, it is `sweep_axes`, then the world's axes.
 
     Parameters
     ----------
@@ -90,25 +92,39 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
     # A sheet has no volume: a sample's width more on all sides makes of two sheets the smaller one.
     skin = min(grid.vector_pitch_mm, grid.sample_spacing_mm)
 
+    def log_volumes(axes: Rotation) -> FloatArray:
+        return np.asarray(np.log(np.ptp(points @ axes.as_matrix(), axis=-2) + skin).sum(axis=-1))
+
     def log_volume(turn_rad: FloatArray, start: Rotation) -> float:
-        axes = start * Rotation.from_rotvec(turn_rad)
-        return float(np.log(np.ptp(points @ axes.as_matrix(), axis=0) + skin).sum())
+        return float(log_volumes(start * Rotation.from_rotvec(turn_rad)))
 
     def smallest_near(start: Rotation) -> Rotation:
         turn = fmin(log_volume, np.zeros(3), (start,), 1e-6, 1e-6, initial_simplex=_SIMPLEX, disp=False)
         return start * Rotation.from_rotvec(turn)
 
-    found = [lateral_first, Rotation.identity()]
-    starts = (*found, _spread_axes(points), *(lateral_first * turn for turn in _STARTS))
-    found += [smallest_near(start) for start in starts]
-    volume = np.array([log_volume(np.zeros(3), axes) for axes in found])
+    turned = lateral_first * _TURNS
+    smallest_first = turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]
+    starts = [lateral_first, _spread_axes(points), *smallest_first]
+    found = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
+    volume = log_volumes(found)
     smallest = found[int(np.flatnonzero(volume <= volume.min() + 1e-4)[0])]
     alike = smallest * Rotation.create_group("O")
     return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
 
 
-def _line_along(directions: FloatArray) -> FloatArray:
-    """Line that directions, shape (n, 3), lie along best, whichever way they point; as the first points."""
+def line_along(directions: FloatArray) -> FloatArray:
+    """Line that directions lie along best, whichever way along it they point.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (n, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        Unit vector along the line, as the first direction points.
+    """
     line = np.asarray(np.linalg.eigh(directions.T @ directions)[1][:, -1], dtype=float)
     return line if directions[0] @ line >= 0 else -line
 

@@ -10,20 +10,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, Float32Array, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.grid import Slab, VoxelGrid
 from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.nearest import BATCH, BYTES_PER_POINT, NearestImages
 
-BYTES_PER_VOXEL = 21
-"""Distance and level of an image on either side, the voxel, and its state."""
+BYTES_PER_VOXEL = BYTES_PER_POINT + 14
+"""Images on either side; voxel, state and a copy of another type; voxel and state of the slab before."""
 
 MAX_MEMORY_GB = 2.5
 """Default memory of a slab."""
-
-_BATCH = 16
-"""Images read at a time: enough for milliseconds of work per thread, few enough for memory."""
 
 
 def backward_slabs(
@@ -66,99 +63,56 @@ def backward_slabs(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    if not (np.isfinite(reach_mm) and reach_mm > 0):
-        raise InvalidInputError(f"reach_mm: expected a value above zero, got {reach_mm}")
-    if region is not None and region.shape != (source.grid.vectors, source.grid.samples):
-        expected = (source.grid.vectors, source.grid.samples)
-        raise InvalidInputError(f"region: expected shape {expected}, as the images, got {region.shape}")
-    n_k = voxel_grid.shape[2]
+    images = NearestImages(source, reach_mm, region)
     planes = _planes_at_once(source, voxel_grid, max_memory_gb)
-    looked_up = _LookUp(source, voxel_grid, reach_mm, region)
+    half_mm = _half_voxel_mm(images.normals, voxel_grid)
+    n_k = voxel_grid.shape[2]
     for first in range(0, n_k, planes):
-        yield looked_up.slab(first, min(first + planes, n_k))
+        yield _slab(images, voxel_grid, half_mm, first, min(first + planes, n_k))
 
 
-class _LookUp:
-    """Images to look voxels up in, and where each voxel lies in each of them."""
+def _slab(images: NearestImages, voxel_grid: VoxelGrid, half_mm: float, first: int, stop: int) -> Slab:
+    n_i, n_j, _ = voxel_grid.shape
+    rows, corners = _rows(voxel_grid, first, stop), _corners_mm(voxel_grid, first, stop)
+    voxels, state = images.beside(rows, n_i, corners).blended(half_mm)
+    return Slab(first, voxels.reshape(-1, n_j, n_i), state.reshape(-1, n_j, n_i))
 
-    def __init__(
-        self, source: PosedImages, voxel_grid: VoxelGrid, reach_mm: float, region: BoolArray | None
-    ) -> None:
-        self.source, self.shape, self.reach_mm = source, voxel_grid.shape, reach_mm
-        self.outside = None if region is None else ~region
-        image_from_world = source.world_from_image.inv().as_matrix()
-        world_from_voxel = voxel_grid.world_from_grid.as_matrix() @ np.diag([*voxel_grid.spacing_mm, 1.0])
-        maps = source.index_from_image() @ image_from_world @ world_from_voxel
-        # "Behind" and "in front" must mean the same for all images, or neighbours of opposite facing
-        # (a probe turned round between two passes) would compete for one side and leave the other empty.
-        normal = image_from_world[:, 2, :3]
-        maps[normal @ normal.sum(axis=0) < 0, 2] *= -1.0
-        self.maps = np.ascontiguousarray(maps)
-        # Half a voxel along the axis that an image is most nearly perpendicular to, for the most upright one.
-        self.half_voxel_mm = 0.5 * float(np.abs(self.maps[:, 2, :3]).max())
 
-    def slab(self, first: int, stop: int) -> Slab:
-        """Planes `first` to before `stop`."""
-        from speckle3d.kernels.backward import blend_planes, keep_nearest_in_planes
+def _half_voxel_mm(normals: FloatArray, voxel_grid: VoxelGrid) -> float:
+    """Half a voxel along the axis that an image is most nearly perpendicular to, of the most upright one."""
+    along = normals @ voxel_grid.world_from_grid.rotation.as_matrix()
+    return 0.5 * float(np.abs(along * voxel_grid.spacing_mm).max())
 
-        n_i, n_j, _ = self.shape
-        distance_mm = np.full((stop - first, 2, n_j, n_i), self.reach_mm, dtype=np.float32)
-        grey = np.full(distance_mm.shape, np.nan, dtype=np.float32)
-        for batch in self._near(first, stop):
-            images = [self._read(int(index)) for index in batch]
 
-            def look_up(low: int, high: int) -> None:
-                for image, index in zip(images, batch, strict=True):  # noqa: B023 (done within the batch)
-                    kept = distance_mm[low:high], grey[low:high]
-                    keep_nearest_in_planes(image, self.maps[index], self.reach_mm, first + low, *kept)
+def _rows(voxel_grid: VoxelGrid, first: int, stop: int) -> FloatArray:
+    """Rows of voxels along i: the centre of the first and the step to the next, shape (n, 2, 3), mm."""
+    pose = voxel_grid.world_from_grid.as_matrix()[:3]
+    steps = pose[:, :3] * voxel_grid.spacing_mm
+    j, k = np.arange(voxel_grid.shape[1])[:, None], np.arange(first, stop)[:, None, None]
+    rows = np.empty((stop - first, voxel_grid.shape[1], 2, 3))
+    # Each worked out by itself, so that it does not depend on the slab.
+    rows[:, :, 0] = pose[:, 3] + j * steps[:, 1] + k * steps[:, 2]
+    rows[:, :, 1] = steps[:, 0]
+    return rows.reshape(-1, 2, 3)
 
-            in_parallel(look_up, stop - first)
-        voxels = np.empty((stop - first, n_j, n_i), np.float32)
-        state = np.empty(voxels.shape, np.uint8)
-        in_parallel(
-            lambda low, high: blend_planes(
-                distance_mm[low:high], grey[low:high], self.half_voxel_mm, voxels[low:high], state[low:high]
-            ),
-            stop - first,
-        )
-        return Slab(first, voxels, state)
 
-    def _read(self, index: int) -> Float32Array:
-        image = self.source.read(index)
-        return image if self.outside is None else np.where(self.outside, np.float32(np.nan), image)
-
-    def _near(self, first: int, stop: int) -> Iterator[IntArray]:
-        """Numbers of the images that can reach some planes, a batch at a time."""
-        near = np.flatnonzero(self._touch(first, stop))
-        yield from np.split(near, range(_BATCH, len(near), _BATCH))
-
-    def _touch(self, first: int, stop: int) -> BoolArray:
-        """Whether each image's slab can reach the planes: no face of it has all eight corners beyond it."""
-        n_i, n_j, _ = self.shape
-        corners = np.array(
-            [[i, j, k, 1] for i in (0, n_i - 1) for j in (0, n_j - 1) for k in (first, stop - 1)]
-        )
-        u, v, q = np.moveaxis(self.maps @ corners.T, 1, 0)
-        grid = self.source.grid
-        reach = (
-            (u, 0.0, grid.vectors - 1.0),
-            (v, 0.0, grid.samples - 1.0),
-            (q, -self.reach_mm, self.reach_mm),
-        )
-        near = [(c.max(axis=1) > low - 1e-3) & (c.min(axis=1) < high + 1e-3) for c, low, high in reach]
-        return np.asarray(near[0] & near[1] & near[2])
+def _corners_mm(voxel_grid: VoxelGrid, first: int, stop: int) -> FloatArray:
+    """Centres of the corner voxels in the world, shape (8, 3)."""
+    n_i, n_j, _ = voxel_grid.shape
+    index = [[i, j, k] for i in (0, n_i - 1) for j in (0, n_j - 1) for k in (first, stop - 1)]
+    return np.asarray(voxel_grid.world_from_grid.apply(np.multiply(index, voxel_grid.spacing_mm)))
 
 
 def _planes_at_once(source: PosedImages, voxel_grid: VoxelGrid, max_memory_gb: float) -> int:
     """Planes of a slab."""
     n_i, n_j, n_k = voxel_grid.shape
-    images_gb = _BATCH * source.grid.vectors * source.grid.samples * 4 / 1e9
+    images_gb = BATCH * source.grid.vectors * source.grid.samples * 4 / 1e9
     plane_gb = n_i * n_j * BYTES_PER_VOXEL / 1e9
     planes = int(min((max_memory_gb - images_gb) / plane_gb, n_k))
     if planes < 1:
         raise InvalidInputError(
             f"volume: expected to work within {max_memory_gb:g} GB of memory, but a plane of {n_i} x {n_j} "
-            f"voxels and {_BATCH} images take {images_gb + plane_gb:.3g} GB: take larger voxels"
+            f"voxels and {BATCH} images take {images_gb + plane_gb:.3g} GB: take larger voxels"
         )
     # Slabs of nearly one size: none at the end that is worth little.
     return -(-n_k // -(-n_k // planes))

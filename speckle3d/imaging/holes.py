@@ -76,6 +76,11 @@ def fill_holes(
         )
 
 
+def cubes_within(radius: int) -> IntArray:
+    """Cubes that grow by a voxel to every side: half edges along k, j and i, shape (radius, 3)."""
+    return np.repeat(np.arange(1, radius + 1), 3).reshape(-1, 3)
+
+
 def boxes_within(radius_mm: float, spacing_mm: tuple[float, float, float]) -> IntArray:
     """Boxes that grow evenly in mm, for voxels of any shape: what `fill_holes` tries in turn.
 
@@ -124,7 +129,7 @@ def _checked_boxes(radius: int | npt.ArrayLike) -> IntArray:
     if given.size > 0 and not 0 <= given.min() <= given.max() <= MAX_RADIUS:
         raise InvalidInputError(f"radius: expected 0 to {MAX_RADIUS} voxels, got {radius!r}")
     if given.ndim == 0:
-        boxes = np.repeat(np.arange(1, int(given) + 1), 3).reshape(-1, 3)
+        return cubes_within(int(given))
     if (np.diff(boxes, axis=0) < 0).any():
         raise InvalidInputError("radius: expected boxes each at least as large as the one before")
     return np.ascontiguousarray(boxes)

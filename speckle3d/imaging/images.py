@@ -62,6 +62,11 @@ class PosedImages:
     def __len__(self) -> int:
         return len(self.world_from_image)
 
+    @property
+    def any_thread(self) -> bool:
+        """Whether images may be read by several threads at once."""
+        return isinstance(self.images, np.ndarray) or getattr(self.images, "any_thread", False)
+
     def read(self, index: int) -> Float32Array:
         """Image number `index`, shape (vector, sample), contiguous; raises what `read_as_stored` does."""
         # Writeable, so that read-only sources do not compile the kernels a second time.
@@ -116,6 +121,11 @@ class ChosenImages:
 
     def __len__(self) -> int:
         return int(self.frames.size)
+
+    @property
+    def any_thread(self) -> bool:
+        """Whether images may be read by several threads at once."""
+        return isinstance(self.images, np.ndarray) or getattr(self.images, "any_thread", False)
 
 
 def require_poses(world_from_image: RigidTransform) -> None:

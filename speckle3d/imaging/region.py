@@ -6,9 +6,10 @@ Positions are millimetres in the image: x lateral from the first vector, y axial
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -176,6 +177,23 @@ class Region:
                 f"{grid.width_mm:g} mm and y {grid.first_sample_depth_mm:g} to {grid.depth_mm:g} mm, got none"
             )
         return inside
+
+    def part(self, grid: ImageGrid, world_from_image: RigidTransform) -> tuple[ImageGrid, RigidTransform]:
+        """Smallest rectangles of the images that hold the region: their grid, and the poses of each.
+
+        A grid of voxels around them has no room for what does not count.
+
+        Raises
+        ------
+        InvalidInputError
+            If no sample counts.
+        """
+        inside = self.mask(grid)
+        vector, sample = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+        moved_mm = grid.image_from_sample[:3, :2] @ [vector[0], sample[0]]
+        sides = int(vector[-1] - vector[0] + 1), int(sample[-1] - sample[0] + 1)
+        within = replace(grid, vectors=sides[0], samples=sides[1])
+        return within, world_from_image * RigidTransform.from_translation(moved_mm)
 
 
 def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray]:

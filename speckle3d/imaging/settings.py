@@ -38,6 +38,12 @@ class CompoundingSettings(BaseModel):
         ge=0,
         description="Half the edge, in voxels, of the largest cube from which a hole is filled; 0: none.",
     )
+    fill_mm: float = Field(
+        0.0,
+        ge=0,
+        description="If above zero, in place of the radius in voxels: holes are filled from boxes that reach "
+        "this far along each axis, whatever the voxels' shape.",
+    )
     voxel_type: VoxelType = Field("uint8", description="Type of the voxels; in float32 empty ones are NaN.")
     levels: Levels | Literal["auto"] = Field(
         "auto",

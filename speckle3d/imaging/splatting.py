@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -142,19 +143,43 @@ def _batches(source: PosedImages, frames: IntArray) -> Iterator[_Batch]:
     kind = first.dtype if first.dtype.name in _DIRECT and first.dtype.isnative else np.dtype(np.float32)
     turned = first.flags.f_contiguous and not first.flags.c_contiguous
     shape = first.shape[::-1] if turned else first.shape
-    size = int(np.clip(_BATCH_BYTES // max(first.size * kind.itemsize, 1), 1, _BATCH_FRAMES))
+    size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES)
     stored = first.dtype
     del first
     images = np.empty((min(size, frames.size), *shape), kind)
     for start in range(0, frames.size, size):
         some = frames[start : start + size]
-        for n, frame in enumerate(some):
-            image = source.read_as_stored(int(frame))
-            if image.dtype != stored:
-                raise MismatchError(f"images[{frame}]: expected {stored} as the others, got {image.dtype}")
-            images[n] = image.T if turned else image
-            del image
+        read = partial(_read_into, images, source, some, stored, turned)
+        if source.any_thread:
+            in_parallel(read, some.size)
+        else:
+            read(0, some.size)
         yield _Batch(images[: some.size], some, turned)
+
+
+def _read_into(
+    images: npt.NDArray[Any],
+    source: PosedImages,
+    frames: IntArray,
+    stored: np.dtype[Any],
+    turned: bool,
+    first: int,
+    stop: int,
+) -> None:
+    """Read some of the frames, from `first` to before `stop`."""
+    for n in range(first, stop):
+        image = source.read_as_stored(int(frames[n]))
+        if image.dtype != stored:
+            raise MismatchError(f"images[{frames[n]}]: expected {stored} as the others, got {image.dtype}")
+        images[n] = image.T if turned else image
+        del image
+
+
+def batch_gb(source: PosedImages) -> float:
+    """Memory for frames and their weights in hand, GB."""
+    samples = source.grid.vectors * source.grid.samples
+    frames = min(len(source), max(_BATCH_BYTES // samples, 1), _BATCH_FRAMES)
+    return 2 * 4 * samples * (frames + 1) / 1e9
 
 
 def _spans(source: PosedImages, mask: BoolArray | None, turned: bool) -> IntArray:
@@ -210,7 +235,7 @@ class Accumulator:
         from speckle3d.kernels import splatting as kernels
 
         whole = np.array([[0, n] for n in self.shape[::-1]], dtype=np.int64)
-        # Threads share out voxels, not images, along the axis that each image crosses most of.
+        # Threads share out voxels, not images: what is added to one comes in the same order.
         axis = _common_axis(maps, images.shape[1:], whole)
         tag = first_tag if self.rule == "latest" else 0
 
@@ -266,8 +291,8 @@ def fixed_maps(index_from_sample: FloatArray, splat: Splat, first_plane: int, tu
 
 
 def _common_axis(maps: IntArray, shape: tuple[int, ...], box: IntArray) -> int:
-    """Axis of the voxels along which images extend most."""
-    extent = np.abs(maps[:, :, :2]).astype(float) @ np.asarray(shape, dtype=float) / 2.0**_POSITION_BITS
+    """Axis of the voxels along which the lines of images follow each other most: few are cut there."""
+    extent = np.abs(maps[:, :, 0]).astype(float) * shape[0] / 2.0**_POSITION_BITS
     shared = np.minimum(extent / box[:, 1], 1.0).mean(axis=0)
     return int(np.argmax(shared * np.minimum(box[:, 1], _LEAST_BLOCK * 4)))
 

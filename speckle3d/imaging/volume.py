@@ -20,7 +20,7 @@ from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, Rule, Splat, VoxelType
 from speckle3d.imaging.slabs import compound_slabs, working_gb
-from speckle3d.imaging.splatting import Weights
+from speckle3d.imaging.splatting import Weights, batch_gb
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
@@ -54,6 +54,7 @@ def compound(
     weights: Weights | None = None,
     region: BoolArray | None = None,
     fill_radius: int = DEFAULT_FILL_RADIUS,
+    backward_mm: float = 0.0,
     voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
     max_memory_gb: float = MAX_MEMORY_GB,
@@ -85,6 +86,10 @@ def compound(
     fill_radius : int
         Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
         stay empty. The volume also grows by so many voxels beyond the first and the last frame.
+    backward_mm : float
+        For sparse sweeps: if above zero, each voxel is interpolated between the images nearest on either
+        side, up to this far from it, without `splat`, `rule` and `fill_radius`; see
+        `speckle3d.imaging.backward`.
     voxel_type : {"float32", "uint8", "int16", "uint16"}
         With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
         are 0.
@@ -132,16 +137,21 @@ def compound(
             splat=splat,
             rule=rule,
             fill_radius=fill_radius,
+            backward_mm=backward_mm,
             voxel_type=voxel_type,
             max_memory_gb=max_memory_gb,
         )
     except ValidationError as error:
         found = error.errors()[0]
         raise InvalidInputError(f"{found['loc'][0]}: {found['msg']}, got {found['input']!r}") from None
-    return _joined(source, voxel_grid, _within_memory(voxel_grid, settings), weights, region)
+    return _joined(
+        source, voxel_grid, _within_memory(voxel_grid, settings, batch_gb(source)), weights, region
+    )
 
 
-def _within_memory(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> CompoundingSettings:
+def _within_memory(
+    voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float
+) -> CompoundingSettings:
     """Settings whose memory is what slabs may take beside the whole volume.
 
     Raises
@@ -149,7 +159,7 @@ def _within_memory(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> Comp
     InvalidInputError
         If nothing is left.
     """
-    if working_gb(voxel_grid, settings) <= settings.max_memory_gb:
+    if working_gb(voxel_grid, settings, frames_gb) <= settings.max_memory_gb:
         return settings
     # The type that the levels have, and a byte of state.
     most, held = settings.max_memory_gb, voxel_grid.size_gb(settings.voxel_type) + voxel_grid.size_gb("uint8")

@@ -141,6 +141,8 @@ def _sensor_rows(sweep: Sweep) -> list[Row]:
             (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
             (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
         ]
+    if sweep.tracker is not None and sweep.tracker.image_skew_rad:
+        rows.append(("image axes off square", f"{np.rad2deg(sweep.tracker.image_skew_rad):.3g}", "deg"))
     return [*rows, ("truth", "no" if sweep.truth is None else "yes", "")]
 
 

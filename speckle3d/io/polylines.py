@@ -11,9 +11,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.io.hdf5 import atomic_path
-
-SPACE = "SPACE=LPS"
-"""What 3D Slicer looks for in the header of a file of points."""
+from speckle3d.io.surfaces import SPACE
 
 
 def write_polylines(

@@ -158,9 +158,10 @@ def _volume(found: _Stored, where: str) -> Volume:
     # The first axis runs fastest in a file.
     voxels = found.voxels.reshape(found.size[::-1]).T
     axes, origin = found.axes, found.origin_mm
-    if np.linalg.det(axes) < 0:
-        origin = origin + axes[2] * spacing[2] * (voxels.shape[2] - 1)
-        axes, voxels = axes * [[1.0], [1.0], [-1.0]], voxels[:, :, ::-1]
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+        if np.linalg.det(axes) < 0:
+            origin = origin + axes[2] * spacing[2] * (voxels.shape[2] - 1)
+            axes, voxels = axes * [[1.0], [1.0], [-1.0]], voxels[:, :, ::-1]
     matrix = np.eye(4)
     matrix[:3, :3] = axes.T
     matrix[:3, 3] = origin

@@ -18,8 +18,8 @@ from speckle3d.kernels.slicing import bilinear
 EDGE_TOLERANCE = 1e-6
 """Fraction of a pixel or voxel by which a point may miss the border: rounding of poses."""
 
-EMPTY = np.uint8(0)
-"""State of a voxel that holds nothing."""
+EMPTY, MEASURED, FILLED = np.uint8(0), np.uint8(1), np.uint8(2)
+"""States of a point or voxel: it holds nothing, an image's level, one from between images."""
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath=False)
@@ -94,6 +94,40 @@ def keep_nearest(
                 if not math.isnan(level):
                     distance_mm[side, line, point] = away
                     grey[side, line, point] = level
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def blend_nearest(
+    distance_mm: Float32Array, grey: Float32Array, alone_mm: float, levels: Float32Array, state: ByteArray
+) -> None:
+    """Interpolate between the nearest images of either side, or take the only one there is if it is near.
+
+    Parameters
+    ----------
+    distance_mm, grey : ndarray, shape (2, n, points)
+        As `keep_nearest` leaves them; `grey` is NaN where there is no image.
+    alone_mm : float
+        Distance of an image up to which a point is measured, and to which one image alone counts.
+    levels : ndarray, shape (n, points), filled
+        NaN where nothing is near.
+    state : ndarray, shape (n, points), filled
+        `EMPTY`, `MEASURED` or, between two images farther away, `FILLED`.
+    """
+    for line in range(levels.shape[0]):
+        for point in range(levels.shape[1]):
+            behind, front = distance_mm[0, line, point], distance_mm[1, line, point]
+            level, other = grey[0, line, point], grey[1, line, point]
+            none_behind, none_front = math.isnan(level), math.isnan(other)
+            measured = (behind <= alone_mm and not none_behind) or (front <= alone_mm and not none_front)
+            if not measured and (none_behind or none_front):
+                levels[line, point], state[line, point] = np.nan, EMPTY
+                continue
+            state[line, point] = MEASURED if measured else FILLED
+            if none_behind:
+                level = other
+            elif not none_front and behind > 0:
+                level += behind / (behind + front) * (other - level)
+            levels[line, point] = level
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath=False)

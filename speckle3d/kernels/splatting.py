@@ -91,24 +91,31 @@ def count_nearest(
     """
     n_j, n_i = table.shape[1:]
     words = table.reshape(-1)
+    place = np.empty(images.shape[2] + 1, np.int64)
+    ends, sums = np.empty(images.shape[2] + 1, np.int64), np.empty(images.shape[2] + 1, np.uint64)
     for n in range(images.shape[0]):
         m = maps[n]
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
         for span in range(spans.shape[0]):
             line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
-            if start >= stop:
+            count = stop - start
+            if count <= 0:
                 continue
-            # Several samples in a row lie in one voxel: memory is touched when it changes.
-            held = np.uint64(0)
-            at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
-            for sample in range(start, stop):
-                here = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
-                if here != at:
-                    words[at] += held
-                    at, held = here, np.uint64(0)
-                held += _ONE_SAMPLE + np.uint64(np.int64(images[n, line, sample]) + offset)
-                x, y, z = x + dx, y + dy, z + dz
-            words[at] += held
+            for s in range(count):
+                k, j, i = z + s * dz, y + s * dy, x + s * dx
+                place[s] = ((k >> POSITION_BITS) * n_j + (j >> POSITION_BITS)) * n_i + (i >> POSITION_BITS)
+            place[count] = -1
+            # Several samples in a row lie in one voxel. What they add is the difference of sums along the
+            # line up to the last of them: processors cannot foresee where a branch would end a row.
+            total, rows = np.uint64(0), 0
+            for s in range(count):
+                total += _ONE_SAMPLE + np.uint64(np.int64(images[n, line, start + s]) + offset)
+                ends[rows], sums[rows] = place[s], total
+                rows += place[s] != place[s + 1]
+            total = np.uint64(0)
+            for row in range(rows):
+                words[np.uint64(ends[row])] += sums[row] - total
+                total = sums[row]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -338,6 +345,18 @@ def raise_linear(
                     ):
                         table[k + w, j + v, i + u] = level
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def round_voxels(
+    voxels: Float32Array, state: npt.NDArray[np.uint8], low: float, high: float, out: Numbers
+) -> None:
+    """Fill `out` with levels rounded to whole numbers from `low` to `high`; 0 where the state is."""
+    for k in range(voxels.shape[0]):
+        for j in range(voxels.shape[1]):
+            for i in range(voxels.shape[2]):
+                level = min(max(np.rint(voxels[k, j, i]), np.float32(low)), np.float32(high))
+                out[k, j, i] = np.int32(level) if state[k, j, i] > 0 else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)

@@ -66,6 +66,11 @@ class _Counted:
         """Shape (frame, vector, sample)."""
         return len(self._sweep), self.grid.vectors, self.grid.samples
 
+    @property
+    def any_thread(self) -> bool:
+        """Whether images may be made by several threads at once: if nothing is to be told in between."""
+        return self._progress is None
+
     def _frame(self, index: int) -> npt.NDArray[Any]:
         if self._progress:
             self._progress(index + 1, len(self._sweep))

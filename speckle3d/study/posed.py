@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
@@ -61,14 +61,14 @@ class PosedSweep:
     ) -> tuple[Images, ImageGrid]:
         """Log-compressed images of the frames that have a pose, in the order of their poses, and their grid.
 
-        Raises
-        ------
-        MissingSettingsError
-            If the recording does not say the dynamic range of its B-mode.
+        B-mode of unknown range is taken to be of this one: its grey levels stay as they are, but for their
+        brightest. Images lie where a tracker's whole calibration puts them, as for `source`.
         """
-        self._require_range("log")
-        every = grey_images(self.sweep, dynamic_range_db, progress, self.reconstruction)
-        return ChosenImages(every, self.frames), every.grid
+        sweep, signal = self.sweep, self.sweep.signal
+        if not self.range_is_known and isinstance(signal, BModeSettings):
+            sweep = replace(sweep, signal=replace(signal, dynamic_range_db=dynamic_range_db))
+        every = grey_images(sweep, dynamic_range_db, progress, self.reconstruction)
+        return ChosenImages(every, self.frames), replace(every.grid, skew_rad=self.skew_rad)
 
     def source(
         self,
@@ -90,10 +90,9 @@ class PosedSweep:
 
         Raises
         ------
-        MissingSettingsError
-            If levels need the dynamic range of B-mode, and the recording does not say it.
         InvalidInputError
-            If echoes are asked for as stored.
+            If levels need the dynamic range of B-mode, and the recording does not say it; or if echoes are
+            asked for as stored.
         """
         chosen = levels or usual_levels(self.sweep)
         self._require_range(chosen)
@@ -118,7 +117,11 @@ class PosedSweep:
 
     def _require_range(self, levels: Levels) -> None:
         if not self.range_is_known and levels != "stored":
-            raise MissingSettingsError(self.sweep.name, (_RANGE,))
+            raise InvalidInputError(
+                f"{self.sweep.name}: levels {levels}: expected the dynamic range of its B-mode, got none: "
+                "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
+                "screen), or take levels stored"
+            )
 
 
 def open_posed(

@@ -1,63 +1,52 @@
-"""A folder that opens in 3D Slicer as one scene: volumes, where voxels are from, frames' outlines and poses.
-
-A scene file (.mrml) lists nodes. A node that has a file refers to a storage node, which names the file
-relative to the scene's folder [1]_.
-
-References
-----------
-.. [1] 3D Slicer, sources of vtkMRMLScene and of the storage nodes named here.
-"""
+"""A folder that opens in 3D Slicer as one scene: volumes, states of voxels, frames' outlines and poses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from urllib.parse import quote
 
-import jinja2
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
-from speckle3d.core.printable import printable
-from speckle3d.core.volume import Volume
+from speckle3d.core.labels import STATE_SEGMENTS
 from speckle3d.imaging.outlines import frame_outlines
-from speckle3d.imaging.volume import DEFAULT_FILL_RADIUS, compound
+from speckle3d.imaging.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.polylines import write_polylines
 from speckle3d.io.transforms import write_transform
-from speckle3d.io.volumes import write_volume
+from speckle3d.study.mrml import COLOURED, Scene
 from speckle3d.study.posed import PosedSweep
+from speckle3d.study.sequences import PosedSequence
+from speckle3d.study.voxels import GridRequest, Progress, VolumeReport, VolumeRequest, write_voxels
 
 SCENE = "scene.mrml"
-_TEMPLATE = Path(__file__).with_name("scene.mrml")
-_COLOURS = ("0.2 0.6 1", "1 0.5 0.1", "0.3 0.8 0.3", "0.9 0.3 0.3", "0.6 0.4 0.9", "0.6 0.5 0.3")
+
+_COLOURS = (
+    (0.2, 0.6, 1.0), (1.0, 0.5, 0.1), (0.3, 0.8, 0.3), (0.9, 0.3, 0.3), (0.6, 0.4, 0.9), (0.6, 0.5, 0.3),
+)  # fmt: skip
 """Of the outlines of one mode after the other."""
-_VIEWS = ("Red", "Green", "Yellow")
 
 
 @dataclass(frozen=True)
-class SceneSettings:
-    """What goes into a scene.
+class SceneRequest:
+    """What a scene is to hold.
 
     Attributes
     ----------
-    voxel_mm : float
-    fill_radius : int
-    dynamic_range_db : float
+    settings : CompoundingSettings
+    grid : GridRequest
+    with_images : bool
+        Whether the images are there, too, and move through the volume when they are played.
+    with_deviation : bool
+        Whether each voxel's standard deviation of position is a volume, too.
     """
 
-    voxel_mm: float = 0.2
-    fill_radius: int = DEFAULT_FILL_RADIUS
-    dynamic_range_db: float = 60.0
-
-
-@dataclass(frozen=True)
-class _Node:
-    tag: str
-    attributes: dict[str, str] = field(default_factory=dict)
+    settings: CompoundingSettings = field(default_factory=CompoundingSettings)
+    grid: GridRequest = field(default_factory=GridRequest)
+    with_images: bool = False
+    with_deviation: bool = False
 
 
 @dataclass(frozen=True)
@@ -68,34 +57,46 @@ class _Files:
     state: str
     outlines: str
     first: str
+    deviation: str
+    images: str
+    poses: str
 
     @classmethod
     def of(cls, mode: str) -> _Files:
-        names = ("volume-{}.nrrd", "state-{}.seg.nrrd", "outlines-{}.vtk", "first-frame-{}.tfm")
+        names = (
+            "volume-{}.nrrd", "state-{}.seg.nrrd", "outlines-{}.vtk", "first-frame-{}.tfm",
+            "deviation-{}.nrrd", "images-{}.seq.nrrd", "poses-{}.seq.mha",
+        )  # fmt: skip
         return cls(*(name.format(mode) for name in names))
 
-    @property
-    def all(self) -> tuple[str, ...]:
-        return self.volume, self.state, self.outlines, self.first
+    def written(self, request: SceneRequest) -> list[str]:
+        deviation = [self.deviation] if request.with_deviation else []
+        images = [self.images, self.poses] if request.with_images else []
+        return [self.volume, self.state, self.outlines, self.first, *deviation, *images]
 
 
 def write_scene(
     folder: PathLike,
     posed: Sequence[PosedSweep],
-    settings: SceneSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> None:
+    request: SceneRequest | None = None,
+    progress: Progress | None = None,
+) -> list[VolumeReport]:
     """Write a folder with a scene and all that it refers to; it appears whole or not at all.
 
     Parameters
     ----------
     folder : path
-        New, or one that holds a scene of the same modes, which is replaced.
+        New, or one that holds a scene, which is replaced.
     posed : sequence of PosedSweep
         One sweep with the poses of one mode or more.
-    settings : SceneSettings, optional
+    request : SceneRequest, optional
     progress : callable, optional
-        Called with the number of frames compounded and their total, mode after mode.
+        Called with the number of planes compounded and their total, of all modes.
+
+    Returns
+    -------
+    list of VolumeReport
+        Of each mode.
 
     Raises
     ------
@@ -104,14 +105,22 @@ def write_scene(
     FileError
         If the folder cannot be written.
     """
+    asked = request or SceneRequest()
     modes = [each.mode for each in posed]
     if not modes or len({*modes}) != len(modes):
-        raise InvalidInputError(f"{folder}: expected one mode or more, each once, got {modes}")
-    others = [name for mode in modes for name in _Files.of(mode).all]
-    with FileSet(SCENE, tuple(others)).replaced(Path(folder)) as part:
-        for each in posed:
-            _write_mode(part, each, settings or SceneSettings(), progress)
-        (part / SCENE).write_text(scene_text(modes, posed[0].sweep.name), encoding="utf-8")
+        raise InvalidInputError(f"{folder}: expected one mode or more, each once, got {', '.join(modes)}")
+    target = Path(folder)
+    names = [name for mode in modes for name in _Files.of(mode).written(asked)]
+    with FileSet(SCENE, tuple(names), _left(target, names)).replaced(target) as part:
+        scene, reports = Scene(), []
+        for i, each in enumerate(posed):
+            shown = _part_of(progress, i, len(posed))
+            report = _write_mode(part, each, asked, shown)
+            reports.append(replace(report, path=target / report.path.name))
+            _add_mode(scene, each, asked, i)
+        scene.show("vtkMRMLScalarVolumeNode1")
+        (part / SCENE).write_text(scene.text(), encoding="utf-8")
+    return reports
 
 
 def require_scene_place(folder: Path, *inputs: Path | None) -> None:
@@ -122,104 +131,59 @@ def require_scene_place(folder: Path, *inputs: Path | None) -> None:
     InvalidInputError
         Naming the folder.
     """
-    if not folder.exists():
+    if not folder.is_dir():
         return
     if any(each is not None and each.resolve().parent == folder.resolve() for each in inputs):
         raise InvalidInputError(f"{folder}: holds an input: give another name")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / SCENE).is_file():
+    if any(folder.iterdir()) and not (folder / SCENE).is_file():
         raise InvalidInputError(f"{folder}: expected a new name or a scene to replace, got another folder")
 
 
-def scene_text(modes: Sequence[str], title: str) -> str:
-    """Scene of the modes' files as text.
+def _left(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """Files of a scene in the folder that the new one does not have."""
+    if not (folder / SCENE).is_file():
+        return ()
+    mode = "*"
+    patterns = vars(_Files.of(mode)).values()
+    return tuple(sorted({each.name for pattern in patterns for each in folder.glob(pattern)} - {*names}))
 
-    Parameters
-    ----------
-    title : str
-        What names of nodes begin with.
-    """
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
-    nodes = [node for i, mode in enumerate(modes, 1) for node in _mode_nodes(i, mode, printable(title))]
-    return template.render(nodes=[*nodes, *_view_nodes()])
+
+def _part_of(progress: Progress | None, i: int, count: int) -> Progress | None:
+    """Progress of one mode as a part of that of all."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(i * total + done, count * total)
 
 
 def _write_mode(
-    folder: Path, posed: PosedSweep, settings: SceneSettings, progress: Callable[[int, int], None] | None
-) -> None:
+    folder: Path, posed: PosedSweep, request: SceneRequest, progress: Progress | None
+) -> VolumeReport:
     files = _Files.of(posed.mode)
-    images, grid = posed.images(settings.dynamic_range_db, progress)
-    poses, voxel_mm = posed.world_from_image, settings.voxel_mm
-    volume = compound(images, grid, poses, voxel_mm, fill_radius=settings.fill_radius)
-    measured = compound(images, grid, poses, voxel_mm, fill_radius=0)
-    state = np.where(np.isfinite(measured.voxels), 1, np.where(np.isfinite(volume.voxels), 2, 0))
-    place = volume.spacing_mm, volume.world_from_grid
-    levels = np.clip(np.nan_to_num(np.rint(volume.voxels)), 0, 255).astype(np.uint8)
-    write_volume(folder / files.volume, Volume(levels, *place, volume.fields))
-    write_volume(folder / files.state, LabelMap(state.astype(np.uint8), *place, {}, STATE_SEGMENTS))
-    outlines = frame_outlines(grid, poses)
+    deviation = folder / files.deviation if request.with_deviation else None
+    voxels = VolumeRequest(
+        folder / files.volume, request.settings, request.grid, None, folder / files.state, deviation
+    )
+    report = write_voxels(posed, voxels, progress)
+    sequence = PosedSequence.of(posed, request.settings.dynamic_range_db)
+    outlines = frame_outlines(sequence.sweep.grid, posed.world_from_image)
     write_polylines(folder / files.outlines, outlines, {"frame": posed.frames.astype(np.float64)})
-    write_transform(folder / files.first, poses[0])
+    write_transform(folder / files.first, posed.world_from_image[0])
+    if request.with_images:
+        sequence.write(folder / files.images)
+        sequence.write_poses(folder / files.poses)
+    return report
 
 
-def _mode_nodes(i: int, mode: str, title: str) -> Iterator[_Node]:
-    """Nodes of one mode, counted from 1; those that others refer to come first."""
-    files, name = _Files.of(mode), f"{title}, {mode}"
-    yield from _stored(
-        "Volume", f"vtkMRMLScalarVolumeNode{i}", name,
-        _storage("VolumeArchetypeStorage", i, files.volume, centerImage="0", UseOrientationFromFile="1"),
-        _Node("VolumeDisplay", {
-            "id": f"vtkMRMLScalarVolumeDisplayNode{i}", "colorNodeID": "vtkMRMLColorTableNodeGrey",
-            "interpolate": "1", "autoWindowLevel": "0", "window": "255", "level": "127.5",
-        }),
-    )  # fmt: skip
-    yield from _stored(
-        "Segmentation", f"vtkMRMLSegmentationNode{i}", f"{name}: voxels measured and filled",
-        _storage("SegmentationStorage", i, files.state),
-        _Node("SegmentationDisplay", {
-            "id": f"vtkMRMLSegmentationDisplayNode{i}", "visibility": "false", "opacity": "0.5",
-        }),
-        referenceImageGeometryRef=f"vtkMRMLScalarVolumeNode{i}",
-    )  # fmt: skip
-    yield from _stored(
-        "Model", f"vtkMRMLModelNode{i}", f"{name}: frames",
-        _storage("ModelStorage", i, files.outlines, coordinateSystem="LPS"),
-        _Node("ModelDisplay", {
-            "id": f"vtkMRMLModelDisplayNode{i}", "color": _COLOURS[(i - 1) % len(_COLOURS)],
-            "lineWidth": "1", "representation": "1", "lighting": "false", "scalarVisibility": "false",
-            "visibility": "true" if i == 1 else "false",
-        }),
-    )  # fmt: skip
-    yield from _stored(
-        "LinearTransform", f"vtkMRMLLinearTransformNode{i}", f"{name}: first frame",
-        _storage("TransformStorage", i, files.first), None,
-    )  # fmt: skip
-
-
-def _view_nodes() -> Iterator[_Node]:
-    """What the three slice views show: the first volume."""
-    for view in _VIEWS:
-        attributes = {
-            "id": f"vtkMRMLSliceCompositeNode{view}", "singletonTag": view, "layoutName": view,
-            "backgroundVolumeID": "vtkMRMLScalarVolumeNode1", "linkedControl": "1",
-        }  # fmt: skip
-        yield _Node("SliceComposite", attributes)
-
-
-def _storage(tag: str, i: int, file: str, **attributes: str) -> _Node:
-    # Names of files in a scene are URLs.
-    place = {"id": f"vtkMRML{tag}Node{i}", "fileName": quote(file), "useCompression": "1"}
-    return _Node(tag, {**place, **attributes})
-
-
-def _stored(
-    tag: str, identity: str, name: str, storage: _Node, display: _Node | None, **references: str
-) -> Iterator[_Node]:
-    """A node with its storage, its display and what else it refers to."""
-    yield storage
-    roles = {"storage": storage.attributes["id"], **references}
-    if display is not None:
-        yield display
-        roles = {"display": display.attributes["id"], **roles}
-    told = "".join(f"{role}:{to};" for role, to in roles.items())
-    yield _Node(tag, {"id": identity, "name": name, "references": told})
+def _add_mode(scene: Scene, posed: PosedSweep, request: SceneRequest, i: int) -> None:
+    files, name = _Files.of(posed.mode), f"{posed.sweep.name}, {posed.mode}"
+    window = (0.0, 255.0) if request.settings.voxel_type == "uint8" else None
+    volume = scene.add_volume(name, files.volume, window)
+    scene.add_labels(f"{name}: voxels", files.state, volume, STATE_SEGMENTS)
+    if request.with_deviation:
+        said = f"{name}: standard deviation of position along the sweep, mm"
+        scene.add_volume(said, files.deviation, None, COLOURED)
+    scene.add_lines(f"{name}: outlines", files.outlines, _COLOURS[i % len(_COLOURS)], visible=i == 0)
+    scene.add_transform(f"{name}: first frame", files.first)
+    if request.with_images:
+        rate = len(posed.frames) / max(float(np.ptp(posed.sweep.frame_time_s[posed.frames])), 1e-3)
+        scene.add_moving_images(f"{name}: frames", files.images, files.poses, rate)

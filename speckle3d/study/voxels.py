@@ -5,26 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.labels import STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.backward import backward_slabs
-from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like
+from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.settings import CompoundingSettings
-from speckle3d.imaging.slabs import as_type, compound_slabs
+from speckle3d.imaging.slabs import compound_slabs
 from speckle3d.imaging.uncertainty import DeviationField
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.volume_writer import VolumeWriter
@@ -54,6 +54,10 @@ class GridRequest:
         Centre of the first voxel in the world; by default the grid begins where the images do.
     shape : tuple of int, optional
         Voxels along i, j and k; by default the grid reaches to where the images end.
+    size_mm : tuple of float, optional
+        Instead of `shape`: sizes along i, j and k from outer side to outer side.
+    within_gb : float, optional
+        Instead of `spacing_mm`: the finest round one with which voxels that hold the images take no more.
     like : path, optional
         A volume whose grid to take instead of all this.
     """
@@ -62,36 +66,47 @@ class GridRequest:
     spacing_mm: tuple[float, float, float] | None = None
     origin_mm: tuple[float, float, float] | None = None
     shape: tuple[int, int, int] | None = None
+    size_mm: tuple[float, float, float] | None = None
+    within_gb: float | None = None
     like: Path | None = None
 
-    def grid(self, source: PosedImages, settings: CompoundingSettings) -> VoxelGrid:
-        """Grid for a sweep's images.
+    def grid(
+        self, images: ImageGrid, world_from_image: RigidTransform, settings: CompoundingSettings
+    ) -> VoxelGrid:
+        """Grid for a sweep's images, or for a part of each.
 
         Raises
         ------
         InvalidInputError
-            If a grid like another's is asked for and anything else beside it, or a value is not what it
-            must be.
+            If a grid like another's is asked for and anything else beside it, a size in both voxels and mm, a
+            spacing and a bound of it, or a value is not what it must be.
         """
         if self.like is not None:
             if self != GridRequest(like=self.like):
                 raise InvalidInputError("--like: expected no other option of the grid beside it")
             return grid_like(read_volume(self.like))
+        if self.spacing_mm is not None and self.within_gb is not None:
+            raise InvalidInputError("--within-gb: expected no --spacing-mm beside it")
+        axes = self._axes(images, world_from_image)
+        spacing: float | tuple[float, float, float] = self.spacing_mm or settings.voxel_mm
+        if self.within_gb is not None:
+            spacing = spacing_within(images, world_from_image, self.within_gb, axes, settings.voxel_type)
         return grid_as_asked(
-            source.grid,
-            source.world_from_image,
-            self.spacing_mm or settings.voxel_mm,
-            world_from_axes=self._axes(source),
+            images,
+            world_from_image,
+            spacing,
+            world_from_axes=axes,
             origin_mm=self.origin_mm,
             shape=self.shape,
+            size_mm=self.size_mm,
         )
 
-    def _axes(self, source: PosedImages) -> Rotation:
+    def _axes(self, images: ImageGrid, world_from_image: RigidTransform) -> Rotation:
         if self.axes == "world":
             return Rotation.identity()
         if self.axes == "principal":
-            return principal_axes(source.grid, source.world_from_image)
-        return sweep_axes(source.world_from_image)
+            return principal_axes(images, world_from_image)
+        return sweep_axes(world_from_image)
 
 
 @dataclass(frozen=True)
@@ -195,7 +210,8 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     began, settings = time.perf_counter(), request.settings
     levels = None if settings.levels == "auto" else settings.levels
     source, meaning = posed.source(levels, settings.dynamic_range_db)
-    grid = request.grid.grid(source, settings)
+    images = source.grid, source.world_from_image
+    grid = request.grid.grid(*(request.region.part(*images) if request.region else images), settings)
     counts = np.zeros(3, dtype=np.int64)
     place = grid.shape, grid.spacing_mm, grid.world_from_grid
     fields = fields_of(posed, request, meaning)
@@ -224,18 +240,9 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
 def _slabs(posed: PosedSweep, source: PosedImages, grid: VoxelGrid, request: VolumeRequest) -> Iterator[Slab]:
     settings = request.settings
     mask: BoolArray | None = None if request.region is None else request.region.mask(source.grid)
-    if settings.backward_mm > 0:
-        return _backward(source, grid, settings, mask)
-    weights = confidence(posed, settings.voxel_mm) if settings.rule == "weighted" else None
+    weighted = settings.rule == "weighted" and settings.backward_mm == 0
+    weights = confidence(posed, settings.voxel_mm) if weighted else None
     return compound_slabs(source, grid, settings, weights, mask)
-
-
-def _backward(
-    source: PosedImages, grid: VoxelGrid, settings: CompoundingSettings, mask: BoolArray | None
-) -> Iterator[Slab]:
-    """Slabs of voxels looked up in the images, in the type asked for."""
-    for slab in backward_slabs(source, grid, settings.backward_mm, mask, settings.max_memory_gb):
-        yield replace(slab, voxels=as_type(slab.voxels, slab.state, settings.voxel_type))
 
 
 def _outputs(
@@ -297,4 +304,5 @@ def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[s
 def _method(settings: CompoundingSettings) -> dict[str, str]:
     if settings.backward_mm > 0:
         return {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
-    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": f"{settings.fill_radius} voxels"}
+    filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
+    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}

@@ -90,6 +90,12 @@ def cases(inputs: Path) -> dict[str, Case]:
     for suffix in ("nrrd", "nii.gz"):
         words = ("volume", "{i}/r{n}/reconstruction.h5", "-o", "{out}/v." + suffix, "--voxel-mm", "0.1")
         found[f"volume .{suffix}"] = Case(*pair(*words, first="5", second="6"), (f"v.{suffix}",))
+    words = ("scene", "{i}/r{n}/reconstruction.h5", "-o", "{out}/scene", "--voxel-mm", "0.2", "--images")
+    files = ("volume-{}.nrrd", "state-{}.seg.nrrd", "outlines-{}.vtk", "first-frame-{}.tfm",
+             "images-{}.seq.nrrd", "poses-{}.seq.mha", "scene.mrml")  # fmt: skip
+    scene = tuple(f"scene/{name.format('image')}" for name in files)
+    found["scene over a scene"] = Case(*pair(*words, first="5", second="6"), scene)
+    found["scene into a new folder"] = Case(*pair(*words, first="5", second="6"), scene, fresh=True)
     for kind in ("plane", "orientation"):
         words = ("calibrate", kind, "{i}/plane{n}.h5", "-o", "{out}/c.h5")
         found[f"calibrate {kind}"] = Case(*pair(*words, first="8", second="9"), beside)

@@ -15,6 +15,7 @@ import sweep_examples
 from fuzz import mutations
 
 from speckle3d.core.curves import TiltResponse
+from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
 from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
@@ -180,11 +181,13 @@ def nrrds(folder):
 
 def volumes(folder):
     voxels = np.random.default_rng(0).integers(0, 256, (4, 5, 6)).astype(np.uint8)
-    volume = Volume(voxels, (0.5, 0.25, 1.0), sweep_examples.poses(1)[0])
-    paths = [folder / name for name in ("v.nrrd", "v.mha", "v.nii.gz", "u.nrrd", "u.mha")]
-    for path in paths:
-        write_volume(path, volume, compress=path.name.startswith("v"))
-    return paths
+    place = (0.5, 0.25, 1.0), sweep_examples.poses(1)[0], {"levels": "linear", "note": "two\nlines"}
+    volume, labels = Volume(voxels, *place), LabelMap(voxels % 3, *place, STATE_SEGMENTS)
+    of_volume = [folder / name for name in ("v.nrrd", "v.mha", "v.nii.gz", "u.nrrd", "u.mha", "u.nii")]
+    of_labels = [folder / name for name in ("l.seg.nrrd", "l.mha", "l.nii")]
+    for path in (*of_volume, *of_labels):
+        write_volume(path, labels if path in of_labels else volume, compress=path.name.startswith("v"))
+    return [*of_volume, *of_labels]
 
 
 def streams(folder):

@@ -14,6 +14,7 @@ from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
+from speckle3d.imaging.volume import compound
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -39,7 +40,7 @@ def by_definition(images, poses, voxel_grid, reach_mm):
     voxels = np.full(voxel_grid.shape, np.nan)
     state = np.full(voxel_grid.shape, EMPTY, np.uint8)
     normals = poses.rotation.apply([0.0, 0.0, 1.0])
-    facing = np.where(normals @ normals.sum(axis=0) < 0, -1.0, 1.0)
+    facing = np.where(normals @ normals[0] < 0, -1.0, 1.0)
     along = voxel_grid.world_from_grid.rotation.inv().apply(normals)
     half = 0.5 * np.abs(along * voxel_grid.spacing_mm).max()
     index = list(np.ndindex(*voxel_grid.shape))
@@ -115,7 +116,7 @@ def test_slabs_equal_the_whole_to_the_last_bit(order):
     source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.3)
     whole = joined(backward_slabs(source, grid, 1.5))
     images_gb = 16 * 9 * 14 * 4 / 1e9
-    plane_gb = grid.shape[0] * grid.shape[1] * 21 / 1e9
+    plane_gb = grid.shape[0] * grid.shape[1] * 30 / 1e9
     slabs = list(backward_slabs(source, grid, 1.5, max_memory_gb=images_gb + 4.5 * plane_gb))
     assert len(slabs) > 3
     assert max(len(slab.voxels) for slab in slabs) <= 4
@@ -131,7 +132,7 @@ def test_images_are_read_once_for_each_slab_they_reach():
         return np.full((9, 14), number)
 
     grid = grid_around(GRID, poses, 0.5)
-    memory_gb = 16 * 9 * 14 * 4 / 1e9 + grid.shape[0] * grid.shape[1] * 21 * 20.5 / 1e9
+    memory_gb = 16 * 9 * 14 * 4 / 1e9 + grid.shape[0] * grid.shape[1] * 30 * 20.5 / 1e9
     slabs = list(backward_slabs(PosedImages(image, GRID, poses), grid, 1.2, max_memory_gb=memory_gb))
     assert len(slabs) == 4
     # 79 planes of 0.5 mm in four slabs; images within 1.2 mm of either end are read for the next one, too.
@@ -149,6 +150,21 @@ def test_any_number_of_threads_gives_the_same(monkeypatch):
     for result in results[1:]:
         for found, expected in zip(result, results[0], strict=True):
             np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_as_many_images_of_either_facing_are_told_apart(seed):
+    # The sum of such normals points anywhere.
+    rng = np.random.default_rng(seed)
+    middle = RigidTransform.from_translation([2.0, 0.0, 0.0])
+    turned = middle * RigidTransform.from_rotation(Rotation.from_rotvec([0.0, np.pi, 0.0])) * middle.inv()
+    there, back = shaken(rng, 3, 1.0), shaken(rng, 3, 1.0) * turned
+    poses, images = RigidTransform.concatenate([there, back]), rng.normal(size=(6, 9, 14)).astype(np.float32)
+    grid = grid_around(GRID, poses, 0.6)
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.0))
+    expected, expected_state = by_definition(images.tolist(), poses, grid, 2.0)
+    np.testing.assert_array_equal(state, expected_state.T)
+    np.testing.assert_allclose(voxels, expected.T, atol=2e-5)
 
 
 def test_a_probe_turned_round_between_passes_interpolates_between_them():
@@ -176,6 +192,17 @@ def test_only_the_region_counts():
     assert (voxels[state != EMPTY] == 1.0).all()
 
 
+def test_compounding_backward_is_this_in_any_type():
+    rng = np.random.default_rng(5)
+    poses, images = shaken(rng, 6, 1.1), rng.uniform(0.0, 255.0, (6, 9, 14)).astype(np.float32)
+    grid = grid_around(GRID, poses, 0.4)
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 1.7))
+    for voxel_type, expected in (("float32", voxels), ("uint8", np.nan_to_num(np.rint(voxels)))):
+        volume = compound(images, GRID, poses, 0.4, backward_mm=1.7, voxel_type=voxel_type)
+        np.testing.assert_array_equal(volume.voxels, expected.T)
+        np.testing.assert_array_equal(volume.state, state.T)
+
+
 def test_one_image_and_none_near():
     source = PosedImages(np.full((1, 9, 14), 7.0), GRID, RigidTransform.identity(1))
     grid = VoxelGrid((3, 3, 3), (0.5, 0.5, 0.5), RigidTransform.from_translation([1.0, 1.0, -0.5]))
@@ -192,7 +219,7 @@ def test_wrong_input_is_refused():
     source = PosedImages(np.ones((1, 9, 14)), GRID, RigidTransform.identity(1))
     grid = VoxelGrid((300, 300, 3), (0.5, 0.5, 0.5), RigidTransform.identity())
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(InvalidInputError, match="reach_mm"):
+        with pytest.raises(InvalidInputError, match="max_distance_mm"):
             next(iter(backward_slabs(source, grid, bad)))
     with pytest.raises(InvalidInputError, match="region"):
         next(iter(backward_slabs(source, grid, 1.0, np.ones((3, 3), bool))))

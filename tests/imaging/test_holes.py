@@ -5,10 +5,16 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.grid import grid_as_asked
 from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED, boxes_within, fill_holes
+from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.settings import CompoundingSettings
+from speckle3d.imaging.slabs import compound_slabs
 
 
 def some_voxels(rng, shape, share_measured):
@@ -94,6 +100,23 @@ def test_slabs_with_halo_give_the_whole_volume_to_the_last_bit(radius):
         # The halo stays as it was.
         np.testing.assert_array_equal(slab[stop - low :], voxels[stop:high])
         np.testing.assert_array_equal(slab_state[: first - low], state[low:first])
+
+
+def test_compounding_fills_as_far_in_mm_along_each_axis():
+    # Two images, 2 mm apart, of voxels much longer along the sweep than across; then the other way round.
+    grid = ImageGrid(11, 11, 0.2, 0.2)
+    poses = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    for spacing in ((0.2, 0.2, 0.5), (0.5, 0.2, 0.2)):
+        voxels = grid_as_asked(grid, poses, spacing, origin_mm=(-1.0, -1.0, -1.0), size_mm=(4.0, 4.0, 4.0))
+        settings = CompoundingSettings(fill_mm=0.6, voxel_type="float32")
+        slabs = list(compound_slabs(PosedImages(np.ones((2, 11, 11)), grid, poses), voxels, settings))
+        state = np.concatenate([slab.state for slab in slabs])
+        for axis, step in zip((2, 1, 0), spacing, strict=True):
+            at = np.moveaxis(np.indices(state.shape), 0, -1)[state == MEASURED][:, axis] * step
+            filled = np.moveaxis(np.indices(state.shape), 0, -1)[state == FILLED][:, axis] * step
+            # From the outermost measured voxels on, as far as whole voxels within 0.6 mm go.
+            assert at.min() - filled.min() == pytest.approx(step * np.floor(0.6 / step + 1e-9))
+            assert filled.max() - at.max() == pytest.approx(step * np.floor(0.6 / step + 1e-9))
 
 
 def test_filled_voxels_fill_no_others():

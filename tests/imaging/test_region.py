@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
@@ -47,7 +48,7 @@ def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
     np.testing.assert_array_equal(found[sure], expected[sure])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), corners=st.integers(3, 8))
 def test_polygon_is_what_it_goes_round(seed, corners):
     rng = np.random.default_rng(seed)
@@ -101,6 +102,23 @@ def test_shapes_are_intersected_and_without_any_the_image_is_whole():
     pieces = [Region.from_text(part) for part in text.split(" and ")]
     assert pieces[0] & pieces[1] & pieces[2] == region
     assert Region().mask(GRID).all()
+
+
+@pytest.mark.parametrize("skew", [0.0, 0.06])
+def test_the_part_of_the_images_that_a_region_needs(skew):
+    grid = ImageGrid(31, 57, 0.3, 0.1, 0.7, skew)
+    poses = RigidTransform.from_components(
+        [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], Rotation.from_rotvec(np.eye(3)[:2])
+    )
+    region = Region.from_text("fan 4.5,-5 -20,25 7,9.5")
+    part, moved = region.part(grid, poses)
+    inside = np.argwhere(region.mask(grid))
+    first, last = inside.min(axis=0), inside.max(axis=0)
+    assert (part.vectors, part.samples) == tuple(last - first + 1)
+    corners = np.array([[*first, 1], [last[0], first[1], 1], [*last, 1], [first[0], last[1], 1]])
+    in_image = corners @ grid.image_from_sample[:3].T
+    for pose, there in zip(poses, moved, strict=True):
+        np.testing.assert_allclose(there.apply(part.corners_mm), pose.apply(in_image), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -193,9 +195,12 @@ def test_a_transform_of_which_the_inverse_is_there_is_inverted(tmp_path):
     scale=st.tuples(st.floats(0.01, 1), st.floats(0.01, 1)),
     seed=st.integers(0, 99),
     skew=st.floats(-0.05, 0.05),
+    first_mm=st.sampled_from([0.0, 3.0]),
 )
 @settings(deadline=None, max_examples=25)
-def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(tmp_path_factory, scale, seed, skew):
+def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(
+    tmp_path_factory, scale, seed, skew, first_mm
+):
     rng = np.random.default_rng(seed)
     rotation, place = Rotation.random(rng=rng), rng.normal(0, 50, 3)
     matrix = np.eye(4)
@@ -206,12 +211,24 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(tmp_path_
     matrix[:3, 2] = np.cross(x, y)
     _, _, frames = tracked(3)
     path = write_mha(tmp_path_factory.mktemp("calibration") / "a.mha", grey(), frames=frames)
-    settings_ = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
+    settings_ = ImportSettings(
+        dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)), first_sample_depth_mm=first_mm
+    )
     sweep = read_metaimage(path, settings_)
     assert sweep.grid.vector_pitch_mm == pytest.approx(scale[0])
     assert sweep.grid.sample_spacing_mm == pytest.approx(scale[1])
-    expected = RigidTransform.from_components(place, rotation).as_matrix()
+    above = rotation.apply([0.0, first_mm, 0.0])
+    expected = RigidTransform.from_components(place - above, rotation).as_matrix()
     np.testing.assert_allclose(sweep.tracker.sensor_from_image.as_matrix(), expected, atol=1e-9)
+    # With the skew, the image's pixels lie where the calibration puts them.
+    leaning = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
+    placed = sweep.tracker.sensor_from_image.as_matrix() @ leaning.image_from_sample
+    np.testing.assert_allclose(placed, matrix[:, [0, 1, 3]], atol=1e-9)
+    ends = [[0, 0], [4, 0], [4, 3], [0, 3]] @ matrix[:3, :2].T + place
+    corners = sweep.tracker.sensor_from_image.apply(leaning.corners_mm)
+    np.testing.assert_allclose(corners, ends, atol=1e-9)
+    middle = sweep.tracker.sensor_from_image.apply(leaning.centre_mm)
+    np.testing.assert_allclose(middle, ends.mean(axis=0), atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -223,6 +223,14 @@ def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
     assert sweep.truth is None
 
 
+@pytest.mark.parametrize("skew_rad", [0.3, np.nan])
+def test_a_skew_that_no_image_has_is_refused(path, skew_rad):
+    with h5py.File(path, "r+") as file:
+        file["tracker"].attrs["image_skew_rad"] = skew_rad
+    with pytest.raises(InvalidInputError, match=r"/tracker.*image_skew_rad: expected"):
+        read_sweep(path)
+
+
 def test_rounding_in_a_pose_is_forgiven(path):
     with h5py.File(path, "r+") as file:
         # A float32 writer leaves about 1e-7 everywhere, the last row included.

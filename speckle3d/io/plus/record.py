@@ -40,7 +40,9 @@ _STORAGE = {
     "ObjectType", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB", "CompressedData",
     "HeaderSize", "CompressedDataSize", "DimSize", "ElementNumberOfChannels", "ElementSize", "Kinds",
     "ElementDataFile", "dimension", "encoding", "endian", "kinds", "sizes", "type", "spacings", "data file",
-    "datafile", "space dimension", "space directions", "space origin",
+    "datafile", "space dimension", "space directions", "space origin", "space", "labels", "units",
+    "DataNodeClassName", "axis 3 index type", "axis 3 index values", "axis 0 index type",
+    "axis 0 index values",
 }  # fmt: skip
 """Fields that say how pixels are stored; a writer makes them anew."""
 

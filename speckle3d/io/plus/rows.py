@@ -23,6 +23,7 @@ from speckle3d.io.plus.transforms import (
     ends,
     fixed_transform,
     image_matrix,
+    image_skew_rad,
     sensor_from_image,
     tracked_poses,
 )
@@ -128,6 +129,12 @@ def rows_of(sweep: Sweep) -> Rows:
     return Rows(fields, frames, images, record.conjugated, left_out)
 
 
+def rows_without_images(times_s: FloatArray) -> Rows:
+    """Rows of frames that have a time alone, to which transforms are added."""
+    frames = [{"Timestamp": number_text(time)} for time in times_s.tolist()]
+    return Rows({}, frames, [*range(len(frames))], False, [])
+
+
 def _standard(sweep: Sweep) -> dict[str, str]:
     """Fields of a sweep that has none of its own.
 
@@ -231,7 +238,11 @@ def _add_calibration(
         return
     grid = sweep.grid
     held = fixed_transform("", record.fields, record.frames, name)
-    if held is not None and _same(sensor_from_image(held, grid.first_sample_depth_mm, name), mounting):
+    if (
+        held is not None
+        and _same(sensor_from_image(held, grid.first_sample_depth_mm, name), mounting)
+        and abs(image_skew_rad(held, name) - skew_rad) < _EQUAL
+    ):
         return
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
     matrix = image_matrix(mounting, *sizes, skew_rad)

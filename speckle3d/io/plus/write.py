@@ -28,7 +28,7 @@ from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import read_header
 from speckle3d.io.pixels import meta_type, type_of_word
 from speckle3d.io.plus.layout import Layout
-from speckle3d.io.plus.rows import Rows, number_of, rows_of
+from speckle3d.io.plus.rows import Rows, number_of, rows_of, rows_without_images
 
 Progress = Callable[[int, int], None]
 
@@ -130,6 +130,42 @@ def write_sequence(
     return rows.left_out
 
 
+def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[str, FloatArray]) -> None:
+    """Write a sequence of transforms without images; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        With the suffix .mha.
+    times_s : ndarray, shape (n,)
+    transforms : mapping of str to ndarray, shape (n, 4, 4)
+        By names as ``ImageToWorld``.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    rows = rows_without_images(times_s)
+    for name, matrices in transforms.items():
+        rows.add_transforms(name, matrices)
+    lines = [
+        "ObjectType = Image",
+        "NDims = 3",
+        "BinaryData = True",
+        "BinaryDataByteOrderMSB = False",
+        "CompressedData = False",
+        f"DimSize = 0 0 {len(times_s)}",
+        "Kinds = domain domain list",
+        "ElementSpacing = 1 1 1",
+        "ElementType = MET_UCHAR",
+        *_frame_lines(rows, " = "),
+        "ElementDataFile = LOCAL",
+    ]
+    with atomic_path(path) as part:
+        part.write_bytes(_encoded(lines))
+
+
 def _require_own(header: Path, data: Path) -> None:
     """Refuse to write over pixels that are not those of the header that is replaced."""
     if not data.exists():
@@ -219,6 +255,11 @@ def _lengths(images: _Images, rows: Rows) -> str:
     return f"{x} {y}" if rows.is_plane else f"{x} {y} {len(rows.images)}"
 
 
+def _frame_lines(rows: Rows, sign: str) -> Iterator[str]:
+    for i, frame in enumerate(rows.frames):
+        yield from (f"Seq_Frame{i:04d}_{name}{sign}{value}" for name, value in frame.items())
+
+
 def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> bytes:
     fields = dict(rows.fields)
     fields.pop("NDims", None)
@@ -236,11 +277,7 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
         f"ElementSpacing = {spacing}",
         f"ElementType = MET_{meta_type(images.dtype)}",
         *(f"{name} = {value}" for name, value in fields.items()),
-        *(
-            f"Seq_Frame{i:04d}_{name} = {value}"
-            for i, frame in enumerate(rows.frames)
-            for name, value in frame.items()
-        ),
+        *_frame_lines(rows, " = "),
         f"ElementDataFile = {data}",
     ]
     return _encoded(lines)
@@ -258,11 +295,7 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -
             for name, value in rows.fields.items()
             if name not in _META_ONLY
         ),
-        *(
-            f"Seq_Frame{i:04d}_{name}:={value}"
-            for i, frame in enumerate(rows.frames)
-            for name, value in frame.items()
-        ),
+        *_frame_lines(rows, ":="),
         # Slicer reads the transforms up to the first line of more than 1,000 characters.
         *(_slicers_index(rows) if is_slicers else ()),
         "",

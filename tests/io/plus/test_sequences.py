@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Tracker
+from speckle3d.io.describe import describe
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_notes, load_sweep
@@ -87,7 +88,7 @@ def assert_same(got, expected, added=()):
 
 
 @pytest.mark.parametrize("compressed", [True, False])
-@pytest.mark.parametrize("suffix", [".igs.mha", ".mhd", ".igs.nrrd"])
+@pytest.mark.parametrize("suffix", [".igs.mha", ".mhd", ".igs.nrrd", ".seq.nrrd"])
 def test_every_field_survives_a_sweep_file_and_each_container(tmp_path, suffix, compressed):
     fields = {"UltrasoundImageOrientation": "UFA", **CUSTOM}
     path = write_mha(tmp_path / "in.mha", grey(4), fields, rich(), spacing="0.1 0.2 7")
@@ -96,7 +97,7 @@ def test_every_field_survives_a_sweep_file_and_each_container(tmp_path, suffix, 
     for source in (sweep, read_sweep(tmp_path / "sweep.h5")):
         out = tmp_path / f"out{suffix}"
         assert write_sequence(out, source, compressed=compressed) == []
-        if suffix == ".igs.nrrd":  # which has no third spacing, as a sequence has none
+        if suffix.endswith(".nrrd"):  # which has no third spacing, as a sequence has none
             content(out)[0]["ElementSpacing"] = (0.1, 0.2, 7.0)
             path = write_mha(tmp_path / "in.mha", grey(4), fields, rich(), spacing="0.1 0.2 1")
         assert_same(out, path)
@@ -160,7 +161,7 @@ def test_an_image_of_two_axes_stays_one(tmp_path):
 
 
 @pytest.mark.parametrize("make", [sweep_examples.bmode_sweep, sweep_examples.rf_sweep])
-@pytest.mark.parametrize("suffix", [".mha", ".nrrd"])
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".seq.nrrd"])
 def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix):
     sweep = make()
     left_out = write_sequence(tmp_path / f"out{suffix}", sweep)
@@ -243,6 +244,31 @@ def test_a_calibration_beside_depth_is_where_the_first_sample_is(tmp_path):
     assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == (0.1, 0.2)
     # Pixel (0, 0) is where the header says, and y of P counts from the probe's face 4 mm above.
     np.testing.assert_allclose(sweep.tracker.sensor_from_image.apply([0, 4.0, 0]), [10, 20, 30])
+
+
+def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
+    """ImageToProbe of PLUS's spine phantom, whose axes lean by 2.7 degrees."""
+    matrix = np.eye(4)
+    matrix[:3] = [
+        [-0.00157821, 0.0785919, -0.00803285, 15.3978],
+        [-0.0839128, 0.00372697, 0.0153803, 49.5705],
+        [0.0159024, 0.00714276, 0.0803604, -8.63446],
+    ]
+    _, _, frames = tracked(3)
+    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
+    given = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
+    sweep = load_sweep(path, given)
+    assert np.rad2deg(sweep.tracker.image_skew_rad) == pytest.approx(-2.745, abs=1e-3)
+    write_sweep(tmp_path / "a.h5", sweep)
+    held = load_sweep(tmp_path / "a.h5")
+    assert ("image axes off square", "-2.74", "deg") in describe(tmp_path / "a.h5")
+    assert held.tracker.image_skew_rad == sweep.tracker.image_skew_rad
+    write_sequence(tmp_path / "b.mha", held)
+    back = load_sweep(tmp_path / "b.mha", ImportSettings(dynamic_range_db=60.0)).tracker
+    assert back.image_skew_rad == pytest.approx(sweep.tracker.image_skew_rad, abs=1e-9)
+    np.testing.assert_allclose(
+        back.sensor_from_image.as_matrix(), sweep.tracker.sensor_from_image.as_matrix(), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,101 @@
+"""What a reconstruction gives 3D Slicer: transforms, a sequence, a scene."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+import SimpleITK
+
+from speckle3d.io.headers import read_header
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.volumes import read_volume
+
+
+@pytest.fixture
+def made(reconstructed):
+    return reconstructed / "reconstruction.h5"
+
+
+@pytest.mark.parametrize("name", ["t.tfm", "t.h5"])
+def test_the_pose_of_a_frame_becomes_a_transform(run, made, tmp_path, name):
+    for _ in range(2):
+        code, out, err = run(
+            "trajectory", "export", made, "-o", tmp_path / name, "--frame", 7, "--mode", "pose"
+        )
+        assert (code, out) == (0, ""), err
+    pose = read_reconstruction(made).poses["pose"][7]
+    found = SimpleITK.ReadTransform(str(tmp_path / name)).TransformPoint(pose.apply([1.0, 2.0, 3.0]).tolist())
+    np.testing.assert_allclose(found, [1.0, 2.0, 3.0], atol=1e-9)
+
+
+def test_every_pose_becomes_a_transform(run, made, tmp_path):
+    code, _, err = run("trajectory", "export", made, "-o", tmp_path / "t.tfm", "--frame", "all")
+    assert code == 0, err
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"t-{i:04d}.tfm" for i in range(24)]
+
+
+@pytest.mark.parametrize(
+    ("name", "frame", "words"),
+    [
+        ("t.tfm", (), "--frame N"),
+        ("t.tfm", ("--frame", 24), "from 0 to 23"),
+        ("t.tfm", ("--frame", "-1"), "from 0 to 23"),
+        ("t.tum", ("--frame", 3), "--frame 3: is of transforms"),
+    ],
+)
+def test_a_frame_that_is_none_is_refused(refused, made, tmp_path, name, frame, words):
+    assert words in refused("trajectory", "export", made, "-o", tmp_path / name, *frame)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["s.seq.nrrd", "s.seq.mha"])
+def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, bench, tmp_path, name):
+    code, out, err = run("convert", made, tmp_path / name, "--mode", "orientation")
+    assert (code, out) == (0, ""), err
+    header = read_header(tmp_path / name)
+    assert (header.size, header.transforms) == ((26, 600, 24), ["ImageToWorld"])
+    pose = read_reconstruction(made).poses["orientation"][11]
+    matrix = np.reshape([float(x) for x in header.frames[11]["ImageToWorldTransform"].split()], (4, 4))
+    np.testing.assert_allclose(matrix[:3, 3] * [-1, -1, 1], pose.apply([0, 0, 0]), atol=1e-6)
+    assert "--mode image: is of a reconstruction" in refused(
+        "convert", bench / "sweep.h5", tmp_path / name, "--mode", "image"
+    )
+    assert "--frame-rate-hz: is of recordings" in refused(
+        "convert", made, tmp_path / name, "--frame-rate-hz", 20
+    )
+    assert "of a reconstruction" in refused("convert", made, tmp_path / "s.h5")
+
+
+def test_a_scene_of_two_modes(run, refused, made, tmp_path):
+    target = tmp_path / "scene"
+    options = ("--mode", "image", "--mode", "pose", "--voxel-mm", 0.5)
+    code, out, err = run("scene", made, "-o", target, *options)
+    assert (code, out) == (0, ""), err
+    assert [line.split(": ")[0] for line in err.splitlines()] == [
+        str(target / f"volume-{mode}.nrrd") for mode in ("image", "pose")
+    ]
+    names = {node.get("name") for node in ElementTree.parse(target / "scene.mrml").getroot()}
+    assert {"sweep, image", "sweep, pose", "sweep, image: outlines"} <= names
+    assert read_volume(target / "volume-pose.nrrd").fields["poses"] == "pose"
+    assert read_volume(target / "state-pose.seg.nrrd").voxels.max() in (1, 2)
+    assert run("scene", made, "-o", target, "--voxel-mm", 0.5)[0] == 0
+    assert not (target / "volume-pose.nrrd").exists()
+    assert str(made.parent) in refused("scene", made, "-o", made.parent)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").write_text("precious")
+    assert "another folder" in refused("scene", made, "-o", tmp_path / "other")
+
+
+def test_info_tells_of_the_volume_and_its_labels(run, made, tmp_path):
+    out, state = tmp_path / "v.nii.gz", tmp_path / "state.seg.nrrd"
+    code, _, err = run("volume", made, "-o", out, "--voxel-mm", 0.5, "--state", state)
+    assert code == 0, err
+    told = []
+    for path in (out, state):
+        code, text, err = run("info", path, "--json")
+        assert code == 0, err
+        told.append({row["description"]: row["value"] for row in json.loads(text)})
+    assert told[0]["voxels"] == told[1]["voxels"]
+    assert told[0]["levels"].startswith("log-compressed, 0 to 255 over 60 dB")
+    assert told[1]["label 1"].startswith("measured: ")

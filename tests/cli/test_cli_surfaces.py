@@ -1,0 +1,162 @@
+"""`speckle3d measure` and `speckle3d surface` on a ball whose size is known."""
+
+import json
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.reconstruction import Provenance, SharedErrors, Trust
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.planes import ReslicePlane
+from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.surfaces import read_surface
+from speckle3d.io.volumes import write_volume
+from speckle3d.motion.uncertainty import shared_covariance
+from speckle3d.study.cut_geometry import save_cuts
+
+GRID = ImageGrid(51, 51, 0.2, 0.2)
+N = 41
+POSES = RigidTransform.from_translation(np.column_stack([np.zeros((N, 2)), 0.25 * np.arange(N)]))
+SCALE = SharedErrors(0.0, 0.05, np.zeros(2))
+RADIUS_MM, STEP_MM = 3.0, 0.25
+VOLUME_MM3 = 4 / 3 * np.pi * RADIUS_MM**3
+
+
+@pytest.fixture
+def rec(tmp_path):
+    """A reconstruction whose scale is known to 5 %."""
+    path = tmp_path / "reconstruction.h5"
+    covariance = shared_covariance(POSES, GRID.centre_mm, SCALE)
+    with ReconstructionWriter(path, 0.04 * np.arange(N), GRID) as writer:
+        trust = Trust(covariance, np.zeros(N, dtype=np.int64), SCALE)
+        writer.finish({"image": POSES, "fused": POSES}, Provenance("sweep.h5", "", ""), "", trust)
+    return path
+
+
+@pytest.fixture
+def ball(tmp_path):
+    index = np.moveaxis(np.indices((41, 41, 41)), 0, -1) * STEP_MM
+    depth = RADIUS_MM - np.linalg.norm(index - 5.0, axis=-1)
+    grey = np.clip(128 + 100 * depth / STEP_MM, 1, 255).astype(np.uint8)
+    path = tmp_path / "ball.nrrd"
+    write_volume(path, Volume(grey, (STEP_MM,) * 3, RigidTransform.identity(), {"poses": "image"}))
+    return path
+
+
+def test_a_distance_along_the_sweep_is_as_sure_as_its_scale(run, rec):
+    points = ("--point", "5,5,1", "--point", "5,5,9", "--point", "9,5,9")
+    code, out, err = run("measure", rec, *points, "--pick-mm", "0.05", "--json")
+    assert code == 0, err
+    told = json.loads(out)
+    first, second, line, angle = told["measurements"]
+    assert first["value"] == pytest.approx(8.0)
+    assert first["by_poses"] == pytest.approx(0.05 * 8.0, rel=1e-3)
+    assert first["by_picking"] == pytest.approx(0.05 * np.sqrt(2))
+    assert first["interval_95"][1] == pytest.approx(8.0 + 1.959964 * first["standard_error"])
+    # Across the sweep the scale along it does nothing.
+    assert second["by_poses"] == pytest.approx(0.0, abs=1e-6)
+    assert line["value"] == pytest.approx(12.0)
+    assert angle["value"] == pytest.approx(90.0)
+    code, out, err = run("measure", rec, *points, "--pick-mm", "0.05")
+    assert out.splitlines()[0].startswith("distance 1 2: 8.00 +- 0.41 mm [7.20, 8.80]")
+    assert out.splitlines()[-1] == "mode image; points picked to 0.05 mm per axis; 95 % in brackets"
+
+
+def test_points_may_come_from_a_file(run, rec, tmp_path):
+    picks = tmp_path / "picks.csv"
+    picks.write_text("name,x_mm,y_mm,z_mm\n# the vessel\na,5,5,1\nb,5,5,9  # its end\n", encoding="utf-8")
+    code, out, err = run("measure", rec, "--points", picks, "--json")
+    assert code == 0, err
+    assert json.loads(out)["measurements"][0]["value"] == pytest.approx(8.0)
+    # By default picked to half the distance of the vectors.
+    assert json.loads(out)["pick_mm"] == pytest.approx(0.1)
+
+
+def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
+    picture = tmp_path / "cut.png"
+    turned = RigidTransform.from_matrix([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 9], [0, 0, 0, 1.0]])
+    figure = Figure()
+    plane = ReslicePlane(turned, 8.0, 10.0, 0.2)
+    save_cuts(figure, picture, {"fused": plane}, {"fused": [figure.add_subplot()]})
+    code, out, err = run("measure", rec, "--on", picture, "--point", "0,5", "--point", "6,5", "--json")
+    assert code == 0, err
+    told = json.loads(out)
+    assert told["mode"] == "fused"
+    assert told["measurements"][0]["value"] == pytest.approx(6.0)
+    assert told["measurements"][0]["by_poses"] == pytest.approx(0.05 * 6.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "--point X,Y,Z two or more times"),
+        (("--point", "5,5,1"), "at least 2 points"),
+        (("--point", "5,5", "--point", "5,5,3"), "--point: expected 3 numbers"),
+        (("--point", "5,5,1", "--point", "5,5,nan"), "--point: expected 3 numbers"),
+        (("--point", "5,5,1", "--point", "5,5,30"), "point 2 (5, 5, 30): expected a point in the sweep"),
+        (("--point", "5,5,1", "--point", "5,5,2", "--mode", "pose"), "--mode: expected one of image, fused"),
+        (("--point", "5,5,1", "--point", "5,5,2", "--pick-mm", "-1"), "--pick-mm"),
+        (("--point", "5,5,1", "--point", "5,5,1"), "two places"),
+    ],
+)
+def test_what_cannot_be_measured_is_said_in_a_line(refused, rec, arguments, words):
+    assert words in refused("measure", rec, *arguments)
+
+
+def test_a_ball_has_its_volume_and_what_the_scale_does_to_it(run, ball, rec, tmp_path):
+    out = tmp_path / "ball.ply"
+    code, text, err = run("surface", ball, "-o", out, "--level", "128", "--reconstruction", rec, "--json")
+    assert code == 0, err
+    (told,) = json.loads(text)
+    assert told["volume_mm3"] == pytest.approx(VOLUME_MM3, rel=0.01)
+    assert told["volume_sigma_mm3"] == pytest.approx(0.05 * told["volume_mm3"], rel=0.01)
+    assert told["open_mm"] == 0.0
+    surface = read_surface(out)
+    assert len(surface) == told["triangles"]
+    np.testing.assert_allclose(surface.vertices_mm.mean(axis=0), 5.0, atol=0.01)
+    code, text, err = run("surface", ball, "-o", out, "--level", "128", "--smooth", "5", "--largest")
+    assert "smoothing changed the volume by" in text
+    assert "1 part" in text
+
+
+def test_labels_and_empty_voxels_and_the_dark_side(run, ball, tmp_path):
+    index = np.moveaxis(np.indices((20, 20, 20)), 0, -1)
+    labels = np.where(np.abs(index - 10).max(axis=-1) < 4, 3, 0).astype(np.uint8)
+    write_volume(tmp_path / "labels.nrrd", Volume(labels, (0.5,) * 3, RigidTransform.identity()))
+    code, text, err = run("surface", tmp_path / "labels.nrrd", "-o", tmp_path / "of.stl", "--labels")
+    assert code == 0, err
+    assert (tmp_path / "of-3.stl").exists()
+    state = np.ones((41, 41, 41), np.uint8)
+    state[:, :, 20:] = 0
+    write_volume(tmp_path / "state.nrrd", Volume(state, (STEP_MM,) * 3, RigidTransform.identity()))
+    out = ("-o", tmp_path / "half.vtk", "--level", "128", "--state", tmp_path / "state.nrrd")
+    code, text, err = run("surface", ball, *out)
+    assert code == 0, err
+    assert "open along" in text
+    assert "volume" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("-o", "a.stl"), "--level or --labels"),
+        (("-o", "a.stl", "--level", "128", "--labels"), "--level or --labels"),
+        (("-o", "a.obj", "--level", "128"), ".stl, .ply, .vtk"),
+        (("-o", "a.stl", "--level", "300"), "level: expected a grey level of the volume"),
+        (("-o", "a.stl", "--level", "128", "--smooth", "-1"), "--smooth"),
+        (("-o", "a.stl", "--labels", "--below"), "no --below"),
+    ],
+)
+def test_what_has_no_surface_is_said_in_a_line(refused, ball, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused("surface", ball, *arguments)
+
+
+def test_nothing_but_a_surface_is_written_over(refused, ball, tmp_path):
+    taken = tmp_path / "notes.stl"
+    taken.write_text("my notes", encoding="utf-8")
+    assert "another kind of file" in refused("surface", ball, "-o", taken, "--level", "128")
+    assert taken.read_text(encoding="utf-8") == "my notes"

@@ -1,0 +1,93 @@
+"""Axes of voxels: the images' mean, and those of the smallest box."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from posed_sweeps import GRID, HALF_TURN, KINDS, corners_in, sweep
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.imaging.axes import principal_axes, sweep_axes
+from speckle3d.imaging.grid import grid_around
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), kind=KINDS)
+def test_the_principal_box_is_the_smallest(seed, kind):
+    passes, frames, turned = kind
+    rng = np.random.default_rng(seed)
+    poses, _ = sweep(rng, frames, passes, turned)
+    corners = np.concatenate([poses.apply(corner) for corner in GRID.corners_mm])
+
+    def sizes(axes):
+        return np.ptp(axes.inv().apply(corners), axis=0)
+
+    axes = principal_axes(GRID, poses)
+    box = np.prod(sizes(axes) + GRID.sample_spacing_mm)
+    for other in [Rotation.identity(), sweep_axes(poses), *Rotation.random(300, rng=rng)]:
+        # What rounding to whole voxels and the tie in favour of plain axes may cost.
+        assert box <= 1.0002 * np.prod(sizes(other) + GRID.sample_spacing_mm)
+    shape, world = (grid_around(GRID, poses, 0.5, way).shape for way in (axes, Rotation.identity()))
+    assert np.prod(np.subtract(shape, 1.0)) <= np.prod(np.add(world, 1.0))
+    # Right-handed, and no other order or sign of its axes is nearer to those of the mean image.
+    away = sweep_axes(poses).inv() * axes
+    assert away.magnitude() <= (away * Rotation.create_group("O")).magnitude().min() + 1e-12
+
+
+def test_the_principal_box_of_an_oblique_sweep_is_known():
+    # Images shifted laterally as they advance: a sheared box, whose smallest box leans with it.
+    z = np.linspace(0.0, 400.0, 30)
+    poses = RigidTransform.from_translation(np.outer(z, [0.75, 0.0, 1.0]))
+    axes = principal_axes(GRID, poses)
+    sizes = np.ptp(
+        axes.inv().apply(np.concatenate([poses.apply(corner) for corner in GRID.corners_mm])), axis=0
+    )
+    width, height = GRID.width_mm, GRID.depth_mm - GRID.first_sample_depth_mm
+    expected = [0.8 * width, height, 500.0 + 0.6 * width]
+    np.testing.assert_allclose(sizes, expected, rtol=1e-4)
+    np.testing.assert_allclose(axes.apply([1.0, 0.0, 0.0]), [0.8, 0.0, -0.6], atol=1e-5)
+
+
+def test_a_translated_sweep_keeps_its_own_axes():
+    axes = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    placed = RigidTransform.from_components([3.0, 4.0, 5.0], axes)
+    poses = placed * RigidTransform.from_translation(np.outer(np.arange(20.0), [0.0, 0.0, 1.0]))
+    for found in (sweep_axes(poses), principal_axes(GRID, poses)):
+        np.testing.assert_allclose((axes.inv() * found).as_rotvec(), 0.0, atol=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_mean_axes_of_a_probe_that_was_turned_between_passes(seed):
+    poses, axes = sweep(np.random.default_rng(seed), 60, passes=2, turned=True)
+    # 120 orientations scatter by 0.08 rad about each of three axes: four standard errors of their mean.
+    assert (axes.inv() * sweep_axes(poses)).magnitude() < 4 * 0.08 * np.sqrt(3 / 120)
+    # Whichever pass comes first says where lateral points.
+    swapped = RigidTransform.concatenate([poses[60:], poses[:60]])
+    np.testing.assert_allclose(
+        (sweep_axes(poses).inv() * sweep_axes(swapped)).as_matrix(), HALF_TURN.as_matrix(), atol=1e-9
+    )
+
+
+def test_a_fan_of_tilted_images_is_no_turned_probe():
+    tilts = np.radians(np.linspace(-95.0, 95.0, 77))
+    poses = RigidTransform.from_rotation(Rotation.from_rotvec(np.outer(tilts, [1.0, 0.0, 0.0])))
+    np.testing.assert_allclose(sweep_axes(poses).as_rotvec(), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("about", "named"), [([0.0, 1.0, 0.0], "lateral|elevational"), ([1.0, 0.0, 0.0], "axial|elev")]
+)
+def test_images_all_round_have_no_mean_axes_and_yet_a_box(about, named):
+    turns = np.outer(np.linspace(0.0, 2 * np.pi, 36, endpoint=False), about)
+    poses = RigidTransform.from_rotation(Rotation.from_rotvec(turns))
+    with pytest.raises(InsufficientDataError, match=named):
+        sweep_axes(poses)
+    voxels = grid_around(GRID, poses, 1.0, principal_axes(GRID, poses))
+    assert (corners_in(voxels, poses) > -0.5).all()
+
+
+def test_no_poses_are_refused():
+    with pytest.raises(InvalidInputError, match="world_from_image"):
+        sweep_axes(RigidTransform.identity(0))

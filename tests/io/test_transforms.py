@@ -1,0 +1,70 @@
+"""Poses as ITK transforms, as SimpleITK reads them."""
+
+import numpy as np
+import pytest
+import SimpleITK
+from disks import FULL, limited
+from scipy.spatial.transform import RigidTransform, Rotation
+from sweep_examples import poses
+
+from speckle3d.core.errors import InvalidInputError, NoSpaceError
+from speckle3d.io.transforms import SUFFIXES, transform_paths, write_transform, write_transforms
+
+POINTS = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [3.0, -20.0, 7.0]])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_itk_takes_points_of_the_parent_to_the_image(tmp_path, suffix):
+    """As in resampling; 3D Slicer shows the inverse as the transform to the parent."""
+    pose = poses(3, seed=4)[1]
+    write_transform(tmp_path / f"t{suffix}", pose)
+    found = SimpleITK.ReadTransform(str(tmp_path / f"t{suffix}"))
+    assert found.GetDimension() == 3
+    assert found.GetName() == "AffineTransform"
+    for point in POINTS:
+        back = found.TransformPoint(pose.apply(point).tolist())
+        np.testing.assert_allclose(back, point, atol=1e-12)
+
+
+def test_an_image_of_the_frame_lands_where_the_pose_says(tmp_path):
+    """Resampled by ITK through the file, the mark at (2, 3) mm of the image appears in the world."""
+    pose = RigidTransform.from_components([5.0, -4.0, 3.0], Rotation.from_euler("z", 90, degrees=True))
+    write_transform(tmp_path / "t.tfm", pose)
+    frame = SimpleITK.Image(8, 8, 1, SimpleITK.sitkFloat32)
+    frame.SetPixel(2, 3, 0, 100.0)
+    world = SimpleITK.Image(20, 20, 10, SimpleITK.sitkFloat32)
+    world.SetOrigin((-10.0, -10.0, 0.0))
+    seen = SimpleITK.Resample(frame, world, SimpleITK.ReadTransform(str(tmp_path / "t.tfm")))
+    k, j, i = np.unravel_index(np.argmax(SimpleITK.GetArrayFromImage(seen)), (10, 20, 20))
+    place = seen.TransformIndexToPhysicalPoint((int(i), int(j), int(k)))
+    np.testing.assert_allclose(place, pose.apply([2.0, 3.0, 0.0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_for_each_frame(tmp_path, suffix):
+    every = poses(12)
+    write_transforms(tmp_path / f"sweep{suffix}", every)
+    paths = transform_paths(tmp_path / f"sweep{suffix}", 12)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
+    assert paths[11].name == f"sweep-0011{suffix}"
+    for path, pose in zip(paths, every, strict=True):
+        found = SimpleITK.ReadTransform(str(path)).TransformPoint([1.0, 2.0, 3.0])
+        np.testing.assert_allclose(found, pose.inv().apply([1.0, 2.0, 3.0]), atol=1e-12)
+
+
+def test_what_slicer_would_not_read_is_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"\.tfm or \.h5, got '\.txt'"):
+        write_transform(tmp_path / "t.txt", poses(1)[0])
+    with pytest.raises(InvalidInputError, match="a row of 2"):
+        write_transform(tmp_path / "t.tfm", poses(2))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_on_a_full_disk_the_old_files_stay(tmp_path, suffix):
+    path = tmp_path / f"t{suffix}"
+    write_transforms(path, poses(3))
+    before = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+    with limited(len(before[f"t-0000{suffix}"]) - 1), pytest.raises(NoSpaceError, match=FULL):
+        write_transforms(path, poses(3, seed=1))
+    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before

@@ -1,0 +1,134 @@
+"""Recordings opened with the poses of their frames, and the grey levels their images are given in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sweep_examples
+from image_examples import grey, text_of, tracked, write_mha
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.calibration import Calibration, FramesUsed
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import BModeSettings
+from speckle3d.io.calibrations import write_calibration
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.study.images import grey_images, usual_levels
+from speckle3d.study.posed import open_posed, posed_by_itself
+
+PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
+LEANING = PIXELS.copy()
+LEANING[0, 1] = 0.01
+"""Rows 0.2 mm apart lie 0.01 mm aside of one another: 2.9 degrees."""
+
+
+def sequence(folder, matrix=PIXELS, invalid=(), frames=4):
+    fields = tracked(frames)[2]
+    for i, frame in enumerate(fields):
+        frame |= {"ImageToProbeTransform": text_of(matrix), "ImageToProbeTransformStatus": "OK"}
+        if i in invalid:
+            frame["ProbeToTrackerTransformStatus"] = "INVALID"
+    return write_mha(folder / "a.mha", grey(frames), frames=fields)
+
+
+def test_bmode_as_it_is_stored_needs_no_dynamic_range(tmp_path):
+    posed = open_posed(sequence(tmp_path))
+    source, meaning = posed.source()
+    assert meaning == "B-mode as stored, 0 to 255"
+    stored = source.images[2]
+    assert stored.dtype == np.uint8
+    np.testing.assert_array_equal(stored, grey(4)[2].T)
+    for levels in ("log", "linear"):
+        with pytest.raises(InvalidInputError, match=f"levels {levels}.*give --dynamic-range-db"):
+            posed.source(levels)
+
+
+@pytest.mark.parametrize("range_db", [40.0, 60.0])
+def test_pictures_of_bmode_of_unknown_range_show_its_levels(tmp_path, range_db):
+    images, _ = open_posed(sequence(tmp_path)).images(range_db)
+    stored = grey(4)[1].T.astype(float)
+    lit = (images[1] > 0) & (images[1] < 255)
+    assert lit.sum() > 5
+    assert np.ptp((images[1] - stored)[lit]) < 1e-2
+
+
+@pytest.mark.parametrize(
+    "given", [{"dynamic_range_db": 40.0}, {"settings": ImportSettings(dynamic_range_db=40.0)}]
+)
+def test_a_dynamic_range_that_is_given_serves_the_other_levels(tmp_path, given):
+    posed = open_posed(sequence(tmp_path), **given)
+    amplitude, meaning = posed.source("linear")
+    assert meaning == "echo amplitude, linear, of B-mode over 40 dB; 1 is full scale"
+    expected = 10 ** ((grey(4)[1].T / 255 - 1) * 40 / 20)
+    np.testing.assert_allclose(amplitude.images[1], expected, rtol=1e-5)
+    _, meaning = posed.source("log", 50.0)
+    assert meaning == "log-compressed, 0 to 255 over 50 dB"
+
+
+def test_a_sweep_that_says_its_range_keeps_it(tmp_path):
+    sweep = replace(sweep_examples.bmode_sweep(), signal=BModeSettings(50.0))
+    write_sweep(tmp_path / "a.h5", sweep)
+    posed = open_posed(tmp_path / "a.h5", dynamic_range_db=70.0)
+    assert posed.source("linear")[1] == "echo amplitude, linear, of B-mode over 50 dB; 1 is full scale"
+
+
+def test_what_else_is_missing_is_asked_for_without_it(tmp_path):
+    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
+    with pytest.raises(MissingSettingsError) as found:
+        open_posed(path)
+    assert found.value.settings == ("column_pitch_mm", "row_spacing_mm")
+
+
+def test_echoes_are_no_levels_as_stored():
+    sweep = sweep_examples.rf_sweep()
+    assert usual_levels(sweep) == "log"
+    with pytest.raises(InvalidInputError, match="expected B-mode for levels as stored, got RF or I/Q"):
+        grey_images(sweep, levels="stored")
+
+
+def test_linear_levels_of_echoes_double_with_them():
+    sweep = sweep_examples.rf_sweep(dtype=np.float32)
+    louder = replace(sweep, frames=2 * np.asarray(sweep.frames))
+    once, twice = (grey_images(each, levels="linear") for each in (sweep, louder))
+    assert once.meaning == "echo amplitude, linear, in the units of the samples"
+    np.testing.assert_allclose(twice[3], 2 * once[3], rtol=1e-5)
+
+
+def test_frames_without_a_valid_pose_are_left_out_and_counted(tmp_path):
+    posed = open_posed(sequence(tmp_path, invalid=(0, 3)))
+    np.testing.assert_array_equal(posed.frames, [1, 2])
+    source, _ = posed.source()
+    assert len(source) == 2
+    np.testing.assert_array_equal(source.images[0], grey(4)[1].T)
+    assert posed.notes() == ["a: 2 of 4 frames have no valid pose and are left out"]
+    assert open_posed(sequence(tmp_path)).notes() == []
+
+
+def test_a_tracker_s_images_lie_where_the_whole_calibration_puts_them(tmp_path):
+    posed = open_posed(sequence(tmp_path, LEANING))
+    source, _ = posed.source()
+    tracker = posed.sweep.tracker
+    mounting = tracker.readings.at(posed.sweep.frame_time_s).inv() * source.world_from_image
+    placed = mounting.as_matrix() @ source.grid.image_from_sample
+    np.testing.assert_allclose(placed, np.tile(LEANING[:, [0, 1, 3]], (4, 1, 1)), atol=1e-9)
+    assert posed.sweep.grid.skew_rad == 0  # of the sweep itself, which others measure on
+    with_truth = replace(posed.sweep, truth=RigidTransform.identity(4))
+    assert posed_by_itself(with_truth).source()[0].grid.skew_rad == 0
+    assert posed_by_itself(with_truth, "tracker").source()[0].grid.skew_rad == tracker.image_skew_rad
+
+
+def test_a_calibration_of_ours_takes_the_place_of_all_of_it(tmp_path):
+    mounting = RigidTransform.from_translation([1.0, 2.0, 3.0])
+    calibration = Calibration(
+        "plane", "tracker", mounting.rotation, mounting.translation, np.array([0.11, 0.21]),
+        1e-6 * np.eye(6), (), 0.1, "mm", 9.0, FramesUsed(3, (0, 1, 2)),
+    )  # fmt: skip
+    write_calibration(tmp_path / "c.h5", calibration)
+    posed = open_posed(sequence(tmp_path, LEANING), calibrations=[tmp_path / "c.h5"])
+    grid = posed.source()[0].grid
+    assert (grid.vector_pitch_mm, grid.sample_spacing_mm, grid.skew_rad) == (0.11, 0.21, 0.0)
+    np.testing.assert_allclose(posed.sweep.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
+    given = ImportSettings(column_pitch_mm=0.3)
+    kept = open_posed(tmp_path / "a.mha", settings=given, calibrations=[tmp_path / "c.h5"])
+    assert (kept.sweep.grid.vector_pitch_mm, kept.sweep.grid.sample_spacing_mm) == (0.3, 0.21)
