@@ -114,7 +114,7 @@ def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp
     assert "not on one line" in told("--points", "0,0,0 1,1,1 2,2,2")
     assert "--points" in told("--points", "0,0,0 1,x,0 2,2,2")
     assert "three" in told("--points", "0,0,0 1,1,0")
-    assert "0 to 23" in told("--frame", "24")
+    assert "0 to 23, got 24" in told("--frame", "24")
     assert "--frame" in told("--angle-deg", "30")
     assert "--right" in told("--origin", "0", "0", "0")
     assert "--curve" in told("--on", out)
