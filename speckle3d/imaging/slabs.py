@@ -18,6 +18,8 @@ from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
 
+_SHARE = 0.8
+"""Of the memory; the rest is for the interpreter, its libraries, and files being read and packed."""
 _LEAST_PLANES = 8
 """Thinner slabs read frames too often, and work more on their neighbours' planes than on their own."""
 
@@ -88,9 +90,9 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
     # Whoever takes the slabs still has the one before.
     held = n_i * n_j * (np.dtype(settings.voxel_type).itemsize + 1) / 1e9
     plane_gb = _plane_gb(voxel_grid, settings) + held
-    planes = int((most - frames_gb) / plane_gb) - around
+    planes = int((_SHARE * most - frames_gb) / plane_gb) - around
     if planes < min(_LEAST_PLANES, n_k):
-        needed = (min(_LEAST_PLANES, n_k) + around) * plane_gb + frames_gb
+        needed = ((min(_LEAST_PLANES, n_k) + around) * plane_gb + frames_gb) / _SHARE
         raise InvalidInputError(
             f"volume: expected to work within {most:g} GB of memory, but a slab of {n_i} x {n_j} voxels "
             f"takes {needed:.3g} GB: take larger voxels, or allow more memory"
@@ -101,7 +103,7 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
 
 def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float) -> float:
     """Memory to make all of a volume at once, the volume and frames in hand included, GB."""
-    return voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + frames_gb
+    return (voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + frames_gb) / _SHARE
 
 
 def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:

@@ -104,7 +104,7 @@ def test_slabs_and_threads_change_nothing(monkeypatch, splat, rule):
     monkeypatch.setattr(threads, "cores", lambda: 5)
     slabs = list(
         compound_slabs(
-            source, voxel_grid, replace_memory(chosen, 1.4e-4 if rule == "maximum" else 2.6e-4), weights
+            source, voxel_grid, replace_memory(chosen, 1.8e-4 if rule == "maximum" else 3.3e-4), weights
         )
     )
     threads._pool.shutdown()
@@ -126,7 +126,7 @@ def test_frames_are_read_only_for_slabs_they_touch():
         read.append(index)
         return images[index]
 
-    chosen = CompoundingSettings(fill_radius=0, max_memory_gb=2.1e-4)
+    chosen = CompoundingSettings(fill_radius=0, max_memory_gb=2.6e-4)
     slabs = len(list(compound_slabs(replace(source, images=reader), voxel_grid, chosen)))
     assert slabs > 3
     assert len(read) < 2 * 60  # each slab's first frame tells the type of the others
