@@ -59,10 +59,11 @@ class Case:
     def own_origin(self):
         return igsio_twin.grid_of(self.reference_from_image, self.clip, WIDTH, HEIGHT, SPACING_MM)
 
-    def paste(self, point=igsio_twin.POINT):
+    def paste(self, point=igsio_twin.POINT, rule="mean"):
         """Volume and weights as PLUS has them before it fills holes."""
         origin, shape = self.own_origin()
-        return igsio_twin.paste(self.images, self.maps(origin), shape, self.clip, self.linear, point=point)
+        maps = self.maps(origin if point == igsio_twin.POINT else self.header_origin)
+        return igsio_twin.paste(self.images, maps, shape, self.clip, self.linear, rule, point)
 
     @cached_property
     def pasted(self):
@@ -112,26 +113,22 @@ def case(request, realdata):
 
 
 @pytest.fixture(scope="module")
-def ours(case, realdata):
-    """Our volume of the same images on the same grid, without and with filled holes."""
+def compounded(case, realdata):
+    """Makes our volume of the same images on the same grid."""
     folder = realdata / "plus"
     settings = ImportSettings(plus_config=str(device_set(folder)))
     source, meaning = open_posed(folder / "SpinePhantomFreehand.igs.mha", settings=settings).source()
     assert meaning == "B-mode as stored, 0 to 255"
     grid = grid_like(read_volume(reference_path(folder, case.name)))
-    mask = case.clip.mask(WIDTH, HEIGHT).T
-    return [
-        compound(
-            source.images,
-            source.grid,
-            source.world_from_image,
-            voxel_grid=grid,
-            splat="linear" if case.linear else "nearest",
-            region=mask,
-            fill_radius=radius,
-        )
-        for radius in (0, 3)
-    ]
+    how = {"splat": "linear" if case.linear else "nearest", "region": case.clip.mask(WIDTH, HEIGHT).T}
+    images = source.images, source.grid, source.world_from_image
+    return lambda radius=0, **more: compound(*images, voxel_grid=grid, fill_radius=radius, **how, **more)
+
+
+@pytest.fixture(scope="module")
+def ours(compounded):
+    """Our volumes without and with filled holes."""
+    return [compounded(0), compounded(3)]
 
 
 def share_within(levels, ours, theirs, where):
@@ -187,6 +184,14 @@ def test_its_places_alone_keep_its_own_means_from_agreeing_with_it(case):
     both = (weight > 0) & (true_weight > 0)
     expected = 0.990 if case.linear else 0.980
     assert share_within(2, placed, volume, both) == pytest.approx(expected, abs=0.003)
+
+
+def test_the_maximum_is_that_of_plus_at_true_places(case, compounded):
+    volume, weight = case.paste(point=24, rule="maximum")
+    ours = compounded(rule="maximum", voxel_type="uint8")
+    both = (ours.state == MEASURED) & (weight > 0)
+    assert both.sum() > 0.99 * max((weight > 0).sum(), (ours.state == MEASURED).sum())
+    assert share_within(0, ours.voxels, volume, both) > (0.995 if case.linear else 0.999)
 
 
 def test_ours_beside_plus(case, ours):

@@ -205,6 +205,8 @@ def _add_tracker(
                 f"the tracker's {len(tracker.readings)} readings, of which {np.count_nonzero(covered)} "
                 f"interpolated ones are at the times of {len(frames)} frames"
             )
+    if tool == IMAGE:  # whose transforms count pixels
+        return left_out
     _add_calibration(
         sweep, tracker.sensor_from_image, f"{IMAGE}To{tool}", record, frames, tracker.image_skew_rad
     )
@@ -215,7 +217,10 @@ def _holds(record: SequenceRecord, tracker: Tracker) -> bool:
     """Whether a sequence's own fields give the tracker's readings."""
     if not record.poses or tracker.time_offset_s:
         return False
-    found = tracked_poses("", record.frames, *record.poses)
+    try:
+        found = tracked_poses("", record.frames, *record.poses)
+    except InvalidInputError:  # of an image whose frame a device set names otherwise
+        return False
     if found is None or len(found.readings) != len(tracker.readings):
         return False
     held, own = found.readings, tracker.readings

@@ -249,6 +249,8 @@ class Source:
         """Transform of this image's pixels to mm on the tracked tool, and where it is from."""
         if self.settings.image_to_probe is not None:
             return np.asarray(self.settings.image_to_probe, dtype=float), "image_to_probe"
+        if self.poses is not None and self.poses.pixels is not None:
+            return self.poses.pixels, f"{self.path}: {self.poses.names[0]}Transform"
         header, name = self.header, f"{self.device.image_frame}To{self.tool}"
         found = fixed_transform(self.path, header.fields, header.frames, name)
         if found is not None:
@@ -315,6 +317,7 @@ class Source:
             given.tracker_transform,
             given.reference_transform,
             f"{self.device.probe_frame}To{self.device.tracker_frame}",
+            self.device.image_frame,
         )
 
     def tracker(self, grid: ImageGrid) -> Tracker | None:

@@ -51,12 +51,15 @@ class Poses:
         Of the tool's transform and the reference's, or "none", as they can be asked for.
     readings : TimedPoses
         Of the frames in which all of these are valid.
+    pixels : ndarray, shape (4, 4), optional
+        Where the tool is the image itself, whose transforms take pixels to mm: pixels to mm in the image.
     """
 
     tool: str
     world: str
     names: tuple[str, str]
     readings: TimedPoses
+    pixels: FloatArray | None = None
 
 
 def tracked_poses(
@@ -65,14 +68,19 @@ def tracked_poses(
     tool: str | None,
     reference: str | None,
     usual: str = "ProbeToTracker",
+    image: str = IMAGE,
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
+
+    The tool may be the image itself, as in ``ImageToReference``: poses are then the nearest rigid ones.
 
     Parameters
     ----------
     tool, reference : str, optional
         Names of transforms, or ``"none"``; by default `usual` and that of ``Reference`` in the same world,
         where the frames hold them.
+    image : str
+        Name of the image's frame.
 
     Raises
     ------
@@ -89,12 +97,16 @@ def tracked_poses(
     valid = valid_frames(frames, *(f"{one.held}TransformStatus" for one in both))
     if not valid.any():
         raise InvalidInputError(f"{path}: {sensor.held}TransformStatus: expected a valid one, got none")
-    poses = _poses(path, frames, sensor, valid)
+    pixels = None
+    if moving == image:
+        poses, pixels = _poses_of_pixels(path, frames, sensor, valid)
+    else:
+        poses = _poses(path, frames, sensor, valid)
     if fixed is not None:
         poses = _poses(path, frames, fixed, valid).inv() * poses
         world = ends(fixed.name)[0]
     names = sensor.name, "none" if fixed is None else fixed.name
-    return Poses(moving, world, names, TimedPoses(time_stamps(path, frames)[valid], poses[valid]))
+    return Poses(moving, world, names, TimedPoses(time_stamps(path, frames)[valid], poses[valid]), pixels)
 
 
 def tracked_orientation(path: str, frames: Sequence[Fields]) -> TimedRotations | None:
@@ -256,7 +268,7 @@ def _find(path: str, frames: Sequence[Fields], given: str | None, default: str) 
     there = [
         held for held in (name, f"{world}To{moving}") if any(f"{held}Transform" in frame for frame in frames)
     ]
-    if len(there) == 2:
+    if len(there) == 2 and IMAGE not in (moving, world):  # whose transforms count pixels
         _require_inverse(path, frames, *there)
     if there:
         return _Transform(name, there[0])
@@ -294,12 +306,53 @@ def names_of(frames: Sequence[Fields]) -> list[str]:
 
 def _poses(path: str, frames: Sequence[Fields], asked: _Transform, valid: BoolArray) -> RigidTransform:
     where = f"{path}: {asked.held}Transform"
+    poses = transforms_from_matrices(_squared(_matrices(path, frames, asked, valid)), where)
+    return poses if asked.held == asked.name else poses.inv()
+
+
+def _matrices(path: str, frames: Sequence[Fields], asked: _Transform, valid: BoolArray) -> FloatArray:
+    """Matrices as the header holds them, shape (n, 4, 4); the identity where they are not valid."""
     matrices = np.tile(np.eye(4), (len(frames), 1, 1))
     for i in np.flatnonzero(valid).tolist():
         text = frames[i].get(f"{asked.held}Transform", "")
-        matrices[i] = np.reshape(numbers(text, 16, f"{where}[{i}]"), (4, 4))
-    poses = transforms_from_matrices(_squared(matrices), where)
-    return poses if asked.held == asked.name else poses.inv()
+        where = f"{path}: {asked.held}Transform[{i}]"
+        matrices[i] = np.reshape(numbers(text, 16, where), (4, 4))
+    return matrices
+
+
+def _poses_of_pixels(
+    path: str, frames: Sequence[Fields], asked: _Transform, valid: BoolArray
+) -> tuple[RigidTransform, FloatArray]:
+    """Split transforms of pixels to mm into the image's poses and its pixels, which are those of all frames.
+
+    Raises
+    ------
+    InvalidInputError
+        If a frame's pixels are of another size, or its axes are not about square.
+    """
+    matrices = _matrices(path, frames, asked, valid)
+    if asked.held != asked.name:
+        singular = valid & ~(np.abs(np.linalg.det(matrices)) > 0)
+        if singular.any():
+            i = int(np.argmax(singular))
+            raise InvalidInputError(f"{path}: {asked.held}Transform[{i}]: expected a matrix to invert")
+        matrices = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    names = [f"{path}: {asked.held}Transform[{i}]" for i in range(len(frames))]
+    used = np.flatnonzero(valid).tolist()
+    poses = [RigidTransform.identity() for _ in frames]
+    sizes = np.zeros((len(frames), 3))
+    for i in used:
+        poses[i] = sensor_from_image(matrices[i], 0.0, names[i])
+        sizes[i] = *pixel_axes(matrices[i], names[i]), 1.0 + image_skew_rad(matrices[i], names[i])
+    mean = sizes[used].mean(axis=0)
+    other = valid & (np.abs(sizes / mean - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
+    if other.any():
+        i = int(np.argmax(other))
+        shown = (f"{column:.6g} x {row:.6g} mm" for column, row, _ in (mean, sizes[i]))
+        raise InvalidInputError("{}: expected pixels as of all frames, {}, got {}".format(names[i], *shown))
+    column_mm, row_mm, leaning = mean.tolist()
+    pixels = image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning - 1.0)
+    return RigidTransform.concatenate(poses), pixels
 
 
 def _squared(matrices: FloatArray) -> FloatArray:

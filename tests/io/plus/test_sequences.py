@@ -1,6 +1,7 @@
 """Sequences written and read back, and through a sweep file, are equal in every field."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -269,6 +270,46 @@ def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
     np.testing.assert_allclose(
         back.sensor_from_image.as_matrix(), sweep.tracker.sensor_from_image.as_matrix(), atol=1e-9
     )
+
+
+def of_pixels(matrices, name):
+    frames = [{"Timestamp": f"{5 + 0.1 * i:.6f}", "ImageStatus": "OK"} for i in range(len(matrices))]
+    for frame, matrix in zip(frames, matrices, strict=True):
+        frame[f"{name}Transform"] = " ".join(map(repr, matrix.ravel().tolist()))
+        frame[f"{name}TransformStatus"] = "OK"
+    return frames
+
+
+@pytest.mark.parametrize("name", ["ImageToRoom", "RoomToImage"])
+def test_poses_may_be_those_of_the_image_s_pixels(tmp_path, name):
+    """Slicer and PLUS record ImageToReference, from pixels to mm."""
+    pixels = np.array([[0.1, 0.008, 0, 0], [0, 0.2, 0, 0], [0, 0, 0.15, 0], [0, 0, 0, 1]])
+    matrices = sweep_examples.poses(4).as_matrix() @ pixels
+    held = of_pixels(matrices if name == "ImageToRoom" else np.linalg.inv(matrices), name)
+    held[3][f"{name}TransformStatus"] = "INVALID"
+    path = write_mha(tmp_path / "a.mha", grey(4), frames=held)
+    given = ImportSettings(dynamic_range_db=60.0, tracker_transform="ImageToRoom", first_sample_depth_mm=2.0)
+    sweep = load_sweep(path, given)
+    assert len(sweep.tracker.readings) == 3
+    grid = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
+    placed = sweep.tracker.world_from_image(sweep.frame_time_s[:3]).as_matrix() @ grid.image_from_sample
+    np.testing.assert_allclose(placed, matrices[:3, :, [0, 1, 3]], atol=1e-9)
+    write_sweep(tmp_path / "a.h5", sweep)
+    write_sequence(tmp_path / "b.mha", load_sweep(tmp_path / "a.h5"))
+    for got, expected in zip(read_header(tmp_path / "b.mha").frames, held, strict=True):
+        assert {each for each in got if "To" in each} == {f"{name}Transform", f"{name}TransformStatus"}
+        assert got[f"{name}TransformStatus"] == expected[f"{name}TransformStatus"]
+        texts = got[f"{name}Transform"], expected[f"{name}Transform"]
+        np.testing.assert_array_equal(*(np.array(each.split(), dtype=float) for each in texts))
+
+
+def test_pixels_of_another_size_are_named(tmp_path):
+    matrices = sweep_examples.poses(3).as_matrix() @ np.diag([0.1, 0.2, 0.15, 1.0])
+    matrices[2, :3, 0] *= 1.1
+    path = write_mha(tmp_path / "a.mha", grey(), frames=of_pixels(matrices, "ImageToReference"))
+    given = ImportSettings(dynamic_range_db=60.0, tracker_transform="ImageToReference")
+    with pytest.raises(InvalidInputError, match=r"ImageToReferenceTransform\[\d\]: expected pixels as of"):
+        load_sweep(path, given)
 
 
 @pytest.mark.parametrize(
