@@ -39,7 +39,7 @@ def filled_by_definition(voxels, state, boxes):
     return filled, marked
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     shape=st.tuples(st.integers(1, 7), st.integers(1, 8), st.integers(1, 9)),
@@ -61,7 +61,7 @@ def test_cubes_are_those_of_brute_force(seed, shape, share, radius):
     np.testing.assert_array_equal(voxels[state == EMPTY], before[state == EMPTY])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     spacing=st.tuples(*[st.sampled_from([0.2, 0.25, 0.5, 0.7, 1.0, 3.0])] * 3),
