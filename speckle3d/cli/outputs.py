@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -55,6 +55,14 @@ def require_own_place(out: Path, kind: Kind, *inputs: Path | None) -> None:
     words, is_own = _KINDS[kind]
     if target.stat().st_size and not is_own(target):
         raise InvalidInputError(f"{out}: expected a new name or {words} to replace, got another kind of file")
+
+
+def require_different(outputs: Mapping[str, Path | None]) -> None:
+    """Refuse two outputs, by their options, that are one file: the one would replace the other."""
+    places: dict[Path, str] = {}
+    for option, path in outputs.items():
+        if path is not None and (other := places.setdefault(path.resolve(), option)) != option:
+            raise InvalidInputError(f"{option}: expected another file than {other}, got {path} for both")
 
 
 def _of_format(wanted: str) -> Callable[[Path], bool]:

@@ -137,15 +137,30 @@ def _cut_sweep(
 ) -> None:
     from speckle3d.study.cuts import cut_posed, open_modes
 
-    opened = open_modes(source, *compared, sweep_file)
     volume, state = made
+    voxels = None if volume is None else _voxels(volume, state)
+    modes, reference = compared
+    if voxels is not None:
+        modes = _modes_of(voxels[0], modes)
+    opened = open_modes(source, modes, reference, sweep_file)
     if volume is not None and len(opened.poses) > 1:
         raise InvalidInputError(f"--mode: expected one beside --volume, got {', '.join(opened.poses)}")
-    voxels = None if volume is None else _voxels(volume, state)
     place = located(opened.reference)
     with progress_bar(f"reslicing {out.name}") as progress:
         picture = cut_posed(opened, place, dynamic_range_db, voxels, progress)
     _write(picture, out)
+
+
+def _modes_of(volume: Volume, modes: tuple[str, ...]) -> tuple[str, ...]:
+    """The mode whose world a volume lies in, if its file says so: cuts must be placed in the same one."""
+    made_at = volume.fields.get("poses")
+    if made_at is None:
+        return modes
+    if modes and modes != (made_at,):
+        raise InvalidInputError(
+            f"--mode: expected {made_at}, at whose poses --volume was made, got {', '.join(modes)}"
+        )
+    return (made_at,)
 
 
 def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> None:
@@ -157,22 +172,10 @@ def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> No
 
 def _voxels(path: Path, state: Path | None) -> tuple[Volume, ByteArray | None]:
     """Read a volume and the states of its voxels, which lie on the same grid."""
-    import numpy as np
-
-    from speckle3d.io.volumes import read_volume
+    from speckle3d.io.volumes import read_states, read_volume
 
     volume = read_volume(path)
-    if state is None:
-        return volume, None
-    states = read_volume(state)
-    same = np.shape(states.voxels) == np.shape(volume.voxels) and np.allclose(
-        states.world_from_index, volume.world_from_index, atol=1e-3
-    )
-    if states.voxels.dtype != np.uint8 or not same:
-        raise InvalidInputError(
-            f"{state}: expected states of type uint8 on the grid of {path}, got another volume"
-        )
-    return volume, states.voxels
+    return volume, None if state is None else read_states(state, volume)
 
 
 def _write(picture: CutPicture, out: Path) -> None:

@@ -30,7 +30,7 @@ from speckle3d.cli.importing import (
     files_of,
     given_settings,
 )
-from speckle3d.cli.outputs import require_own_place
+from speckle3d.cli.outputs import require_different, require_own_place
 
 Three = tuple[float, float, float]
 
@@ -119,10 +119,11 @@ def volume(
     for place in (out, state, deviation):
         if place is not None:
             require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
+    require_different({"--output": out, "--state": state, "--deviation": deviation})
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
-    if levels == "linear" and voxel_type is None:  # most amplitudes are less than one
-        given["voxel_type"] = "float32"
+    if levels == "linear" and voxel_type is None and base["voxel_type"] == "uint8":
+        given["voxel_type"] = "float32"  # amplitudes may be less than one, or thousands
     settings = from_options(CompoundingSettings, base | given)
     request = VolumeRequest(
         out,

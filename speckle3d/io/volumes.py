@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import transforms_from_matrices
@@ -149,6 +149,25 @@ def read_volume(path: PathLike) -> Volume:
         raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
     with naming(str(path)):
         return _volume(found, str(path))
+
+
+def read_states(path: PathLike, volume: Volume) -> ByteArray:
+    """Read the states of a volume's voxels, shape (n_i, n_j, n_k).
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        As `read_volume`, and if they are not of type uint8 or not on the volume's grid.
+    """
+    states = read_volume(path)
+    is_same = states.shape == volume.shape and np.allclose(
+        states.world_from_index, volume.world_from_index, atol=1e-3
+    )
+    if states.voxels.dtype != np.uint8 or not is_same:
+        raise InvalidInputError(
+            f"{path}: expected states of type uint8 on the volume's grid, got another volume"
+        )
+    return states.voxels
 
 
 def _volume(found: _Stored, where: str) -> Volume:

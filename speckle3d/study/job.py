@@ -33,6 +33,7 @@ from speckle3d.pipeline import Progress, Tracked, after, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
 from speckle3d.study.crossed import Companion
+from speckle3d.study.cut_geometry import anchors_of
 from speckle3d.study.cuts import CutPicture, DrawnCut
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
@@ -318,4 +319,6 @@ def _draw_reslices(
     first = next(iter(shown)) if len(shown) > 1 else None
     view = view_of(planes[compared or "image"], shown[compared or "image"])
     where = f"at lateral {strip.left_mm + strip.grid.width_mm / 2:.4g} mm, {view}".removesuffix(", ")
-    return save_reslices(CutPicture(cuts, place=where, reference=compared or first, name=name), path)
+    anchors = {mode: anchors_of(world_from_image) for mode, world_from_image in poses.items()}
+    picture = CutPicture(cuts, place=where, reference=compared or first, name=name, anchors=anchors)
+    return save_reslices(picture, path)

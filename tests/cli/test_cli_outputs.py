@@ -55,6 +55,16 @@ def test_a_file_of_another_kind_stays_as_it_is(refused, calls, tmp_path, name):
     assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
 
 
+def test_two_outputs_are_two_files(refused, reconstructed, tmp_path):
+    place = tmp_path / "v.nrrd"
+    command = ("volume", reconstructed / "reconstruction.h5", "-o", place, "--voxel-mm", 1)
+    told = refused(*command, "--state", tmp_path / "s.nrrd", "--deviation", tmp_path / "." / "v.nrrd")
+    assert told.count("--deviation: expected another file than --output") == 1
+    told = refused(*command, "--state", tmp_path / "s.nrrd", "--deviation", tmp_path / "s.nrrd")
+    assert "--deviation: expected another file than --state" in told
+    assert not place.exists()
+
+
 @pytest.mark.parametrize(
     "name", ["convert", "imu convert", "imu orient", "volume", "reslice", "export", "curves"]
 )

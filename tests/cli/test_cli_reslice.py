@@ -96,6 +96,17 @@ def test_a_volume_is_cut_at_its_place_and_in_the_terms_of_its_sweep(run, bench, 
     assert code == 0, err
 
 
+def test_a_volume_is_cut_in_the_world_of_its_own_poses(run, refused, reconstructed, tmp_path):
+    path, made = reconstructed / "reconstruction.h5", tmp_path / "v.nrrd"
+    grid = ("--voxel-mm", "0.5")
+    assert run("volume", path, "-o", made, "--mode", "orientation", *grid)[0] == 0
+    code, _, err = run("reslice", path, "-o", tmp_path / "c.png", "--volume", made)
+    assert code == 0, err
+    assert read_plane(tmp_path / "c.png").mode == "orientation"
+    told = refused("reslice", path, "-o", tmp_path / "d.png", "--volume", made, "--mode", "image")
+    assert "--mode: expected orientation, at whose poses" in told
+
+
 def test_empty_voxels_are_not_shown_where_their_states_are_given(run, refused, bench, tmp_path):
     placed = load_sweep(bench / "sweep.h5").truth[0]
     states = np.ones((30, 40, 3), np.uint8)
