@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -31,6 +32,7 @@ from speckle3d.cli.importing import (
     given_settings,
 )
 from speckle3d.cli.outputs import require_different, require_own_place
+from speckle3d.core.errors import InvalidInputError
 
 Three = tuple[float, float, float]
 
@@ -120,6 +122,13 @@ def volume(
         if place is not None:
             require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
     require_different({"--output": out, "--state": state, "--deviation": deviation})
+    _require_alone(
+        {"--voxel-mm": voxel_mm}, {"--spacing-mm": spacing_mm, "--within-gb": within_gb, "--like": like}
+    )
+    _require_alone(
+        {"--splat": splat, "--rule": rule, "--fill-radius": fill_radius, "--fill-mm": fill_mm},
+        {"--backward-mm": backward_mm or None},
+    )
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if name in base and value is not None}
     if levels == "linear" and voxel_type is None and base["voxel_type"] == "uint8":
@@ -143,3 +152,11 @@ def volume(
     if as_json:
         emit_json(report.summary())
     note(report.line)
+
+
+def _require_alone(options: Mapping[str, object], others: Mapping[str, object]) -> None:
+    """Refuse options that would say nothing beside others."""
+    given = [name for name, value in options.items() if value is not None]
+    beside = [name for name, value in others.items() if value is not None]
+    if given and beside:
+        raise InvalidInputError(f"{given[0]}: expected no {beside[0]} beside it, which takes its place")
