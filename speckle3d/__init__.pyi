@@ -10,8 +10,8 @@ from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
 from .corrections import correct as correct
 from .crossing_sweeps import cross_sweeps as cross_sweeps
-from .imaging.surface import surface_of as surface_of
-from .imaging.volume import compound as compound
+from .imaging.measures.surface import surface_of as surface_of
+from .imaging.voxels.volume import compound as compound
 from .io.calibrations import load_calibration as load_calibration
 from .io.calibrations import write_calibration as write_calibration
 from .io.curves import load_curves as load_curves

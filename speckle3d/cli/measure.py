@@ -12,7 +12,7 @@ from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
-    from speckle3d.imaging.measure import Measurement
+    from speckle3d.imaging.measures.measure import Measurement
 
 
 @app.command()

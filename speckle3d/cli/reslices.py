@@ -191,7 +191,7 @@ def _write(picture: CutPicture, out: Path) -> None:
 def _draw_outlines(
     source: Path, out: Path, modes: tuple[str, ...], difference_to: str | None, sweep_file: Path | None
 ) -> None:
-    from speckle3d.imaging.outlines import frame_outlines
+    from speckle3d.imaging.cuts.outlines import frame_outlines
     from speckle3d.matching.intensity import IntensityExtractor
     from speckle3d.study.cuts import open_modes
     from speckle3d.study.figures import save_figure

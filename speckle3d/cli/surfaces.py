@@ -60,7 +60,7 @@ def surface(
 
     Where the sweep ends the surface stays open, and what is open has no volume.
     """
-    from speckle3d.imaging.surface import largest_part, smoothed, surface_of, surfaces_of_labels
+    from speckle3d.imaging.measures.surface import largest_part, smoothed, surface_of, surfaces_of_labels
     from speckle3d.io.surfaces import require_suffix, write_surface
     from speckle3d.io.volumes import read_volume
 
@@ -125,7 +125,7 @@ def _sizes(
     """What is said of one surface."""
     from dataclasses import asdict
 
-    from speckle3d.imaging.surface import measures_of
+    from speckle3d.imaging.measures.surface import measures_of
 
     found = measures_of(surface, errors, grid)
     parts = int(surface.parts().max()) + 1

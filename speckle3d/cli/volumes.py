@@ -111,7 +111,7 @@ def volume(
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
-    from speckle3d.imaging.settings import CompoundingSettings
+    from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
     from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
 

@@ -22,8 +22,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.imaging.curved import CurvedSheet
-from speckle3d.imaging.planes import ReslicePlane
+from speckle3d.imaging.cuts.curved import CurvedSheet
+from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.io.hdf5 import atomic_path, make_folder, reading
 from speckle3d.study.figures import DOTS_PER_INCH
 

@@ -16,8 +16,8 @@ from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.curved import CurvedSheet
-from speckle3d.imaging.reslice import reslice_at, reslice_volume
+from speckle3d.imaging.cuts.curved import CurvedSheet
+from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
 from speckle3d.scoring.references import REFERENCES, find_reference

@@ -13,8 +13,8 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.curved import CurvedSheet, curved_sheet
-from speckle3d.imaging.oblique import (
+from speckle3d.imaging.cuts.curved import CurvedSheet, curved_sheet
+from speckle3d.imaging.cuts.oblique import (
     covering_box,
     covering_plane,
     spanned_plane,
@@ -22,8 +22,8 @@ from speckle3d.imaging.oblique import (
     turned_frame_plane,
     vector_words,
 )
-from speckle3d.imaging.outlines import crossings, frame_outlines, sheet_crossings
-from speckle3d.imaging.planes import (
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines, sheet_crossings
+from speckle3d.imaging.cuts.planes import (
     DEFAULT_PIXEL_MM,
     ReslicePlane,
     depth_line,

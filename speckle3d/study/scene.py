@@ -11,8 +11,8 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import STATE_SEGMENTS
-from speckle3d.imaging.outlines import frame_outlines
-from speckle3d.imaging.settings import CompoundingSettings
+from speckle3d.imaging.cuts.outlines import frame_outlines
+from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.polylines import write_polylines
 from speckle3d.io.transforms import write_transform

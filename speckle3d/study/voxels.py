@@ -19,12 +19,12 @@ from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segme
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
 from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.measures.uncertainty import DeviationField
 from speckle3d.imaging.region import Region
-from speckle3d.imaging.settings import CompoundingSettings
-from speckle3d.imaging.slabs import compound_slabs
-from speckle3d.imaging.uncertainty import DeviationField
+from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.imaging.voxels.slabs import compound_slabs
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.volume_writer import VolumeWriter
 from speckle3d.io.volumes import read_volume

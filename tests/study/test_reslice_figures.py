@@ -6,8 +6,8 @@ from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.curved import curved_sheet
-from speckle3d.imaging.planes import ReslicePlane
+from speckle3d.imaging.cuts.curved import curved_sheet
+from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.study.cut_geometry import read_cuts, read_plane
 from speckle3d.study.cuts import CutPicture, DrawnCut
 from speckle3d.study.reslice_figures import draw_cuts, save_reslices

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError, NoSpaceError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
-from speckle3d.imaging.settings import CompoundingSettings
+from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.headers import read_header
 from speckle3d.study.mrml import Scene
 from speckle3d.study.posed import PosedSweep

@@ -12,9 +12,9 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.grid import Slab, VoxelGrid
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.nearest import BATCH, BYTES_PER_POINT, NearestImages
+from speckle3d.imaging.voxels.grid import Slab, VoxelGrid
 
 BYTES_PER_VOXEL = BYTES_PER_POINT + 14
 """Images on either side; voxel, state and a copy of another type; voxel and state of the slab before."""

@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.planes import ReslicePlane, along_sweep_plane, surface_plane
-from speckle3d.imaging.reslice import reslice_frames
+from speckle3d.imaging.cuts.planes import ReslicePlane, along_sweep_plane, surface_plane
+from speckle3d.imaging.cuts.reslice import reslice_frames
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 FINE = ImageGrid(

@@ -7,8 +7,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.belonging import belonging_of, require_inside
-from speckle3d.imaging.measure import angle, length, measured
+from speckle3d.imaging.measures.belonging import belonging_of, require_inside
+from speckle3d.imaging.measures.measure import angle, length, measured
 
 GRID = ImageGrid(41, 81, 0.5, 0.5)
 WORLD = RigidTransform.from_components([20.0, -30.0, 5.0], Rotation.from_euler("ZYX", [1.1, -0.4, 0.7]))

@@ -7,8 +7,8 @@ from igsio_twin import Clip
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.grid import VoxelGrid
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.voxels.grid import VoxelGrid
+from speckle3d.imaging.voxels.volume import compound
 
 SHAPE = (14, 15, 16)
 FRAMES, WIDTH, HEIGHT = 5, 9, 8

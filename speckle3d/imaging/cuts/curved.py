@@ -10,7 +10,7 @@ from scipy.interpolate import make_interp_spline
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.planes import DEFAULT_PIXEL_MM, require_pixels
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, require_pixels
 
 _DENSITY = 8
 """Points per pixel along the curve from which equal steps are read off: errors of a hundredth of a pixel."""

@@ -5,9 +5,9 @@ import pytest
 
 from speckle3d.core.labels import FILLED
 from speckle3d.imaging.axes import sweep_axes
-from speckle3d.imaging.grid import grid_around
 from speckle3d.imaging.images import ChosenImages, PosedImages
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.voxels.grid import grid_around
+from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.study.posed import open_posed
 

@@ -14,11 +14,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.grid import VoxelGrid
 from speckle3d.imaging.images import ChosenImages, PosedImages
-from speckle3d.imaging.settings import CompoundingSettings
-from speckle3d.imaging.slabs import compound_slabs
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.voxels.grid import VoxelGrid
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.imaging.voxels.slabs import compound_slabs
+from speckle3d.imaging.voxels.volume import compound
 
 GRID = ImageGrid(
     vectors=13, samples=21, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7

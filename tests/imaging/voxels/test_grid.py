@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.grid import grid_around, grid_as_asked, grid_like, spacing_within
+from speckle3d.imaging.voxels.grid import grid_around, grid_as_asked, grid_like, spacing_within
 
 
 @settings(max_examples=8, deadline=None)

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.threads import cores, in_parallel
-from speckle3d.imaging.grid import VoxelGrid
 from speckle3d.imaging.images import Images, PosedImages
-from speckle3d.imaging.settings import Rule, Splat
+from speckle3d.imaging.voxels.grid import VoxelGrid
+from speckle3d.imaging.voxels.settings import Rule, Splat
 
 Weights = npt.NDArray[Any] | Images
 """Weight of each frame, shape (n,), or of each sample: images of weights."""

@@ -61,7 +61,7 @@ def measured(
     points_mm : ndarray, shape (k, 3)
         In the world, k >= 2, in order.
     belonging : Belonging
-        Of the points; see `speckle3d.imaging.belonging`.
+        Of the points; see `speckle3d.imaging.measures.belonging`.
     errors : PosedErrors
     pick_mm : float
         Standard deviation of each point's place on each axis by picking.

@@ -10,11 +10,11 @@ from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.backward import backward_slabs
-from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.volume import compound
 from speckle3d.kernels.cuts import EDGE_TOLERANCE
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)

@@ -16,11 +16,11 @@ from speckle3d.core.arrays import BoolArray, ByteArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.grid import VoxelGrid, grid_around
 from speckle3d.imaging.images import Images, PosedImages
-from speckle3d.imaging.settings import CompoundingSettings, Rule, Splat, VoxelType
-from speckle3d.imaging.slabs import compound_slabs, working_gb
-from speckle3d.imaging.splatting import Weights, batch_gb
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
+from speckle3d.imaging.voxels.slabs import compound_slabs, working_gb
+from speckle3d.imaging.voxels.splatting import Weights, batch_gb
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
@@ -89,7 +89,7 @@ def compound(
     backward_mm : float
         For sparse sweeps: if above zero, each voxel is interpolated between the images nearest on either
         side, up to this far from it, without `splat`, `rule` and `fill_radius`; see
-        `speckle3d.imaging.backward`.
+        `speckle3d.imaging.voxels.backward`.
     voxel_type : {"float32", "uint8", "int16", "uint16"}
         With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
         are 0.

@@ -6,14 +6,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.oblique import (
+from speckle3d.imaging.cuts.oblique import (
     covering_box,
     covering_plane,
     spanned_plane,
     three_point_plane,
     turned_frame_plane,
 )
-from speckle3d.imaging.planes import lateral_line, planes_from_first_frame
+from speckle3d.imaging.cuts.planes import lateral_line, planes_from_first_frame
 
 GRID = ImageGrid(11, 21, 0.5, 0.5, 1.0)
 BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 6.0) for z in (0.0, 8.0)])

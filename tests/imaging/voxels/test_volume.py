@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.planes import ReslicePlane
-from speckle3d.imaging.reslice import reslice_volume
-from speckle3d.imaging.volume import compound, grid_around
+from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.imaging.cuts.reslice import reslice_volume
+from speckle3d.imaging.voxels.volume import compound, grid_around
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 

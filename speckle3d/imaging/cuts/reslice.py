@@ -18,10 +18,10 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
+from speckle3d.imaging.cuts.planes import ReslicePlane as ReslicePlane
+from speckle3d.imaging.cuts.planes import image_plane
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.nearest import LookUp, NearestImages, in_one_pass
-from speckle3d.imaging.planes import ReslicePlane as ReslicePlane
-from speckle3d.imaging.planes import image_plane
 
 _GRAIN = 32
 """Lines of a cut below which a slice is not worth another thread's while."""

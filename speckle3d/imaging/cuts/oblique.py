@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.outlines import crossings, frame_outlines
-from speckle3d.imaging.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_part
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_part
 
 _LEAST_SINE = 1e-4
 """Of the angle between two directions that span a plane: six thousandths of a degree."""

@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.planes import ReslicePlane
-from speckle3d.imaging.reslice import reslice_volume
+from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.imaging.cuts.reslice import reslice_volume
 
 
 def index_of(volume, cut):

@@ -16,8 +16,8 @@ from commands import run_command
 from igsio_twin import Clip
 
 from speckle3d.core.labels import FILLED, MEASURED
-from speckle3d.imaging.grid import grid_like
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.voxels.grid import grid_like
+from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.volumes import read_volume
 from speckle3d.study.posed import open_posed

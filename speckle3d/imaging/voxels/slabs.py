@@ -11,12 +11,12 @@ import numpy.typing as npt
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.threads import in_parallel
-from speckle3d.imaging.backward import BYTES_PER_VOXEL, backward_slabs
-from speckle3d.imaging.grid import Slab, VoxelGrid
-from speckle3d.imaging.holes import boxes_within, cubes_within, fill_holes
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.settings import CompoundingSettings, VoxelType
-from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
+from speckle3d.imaging.voxels.backward import BYTES_PER_VOXEL, backward_slabs
+from speckle3d.imaging.voxels.grid import Slab, VoxelGrid
+from speckle3d.imaging.voxels.holes import boxes_within, cubes_within, fill_holes
+from speckle3d.imaging.voxels.settings import CompoundingSettings, VoxelType
+from speckle3d.imaging.voxels.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
 
 _SHARE = 0.8
 """Of the memory; the rest is for the interpreter, its libraries, and files being read and packed."""

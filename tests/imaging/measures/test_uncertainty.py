@@ -6,9 +6,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.belonging import belonging_of
-from speckle3d.imaging.grid import VoxelGrid, grid_around
-from speckle3d.imaging.uncertainty import DeviationField, deviation_slabs, deviations
+from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.imaging.measures.uncertainty import DeviationField, deviation_slabs, deviations
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 
 GRID = ImageGrid(31, 41, 0.5, 0.5)
 

@@ -14,8 +14,8 @@ from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import require_poses
-from speckle3d.imaging.settings import VoxelType
+from speckle3d.imaging.images import image_corners
+from speckle3d.imaging.voxels.settings import VoxelType
 
 MAX_VOXELS_ALONG = 1_000_000
 """Most voxels along an axis, to catch wrong units: 100 m at 0.1 mm."""
@@ -211,12 +211,6 @@ def spacing_within(
         if spacing >= finest and np.prod(_counts(low, high, spacing)) <= most:
             return spacing
     raise InvalidInputError(f"max_gb: expected enough for some voxels, got {max_gb:g} GB")
-
-
-def image_corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
-    """Corners of all images in the world, shape (4 n, 3)."""
-    require_poses(world_from_image)
-    return np.concatenate([world_from_image.apply(corner) for corner in grid.corners_mm])
 
 
 def _bounds(

@@ -11,11 +11,11 @@ from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.grid import grid_as_asked
-from speckle3d.imaging.holes import boxes_within, fill_holes
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.settings import CompoundingSettings
-from speckle3d.imaging.slabs import compound_slabs
+from speckle3d.imaging.voxels.grid import grid_as_asked
+from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.imaging.voxels.slabs import compound_slabs
 
 
 def some_voxels(rng, shape, share_measured):

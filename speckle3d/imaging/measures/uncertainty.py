@@ -9,8 +9,8 @@ import numpy as np
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.belonging import belonging_of
-from speckle3d.imaging.grid import VoxelGrid
+from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.imaging.voxels.grid import VoxelGrid
 
 COARSE_MM = 0.75
 """Distance of the points at which the deviation is computed; between them it is interpolated linearly."""
@@ -21,9 +21,9 @@ _AT_ONCE = 2**15
 class DeviationField:
     """Standard deviation of position along the sweep, on the grid of a volume.
 
-    A voxel moves with the frames nearest to it (`speckle3d.imaging.belonging`), and along the sweep is the
-    direction of their elevational axis. Deviations are computed on a coarse grid and interpolated, which
-    costs some hundredths of the largest. Where the probe passes twice, the nearer pass counts; between voxels
+    A voxel moves with the frames nearest to it (`belonging_of`), and along the sweep is the direction of
+    their elevational axis. Deviations are computed on a coarse grid and interpolated, which is off by some
+    hundredths of the largest. Where the probe passes twice, the nearer pass counts; between voxels
     of the one and of the other the deviation jumps, and is blurred over the coarse grid's step.
 
     Parameters

@@ -15,7 +15,7 @@ from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.surface import Surface
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.belonging import belonging_of
+from speckle3d.imaging.measures.belonging import belonging_of
 
 Inside = Literal["above", "below"]
 TAUBIN = (0.5, -0.53)
@@ -180,8 +180,8 @@ def measures_of(
 ) -> PartMeasures:
     """Measure a surface; with its sweep's pose errors and image grid also the standard errors.
 
-    Every vertex moves with the frames nearest to it (`speckle3d.imaging.belonging`). Area and volume follow
-    to first order. The place of the level, the resolution of the images and the voxels' size are not in it.
+    Every vertex moves with the frames nearest to it (`belonging_of`). Area and volume follow to first order.
+    The place of the level, the resolution of the images and the voxels' size are not in it.
     """
     edges = surface.open_edges()
     open_mm = float(np.linalg.norm(np.diff(surface.vertices_mm[edges], axis=1), axis=2).sum())

@@ -7,8 +7,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.curved import curved_sheet
-from speckle3d.imaging.reslice import reslice_frames, reslice_volume
+from speckle3d.imaging.cuts.curved import curved_sheet
+from speckle3d.imaging.cuts.reslice import reslice_frames, reslice_volume
 
 
 def arc(radius_mm, degrees, n, tilt=None):
