@@ -38,6 +38,6 @@ from .study.images import grey_images as grey_images
 from .study.job import JobResult as JobResult
 from .study.job import run_job as run_job
 from .study.pose_errors import measure as measure
-from .study.scene import write_scene as write_scene
+from .study.scenes.scene import write_scene as write_scene
 
 __version__: str

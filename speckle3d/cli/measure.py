@@ -77,7 +77,7 @@ def measure(
 
 def _in_world(picture: Path, places: FloatArray, mode: str | None) -> tuple[FloatArray, str]:
     """Points of the world that lie under points of a picture, and the mode whose poses it shows."""
-    from speckle3d.study.cut_geometry import read_plane
+    from speckle3d.study.reslices.cut_geometry import read_plane
 
     shown = read_plane(picture, mode)
     return shown.cut.world_from_mm(places[:, 0], places[:, 1]), shown.mode

@@ -113,7 +113,7 @@ def volume(
     from speckle3d.imaging.region import Region
     from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
+    from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
     for place in (out, state, deviation):

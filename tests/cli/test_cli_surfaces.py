@@ -15,7 +15,7 @@ from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.surfaces import read_surface
 from speckle3d.io.volumes import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.cut_geometry import save_cuts
+from speckle3d.study.reslices.cut_geometry import save_cuts
 
 GRID = ImageGrid(51, 51, 0.2, 0.2)
 N = 41

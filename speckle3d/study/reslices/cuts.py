@@ -22,7 +22,8 @@ from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
-from speckle3d.study.places import (
+from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
+from speckle3d.study.reslices.places import (
     AnyCut,
     Place,
     frame_centres,
@@ -30,7 +31,6 @@ from speckle3d.study.places import (
     sweep_extent,
     view_of,
 )
-from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.cuts.curved import curved_sheet
 from speckle3d.imaging.cuts.planes import ReslicePlane
-from speckle3d.study.cut_geometry import read_cuts, read_plane
-from speckle3d.study.cuts import CutPicture, DrawnCut
-from speckle3d.study.reslice_figures import draw_cuts, save_reslices
+from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
+from speckle3d.study.reslices.reslice_figures import draw_cuts, save_reslices
 
 PLACED = RigidTransform.from_components([3.0, -40.0, 12.0], Rotation.from_euler("ZYX", [0.4, -0.7, 1.0]))
 

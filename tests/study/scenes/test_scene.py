@@ -16,10 +16,10 @@ from speckle3d.core.errors import InvalidInputError, NoSpaceError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.headers import read_header
-from speckle3d.study.mrml import Scene
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scene import SceneRequest, require_scene_place, write_scene
-from speckle3d.study.sequences import PosedSequence
+from speckle3d.study.scenes.mrml import Scene
+from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
+from speckle3d.study.scenes.sequences import PosedSequence
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""

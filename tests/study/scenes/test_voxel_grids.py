@@ -9,7 +9,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import open_posed
-from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
+from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
 SPACING, ORIGIN, SHAPE = (0.7, 0.9, 1.1), (1.0 / 3.0, 2.0 / 7.0, -0.1), (19, 41, 7)
 COARSE = CompoundingSettings(voxel_mm=1.0)

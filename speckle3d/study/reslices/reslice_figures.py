@@ -23,10 +23,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
-from speckle3d.study.cut_geometry import save_cuts
-from speckle3d.study.cut_panels import add_axes_in, laid_out, name_axes
-from speckle3d.study.cuts import CutPicture, DrawnCut
 from speckle3d.study.figures import UNSEEN, colour_of, label_of, name_figure, new_figure, show_grey, wrapped
+from speckle3d.study.reslices.cut_geometry import save_cuts
+from speckle3d.study.reslices.cut_panels import add_axes_in, laid_out, name_axes
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
 
 _BRIGHTEST_PERCENTILE = 99.9
 """A single specular echo must not darken the tissue."""

@@ -17,10 +17,10 @@ from speckle3d.io.fileset import FileSet
 from speckle3d.io.polylines import write_polylines
 from speckle3d.io.transforms import write_transform
 from speckle3d.scoring.references import REFERENCES
-from speckle3d.study.mrml import COLOURED, Scene
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.sequences import PosedSequence
-from speckle3d.study.voxels import (
+from speckle3d.study.scenes.mrml import COLOURED, Scene
+from speckle3d.study.scenes.sequences import PosedSequence
+from speckle3d.study.scenes.voxels import (
     BEST_FIRST,
     GridRequest,
     Progress,
