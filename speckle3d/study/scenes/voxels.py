@@ -227,7 +227,7 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
                 made.append(deviation.planes(slab.first, stop, slab.state))
             for writer, planes in zip(writers, made, strict=True):
                 writer.append(planes)
-            counts += np.bincount(slab.state.ravel(), minlength=3)
+            counts += [np.count_nonzero(slab.state == state) for state in range(3)]
             if progress is not None:
                 progress(stop, grid.shape[2])
         if counts[MEASURED] == 0:
