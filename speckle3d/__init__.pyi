@@ -5,10 +5,12 @@ from .core.calibration import Calibration as Calibration
 from .core.calibration import calibrated as calibrated
 from .core.curves import DecorrelationCurves as DecorrelationCurves
 from .core.errors import Speckle3DError as Speckle3DError
+from .core.labels import LabelMap as LabelMap
 from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
 from .corrections import correct as correct
 from .crossing_sweeps import cross_sweeps as cross_sweeps
+from .imaging.surface import surface_of as surface_of
 from .imaging.volume import compound as compound
 from .io.calibrations import load_calibration as load_calibration
 from .io.calibrations import write_calibration as write_calibration
@@ -18,7 +20,11 @@ from .io.import_settings import ImportSettings as ImportSettings
 from .io.load import load_sweep as load_sweep
 from .io.readers import Reader as Reader
 from .io.reconstructions import read_reconstruction as read_reconstruction
+from .io.surfaces import read_surface as read_surface
+from .io.surfaces import write_surface as write_surface
 from .io.sweep_writer import write_sweep as write_sweep
+from .io.transforms import write_transform as write_transform
+from .io.volume_writer import VolumeWriter as VolumeWriter
 from .io.volumes import read_volume as read_volume
 from .io.volumes import write_volume as write_volume
 from .phantom_curves import calibrate_curves as calibrate_curves
@@ -31,5 +37,7 @@ from .simulation.presets import simulate as simulate
 from .study.images import grey_images as grey_images
 from .study.job import JobResult as JobResult
 from .study.job import run_job as run_job
+from .study.pose_errors import measure as measure
+from .study.scene import write_scene as write_scene
 
 __version__: str

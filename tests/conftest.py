@@ -84,6 +84,18 @@ def report_study(tmp_path_factory, small_sweeps) -> Path:
     return folder
 
 
+@pytest.fixture
+def many_threads(monkeypatch):
+    """Five threads, more than these machines have: slices end in other places, their order is any."""
+    from speckle3d.core import threads
+
+    monkeypatch.setattr(threads, "_pool", None)
+    monkeypatch.setattr(threads, "cores", lambda: 5)
+    yield
+    if threads._pool is not None:
+        threads._pool.shutdown()
+
+
 @pytest.fixture(scope="session")
 def python():
     """Run a few lines in a fresh interpreter and return what it prints."""

@@ -13,12 +13,14 @@ from disks import FULL, limited
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import NoSpaceError
+from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
 from speckle3d.core.reconstruction import FramePairs, Provenance
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.points import PickedPoints, write_points
+from speckle3d.io.polylines import write_polylines
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.volumes import write_volume
@@ -36,6 +38,7 @@ VOLUME = Volume(
     (0.5, 0.5, 1.0),
     RigidTransform.identity(),
 )
+LABELS = LabelMap(VOLUME.voxels % 3, VOLUME.spacing_mm, VOLUME.world_from_grid, {}, STATE_SEGMENTS)
 
 
 def reconstruction(path):
@@ -80,6 +83,11 @@ WRITERS = {
     "volume.nrrd": lambda path: write_volume(path, VOLUME),
     "volume.mha": lambda path: write_volume(path, VOLUME),
     "volume.nii.gz": lambda path: write_volume(path, VOLUME),
+    "volume.nii": lambda path: write_volume(path, VOLUME),
+    "plain.nrrd": lambda path: write_volume(path, VOLUME, compress=False),
+    "state.seg.nrrd": lambda path: write_volume(path, LABELS),
+    "frames.seq.nrrd": lambda path: write_sequence(path, SWEEP),
+    "outlines.vtk": lambda path: write_polylines(path, np.zeros((9, 5, 3))),
     "figure.png": lambda path: save_figure(figure(), path),
     "both.svg": lambda path: save_both(figure(), path.with_suffix("")),
     "summary.json": lambda path: write_texts(path.parent, {path.name: "0123456789" * 500}),

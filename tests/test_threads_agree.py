@@ -10,9 +10,6 @@ from speckle3d.core import threads
 from speckle3d.corrections import correct
 from speckle3d.pipeline import Tracked, track
 
-THREADS = 5
-"""More than these machines have: slices then end in other places, and their order is another each time."""
-
 
 def poses_of(tracked: Tracked, sweep) -> dict[str, np.ndarray]:
     corrected = correct(tracked, sweep, ["orientation", "pose"])
@@ -22,14 +19,6 @@ def poses_of(tracked: Tracked, sweep) -> dict[str, np.ndarray]:
         "subset": tracked.subset.as_matrix(),
         "flags": tracked.flags,
     } | {mode: each.poses.as_matrix() for mode, each in corrected.items()}
-
-
-@pytest.fixture
-def many_threads(monkeypatch):
-    monkeypatch.setattr(threads, "_pool", None)
-    monkeypatch.setattr(threads, "cores", lambda: THREADS)
-    yield
-    threads._pool.shutdown()
 
 
 def test_poses_do_not_depend_on_threads(sweep, curves, many_threads):

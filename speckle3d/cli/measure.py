@@ -50,11 +50,10 @@ def measure(
     Standard errors are those of the poses of the frames on either side of each point, jointly, and of the
     picking.
     """
-    from speckle3d.imaging.belonging import require_inside
-    from speckle3d.imaging.measure import measured
     from speckle3d.io.picks import PICTURE, WORLD, parse_places, read_places
     from speckle3d.io.reconstructions import read_reconstruction
-    from speckle3d.study.pose_errors import posed_errors_of
+    from speckle3d.study.pose_errors import PICKED
+    from speckle3d.study.pose_errors import measure as measure_points
 
     columns = WORLD if on is None else PICTURE
     if (points is None) == (not point):
@@ -66,10 +65,8 @@ def measure(
     if on is not None:
         places, mode = _in_world(on, places, mode)
     held = read_reconstruction(source, with_pairs=False)
-    errors = posed_errors_of(held, mode or "image")
-    near = require_inside(places, held.grid, errors.world_from_image)
-    picked = held.grid.vector_pitch_mm / 2 if pick_mm is None else pick_mm
-    found = measured(places, near, errors, picked)
+    picked = PICKED * held.grid.vector_pitch_mm if pick_mm is None else pick_mm
+    found = measure_points(held, places, mode or "image", picked)
     told = f"mode {mode or 'image'}; points picked to {picked:.2g} mm per axis; 95 % in brackets"
     if as_json:
         rows = [_plain(each) for each in found]

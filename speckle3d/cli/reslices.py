@@ -14,7 +14,8 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from speckle3d.core.arrays import FloatArray
+    from speckle3d.core.arrays import ByteArray, FloatArray
+    from speckle3d.core.volume import Volume
     from speckle3d.study.cuts import CutPicture
     from speckle3d.study.places import Place
 
@@ -75,6 +76,10 @@ def reslice(
     ] = False,
     outlines: Annotated[bool, typer.Option("--outlines", help="Draw where the frames are instead.")] = False,
     volume: Annotated[Path | None, typer.Option(help="Cut this volume of the sweep, not its frames.")] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(help="What `volume --state` wrote: empty voxels are not shown."),
+    ] = None,
     pixel_mm: Annotated[float, typer.Option(help="Side of a pixel.")] = 0.2,
     reach_mm: Annotated[float, typer.Option(help="Frames farther from a pixel do not count.")] = 0.5,
     sweep_file: SweepFile = None,
@@ -85,7 +90,7 @@ def reslice(
     from speckle3d.study.places import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)
-    require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, on, volume)
+    require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, on, volume, state)
     _require_one_place(
         {"--lateral-mm": lateral_mm if frame is None else None, "--depth-mm": depth_mm, "--frame": frame,
          "--points": points, "--origin": origin, "--curve": curve}
@@ -114,9 +119,11 @@ def reslice(
         _draw_outlines(source, out, modes, difference_to, sweep_file)
     elif _is_volume(source):
         _require_no_modes(modes, difference_to, volume)
-        _cut_volume(source, out, located(None))
+        _cut_volume(source, state, out, located(None))
     else:
-        _cut_sweep(source, out, located, (modes, difference_to), volume, sweep_file, dynamic_range_db)
+        _require_together({"--state": state, "--volume": volume})
+        compared, made = (modes, difference_to), (volume, state)
+        _cut_sweep(source, out, located, compared, made, sweep_file, dynamic_range_db)
 
 
 def _cut_sweep(
@@ -124,28 +131,48 @@ def _cut_sweep(
     out: Path,
     located: Callable[[str | None], Place],
     compared: tuple[tuple[str, ...], str | None],
-    volume: Path | None,
+    made: tuple[Path | None, Path | None],
     sweep_file: Path | None,
     dynamic_range_db: float,
 ) -> None:
-    from speckle3d.io.volumes import read_volume
     from speckle3d.study.cuts import cut_posed, open_modes
 
     opened = open_modes(source, *compared, sweep_file)
+    volume, state = made
     if volume is not None and len(opened.poses) > 1:
         raise InvalidInputError(f"--mode: expected one beside --volume, got {', '.join(opened.poses)}")
-    voxels = None if volume is None else read_volume(volume)
+    voxels = None if volume is None else _voxels(volume, state)
     place = located(opened.reference)
     with progress_bar(f"reslicing {out.name}") as progress:
         picture = cut_posed(opened, place, dynamic_range_db, voxels, progress)
     _write(picture, out)
 
 
-def _cut_volume(source: Path, out: Path, place: Place) -> None:
-    from speckle3d.io.volumes import read_volume
+def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> None:
     from speckle3d.study.cuts import cut_voxels
 
-    _write(cut_voxels(read_volume(source), place, source.name), out)
+    volume, states = _voxels(source, state)
+    _write(cut_voxels(volume, place, source.name, states), out)
+
+
+def _voxels(path: Path, state: Path | None) -> tuple[Volume, ByteArray | None]:
+    """Read a volume and the states of its voxels, which lie on the same grid."""
+    import numpy as np
+
+    from speckle3d.io.volumes import read_volume
+
+    volume = read_volume(path)
+    if state is None:
+        return volume, None
+    states = read_volume(state)
+    same = np.shape(states.voxels) == np.shape(volume.voxels) and np.allclose(
+        states.world_from_index, volume.world_from_index, atol=1e-3
+    )
+    if states.voxels.dtype != np.uint8 or not same:
+        raise InvalidInputError(
+            f"{state}: expected states of type uint8 on the grid of {path}, got another volume"
+        )
+    return volume, states.voxels
 
 
 def _write(picture: CutPicture, out: Path) -> None:

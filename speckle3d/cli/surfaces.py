@@ -71,6 +71,8 @@ def surface(
     if smooth < 0:
         raise InvalidInputError(f"--smooth: expected zero or more passes, got {smooth}")
     suffix = require_suffix(out)
+    if not labels:
+        require_own_place(out, "surface", source, reconstruction, state)
     volume = read_volume(source)
     errors, grid = _errors(reconstruction, mode or volume.fields.get("poses", "image"))
     known = None if state is None else _known(volume, state)
@@ -80,7 +82,7 @@ def surface(
             found[str(out.with_name(f"{out.stem}-{label}{suffix}"))] = each
     else:
         found[str(out)] = surface_of(volume, level or 0.0, "below" if below else "above", known)
-    for place in found:
+    for place in found if labels else ():
         require_own_place(Path(place), "surface", source, reconstruction, state)
     told = []
     for place, each in found.items():

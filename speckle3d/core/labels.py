@@ -47,11 +47,14 @@ class Segment:
         object.__setattr__(self, "colour", colour)
 
 
+EMPTY, MEASURED, FILLED = 0, 1, 2
+"""States of a voxel: without a value, with samples of its own, and with a value that comes from others."""
+
 STATE_SEGMENTS = (
-    Segment(1, "measured", (0.25, 0.75, 0.35)),
-    Segment(2, "filled", (0.95, 0.65, 0.15)),
+    Segment(MEASURED, "measured", (0.25, 0.75, 0.35)),
+    Segment(FILLED, "filled", (0.95, 0.65, 0.15)),
 )
-"""Of voxels by how they came to their value; those that are empty have label 0."""
+"""Of voxels by how they came to their value."""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Slab:
     voxels : ndarray, shape (planes, n_j, n_i)
         Of the type asked for; empty ones are NaN in float32 and 0 in whole numbers.
     state : ndarray of uint8, shape (planes, n_j, n_i)
-        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.imaging.holes`.
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
     """
 
     first: int

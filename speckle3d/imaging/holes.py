@@ -1,4 +1,4 @@
-"""Filling empty voxels from the measured ones nearby, and the states of a voxel."""
+"""Filling empty voxels from the measured ones nearby."""
 
 from __future__ import annotations
 
@@ -8,15 +8,6 @@ import numpy.typing as npt
 from speckle3d.core.arrays import ByteArray, Float32Array, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.threads import in_parallel
-
-EMPTY = 0
-"""State of a voxel without a value."""
-
-MEASURED = 1
-"""State of a voxel in which samples lie."""
-
-FILLED = 2
-"""State of a voxel whose value comes from others."""
 
 MAX_RADIUS = 255
 """Largest half edge of a box, to catch wrong units, and within what counts of four bytes hold."""
@@ -43,7 +34,7 @@ def fill_holes(
     voxels : ndarray of float32, shape (n_k, n_j, n_i), changed in place
         What empty ones hold does not matter.
     state : ndarray of uint8, shape (n_k, n_j, n_i), changed in place
-        `EMPTY`, `MEASURED` or `FILLED`.
+        `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.core.labels`.
     radius : int, or array_like of int, shape (n, 3)
         Half the edge of the largest box in voxels: boxes are cubes that grow by one voxel to every side;
         with 0 nothing is filled. Or half edges (k, j, i) of each box, smallest first: see `boxes_within`.

@@ -46,9 +46,9 @@ class Measurement:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the value; none reaches below zero."""
-        half = NORMAL_95 * self.sigma
-        return max(self.value - half, 0.0), self.value + half
+        """95 % interval of the value; none reaches below zero, or past pi for angles."""
+        half, most = NORMAL_95 * self.sigma, np.pi if self.unit == "rad" else np.inf
+        return max(self.value - half, 0.0), min(self.value + half, float(most))
 
 
 def measured(

@@ -108,9 +108,11 @@ class NearestImages:
         return in_one_pass([LookUp(self, lines, points, hull_mm)])[0]
 
     def read(self, index: int) -> Float32Array:
-        """One image, NaN outside the region."""
-        image = self._source.read(index)
-        return image if self._outside is None else np.where(self._outside, np.float32(np.nan), image)
+        """One image in memory of its own, since readers may reuse theirs; NaN outside the region."""
+        image = np.array(self._source.read_as_stored(index), dtype=np.float32, order="C")
+        if self._outside is not None:
+            image[self._outside] = np.nan
+        return image
 
     def reach(self, hull_mm: FloatArray) -> BoolArray:
         """Whether each image's slab can reach a point: no face of it has all of their hull beyond it."""

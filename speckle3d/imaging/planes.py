@@ -21,6 +21,9 @@ MAX_PIXELS = 100_000_000
 DEFAULT_PIXEL_MM = 0.2
 """Between the axial and the lateral resolution of a 5-10 MHz probe."""
 
+_LEAST_CROSSING = 0.5
+"""Sine of the angle between a frame and a plane at which the frame is said to cross it."""
+
 
 @dataclass(frozen=True)
 class ReslicePlane:
@@ -240,8 +243,8 @@ def _travelled(
 ) -> tuple[RigidTransform, FloatArray]:
     """Place a plane along the travel of a line, and say where on it the ends of that line are.
 
-    Its origin is the first frame's line's first end, but in the mean plane of all lines. Its y is the lines'
-    mean direction, or the first one's own.
+    It lies in the mean plane of all lines; its origin is in the first frame, as far along it as the line
+    begins. Its y is the lines' mean direction, or the line in which the first frame crosses it.
 
     Returns
     -------
@@ -254,11 +257,17 @@ def _travelled(
     travel = _mean_travel(ends.mean(axis=0), world_from_image)
     across = _unit(travel - (travel @ down) * down, "travel")
     normal = np.cross(across, down)
+    beside = np.cross(
+        world_from_image[0].rotation.apply([0.0, 0.0, 1.0]), along[0] / np.linalg.norm(along[0])
+    )
+    # A frame that hardly crosses the plane has its line projected there instead.
+    beside = beside if abs(beside @ normal) > _LEAST_CROSSING else normal
     if first_down:
-        down = _unit(along[0] - (along[0] @ normal) * normal, "the first frame's line")
+        down = _unit(along[0] - (along[0] @ normal) / (beside @ normal) * beside, "the first frame's line")
         across = np.cross(down, normal)
     axes = Rotation.from_matrix(np.column_stack([across, down, normal]))
-    origin = ends[0, 0] + normal * ((ends.reshape(-1, 3).mean(axis=0) - ends[0, 0]) @ normal)
+    away = (ends.reshape(-1, 3).mean(axis=0) - ends[0, 0]) @ normal
+    origin = ends[0, 0] + beside * away / (beside @ normal)
     placed = RigidTransform.from_components(origin, axes)
     return placed, placed.inv().apply(ends.reshape(-1, 3))[:, :2]
 

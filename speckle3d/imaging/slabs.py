@@ -19,6 +19,8 @@ from speckle3d.imaging.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
 from speckle3d.imaging.whole_levels import splat_block_whole
 
+_SHARE = 0.8
+"""Of the memory; the rest is for the interpreter, its libraries, and files being read and packed."""
 _LEAST_PLANES = 8
 """Thinner slabs read frames too often, and work more on their neighbours' planes than on their own."""
 
@@ -91,10 +93,12 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
     around, most = 2 * _halo(boxes_of(voxel_grid, settings)), settings.max_memory_gb
     if working_gb(voxel_grid, settings, frames_gb) <= most:
         return n_k
-    plane_gb = _plane_gb(voxel_grid, settings)
-    planes = int((most - frames_gb) / plane_gb) - around
+    # Whoever takes the slabs still has the one before.
+    held = n_i * n_j * (np.dtype(settings.voxel_type).itemsize + 1) / 1e9
+    plane_gb = _plane_gb(voxel_grid, settings) + held
+    planes = int((_SHARE * most - frames_gb) / plane_gb) - around
     if planes < min(_LEAST_PLANES, n_k):
-        needed = (min(_LEAST_PLANES, n_k) + around) * plane_gb + frames_gb
+        needed = ((min(_LEAST_PLANES, n_k) + around) * plane_gb + frames_gb) / _SHARE
         raise InvalidInputError(
             f"volume: expected to work within {most:g} GB of memory, but a slab of {n_i} x {n_j} voxels "
             f"takes {needed:.3g} GB: take larger voxels, or allow more memory"
@@ -105,7 +109,7 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
 
 def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float) -> float:
     """Memory to make all of a volume at once, the volume and frames in hand included, GB."""
-    return voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + frames_gb
+    return (voxel_grid.shape[2] * _plane_gb(voxel_grid, settings) + frames_gb) / _SHARE
 
 
 def _plane_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> float:

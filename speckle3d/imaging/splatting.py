@@ -20,9 +20,12 @@ from speckle3d.imaging.settings import Rule, Splat
 Weights = npt.NDArray[Any] | Images
 """Weight of each frame, shape (n,), or of each sample: images of weights."""
 
-_DIRECT = ("uint8", "int16", "uint16", "float32")
-"""Types that kernels read as they are; others become float32."""
-_POSITION_BITS, _SHARE_BITS, _COUNT_BITS = 40, 10, 24
+_COUNTED, _SUMMED = ("uint8", "int16", "uint16", "float32"), ("uint8", "float32")
+"""Types that kernels read as they are, counting and otherwise; others become float32."""
+_POSITION_BITS, _SHARE_BITS = 40, 10
+"""As the kernels have them."""
+_MOST_COUNTED = 2**24
+"""Samples in a voxel for which sum and count fit into one word."""
 _BORDER = 2.0**-24
 """Voxels. A sample less than this below a border lies on it, and belongs to the voxel above."""
 _FARTHEST = 2.0**22
@@ -135,12 +138,14 @@ class Batch:
     turned: bool
 
 
-def batches(source: PosedImages, frames: IntArray, by_row: bool = False) -> Iterator[Batch]:
-    """Read frames a few at a time, in the type of the first, and in its order in memory or by rows."""
+def batches(
+    source: PosedImages, frames: IntArray, direct: tuple[str, ...], by_row: bool = False
+) -> Iterator[Batch]:
+    """Read frames a few at a time, in the type of the first if it is direct, and in its order or by rows."""
     if frames.size == 0:
         return
     first = source.read_as_stored(int(frames[0]))
-    kind = first.dtype if first.dtype.name in _DIRECT and first.dtype.isnative else np.dtype(np.float32)
+    kind = first.dtype if first.dtype.name in direct and first.dtype.isnative else np.dtype(np.float32)
     turned = by_row or (first.flags.f_contiguous and not first.flags.c_contiguous)
     shape = first.shape[::-1] if turned else first.shape
     size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES)
@@ -203,17 +208,15 @@ class Accumulator:
         Of the images, as kernels read them.
     splat : {"nearest", "linear"}
     rule : {"mean", "maximum", "latest", "weighted"}
-    most_samples : float
-        Upper bound of the samples in a voxel.
+    countable : bool
+        Whether whole levels can be summed in one word with their number: see `countable`.
     """
 
     def __init__(
-        self, shape: tuple[int, int, int], kind: np.dtype[Any], splat: Splat, rule: Rule, most_samples: float
+        self, shape: tuple[int, int, int], kind: np.dtype[Any], splat: Splat, rule: Rule, countable: bool
     ) -> None:
         self.shape, self.splat, self.rule = shape, splat, rule
-        self.counts = (
-            splat == "nearest" and rule == "mean" and kind.kind in "iu" and most_samples < 2**_COUNT_BITS
-        )
+        self.counts = countable and kind.kind in "iu"
         self._offset = 2**15 if kind.kind == "i" else 0
         self._table = self._empty_table()
         self._tags = np.zeros(shape if rule == "latest" else (1, 1, 1), np.uint32)
@@ -340,10 +343,10 @@ def splat_block(
     n_i, n_j, _ = voxel_grid.shape
     box = np.array([[0, n_i], [0, n_j], [first, stop]], dtype=np.int64)
     accumulator = None
-    for batch in batches(placed.source, placed.touching(box)):
+    packed = countable(placed, splat, rule)
+    for batch in batches(placed.source, placed.touching(box), _COUNTED if packed else _SUMMED):
         if accumulator is None:
-            most = _most_samples(placed)
-            accumulator = Accumulator((stop - first, n_j, n_i), batch.images.dtype, splat, rule, most)
+            accumulator = Accumulator((stop - first, n_j, n_i), batch.images.dtype, splat, rule, packed)
             spans = spans_of(placed.source, placed.mask, batch.turned)
         maps = fixed_maps(placed.index_from_sample[batch.frames], splat, first, batch.turned)
         weights = _weights_of(placed, batch) if rule == "weighted" else _ones(batch)
@@ -352,6 +355,11 @@ def splat_block(
         shape = (stop - first, n_j, n_i)
         return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
     return accumulator.finish()
+
+
+def countable(placed: Placed, splat: Splat, rule: Rule) -> bool:
+    """Whether samples are only counted and summed, and so few in a voxel that both fit in one word."""
+    return splat == "nearest" and rule == "mean" and _most_samples(placed) < _MOST_COUNTED
 
 
 def _most_samples(placed: Placed) -> float:

@@ -203,14 +203,22 @@ def largest_part(surface: Surface) -> Surface:
 
 
 def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
-    """The parts of a surface that have no border."""
-    if not len(open_edges):
-        return surface
+    """The parts of a surface that have no border, and of cavities those within the bounds of such a part."""
     part = surface.parts()
     is_open = np.zeros(len(surface.vertices_mm), dtype=bool)
     is_open[open_edges] = True
-    opened = np.unique(part[is_open[surface.triangles].any(axis=1)])
-    return surface.of_triangles(~np.isin(part, opened))
+    whole = np.ones(int(part.max()) + 1, dtype=bool)
+    whole[part[is_open[surface.triangles].any(axis=1)]] = False
+    middles = surface.vertices_mm[surface.triangles].mean(axis=1)
+    inner = np.einsum("ij,ij->i", surface.normals_mm2, middles - middles.mean(axis=0))
+    body = whole & (np.bincount(part, inner) > 0.0)
+    low, high = np.full((len(whole), 3), np.inf), np.full((len(whole), 3), -np.inf)
+    np.minimum.at(low, part, middles)
+    np.maximum.at(high, part, middles)
+    for cavity in np.flatnonzero(whole & ~body):
+        around = (low[body] <= low[cavity]).all(axis=1) & (high[body] >= high[cavity]).all(axis=1)
+        whole[cavity] = around.any()
+    return surface.of_triangles(whole[part])
 
 
 def _sigma(vertices: FloatArray, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:

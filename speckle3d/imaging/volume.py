@@ -36,7 +36,7 @@ class CompoundedVolume(Volume):
     Attributes
     ----------
     state : ndarray of uint8, shape (n_i, n_j, n_k)
-        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.imaging.holes`.
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
     """
 
     state: ByteArray = field(kw_only=True)

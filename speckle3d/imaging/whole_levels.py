@@ -8,6 +8,7 @@ differs from the mean of the samples, with ``Optimization="FULL"`` (the default)
 - Rows are taken from the top and columns from the left, and the mean is a whole grey level after each pixel:
   cut with "nearest", so that it falls, and rounded with "linear", so that late pixels do not move it.
 - Weights are kept in 16 bits, in steps of 1/256 pixel: from the 256th pixel on, each counts for 1/256.
+- Pixels come in the order of one thread; with more, PLUS's own volumes may differ between runs.
 - With "linear", a pixel that has a share in a voxel beyond the grid counts nowhere.
 
 Holes are filled as for the other rules, not along PLUS's sticks: compare without filling. On PLUS's own grid
@@ -26,6 +27,8 @@ from speckle3d.imaging.settings import Splat
 from speckle3d.imaging.splatting import Placed, batches, share_out, spans_of
 
 _POSITION_BITS, _PLACE_BITS = 40, 14
+_TYPES = ("uint8", "int16", "uint16", "float32", "float64")
+"""Of images: the first is worked on, and the others told apart in errors."""
 
 
 def splat_block_whole(
@@ -62,7 +65,7 @@ def splat_block_whole(
     room = np.array([[0, n_i], [0, n_j], [-first, n_k - first]], dtype=np.int64)
     planes = np.array([[0, n_i], [0, n_j], [first, stop]], dtype=np.int64)
     spans = spans_of(placed.source, placed.mask, turned=True)
-    for batch in batches(placed.source, placed.touching(planes), by_row=True):
+    for batch in batches(placed.source, placed.touching(planes), _TYPES, by_row=True):
         images, maps = batch.images, fixed_maps(placed.index_from_sample[batch.frames], splat, first)
         if images.dtype != np.uint8:
             raise InvalidInputError(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -78,17 +77,6 @@ class SequenceHeader:
         """Names of the tracked transforms, as ``ProbeToTracker``."""
         names = {name for frame in self.frames for name in frame if name.endswith("Transform")}
         return sorted(name.removesuffix("Transform") for name in names)
-
-
-@contextmanager
-def image_library(path: PathLike, done: str) -> Iterator[Any]:
-    """Yield SimpleITK; its failures in the block become a `FileError` of one line: "cannot be `done`"."""
-    import SimpleITK
-
-    try:
-        yield SimpleITK
-    except RuntimeError as error:
-        raise FileError(f"{path}: cannot be {done}: {str(error).strip().splitlines()[-1]}") from error
 
 
 def is_metaimage(start: bytes) -> bool:

@@ -12,6 +12,7 @@ References
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 import zlib
@@ -214,6 +215,7 @@ def _head(path: Path, is_packed: bool) -> bytes:
         if not is_packed:
             return stream.read(_HEADER_BYTES)
         try:
-            return zlib.decompressobj(47).decompress(stream.read(2**16), _HEADER_BYTES)
-        except zlib.error as error:
+            with gzip.open(stream) as unpacked:
+                return unpacked.read(_HEADER_BYTES)
+        except (zlib.error, EOFError, gzip.BadGzipFile) as error:
             raise FileError(f"{path}: expected a whole gzip file: {one_line(error)}") from error

@@ -40,7 +40,6 @@ def segment_fields(segments: Iterable[Segment], shape: Sequence[int]) -> dict[st
             "Extent": extent,
             "LabelValue": str(segment.value),
             "Layer": "0",
-            "Tags": "|",
         }
         fields |= {f"Segment{i}_{name}": value for name, value in told.items()}
     return fields

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,24 +76,39 @@ def read_surface(path: PathLike) -> Surface:
     suffix = require_suffix(path)
     with reading(path), open(path, "rb"):
         pass
-    import meshio
-
-    read: Callable[[Any], Any] = {".stl": meshio.stl.read, ".ply": meshio.ply.read, ".vtk": meshio.vtk.read}[
-        suffix
-    ]
     try:
-        mesh = read(Path(path))
+        mesh = _read(Path(path), suffix)
         triangles = [block.data for block in mesh.cells if block.type == "triangle"]
     # A damaged file shows in whatever meshio happens to stumble over.
     except Exception as error:
         raise FileError(f"{path}: cannot be read as {suffix[1:].upper()}: {one_line(error)}") from error
-    if not triangles:
-        raise InvalidInputError(f"{path}: expected triangles, got none")
+    if not triangles or any(each.dtype.kind not in "iu" for each in triangles):
+        raise InvalidInputError(f"{path}: expected triangles by numbers of their vertices, got none")
     promised = _promised_cells(Path(path))
     if promised is not None and promised != sum(len(block.data) for block in mesh.cells):
         raise FileError(f"{path}: cannot be read: it ends before its {promised} triangles do")
-    with naming(str(path)):
+    # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
+    with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
+
+
+def _read(path: Path, suffix: str) -> Any:
+    import meshio
+
+    if suffix == ".ply":
+        with _Lines(io.FileIO(path)) as stream:
+            return meshio.ply.read(stream)
+    return (meshio.stl if suffix == ".stl" else meshio.vtk).read(path)
+
+
+class _Lines(io.BufferedReader):
+    """A file whose end is an error to who asks for a line: meshio would ask for the next for ever."""
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        line = super().readline(-1 if size is None else size)
+        if not line:
+            raise EOFError("its header has no end")
+        return line
 
 
 def _promised_cells(path: Path) -> int | None:

@@ -96,7 +96,7 @@ class VolumeWriter:
         self._path = Path(path)
         suffix = require_suffix(self._path, segments is not None)
         with naming(str(path)):
-            kind, plain = np.dtype(dtype), dict[str, str]()
+            kind, plain = np.dtype(dtype).newbyteorder("="), dict[str, str]()
             if segments is not None:
                 require_segments(kind, tuple(segments))
                 plain = segment_fields(segments, shape)
@@ -147,7 +147,7 @@ class VolumeWriter:
         if planes.ndim != 3 or planes.shape[1:] != (n_j, n_i) or len(planes) > left:
             expected = f"at most {left} planes of {n_j} x {n_i} voxels (j x i)"
             raise MismatchError(f"{self._path}: expected {expected}, got shape {planes.shape}")
-        if planes.dtype != self._header.dtype:
+        if planes.dtype.newbyteorder("=") != self._header.dtype:
             raise MismatchError(
                 f"{self._path}: expected voxels of type {self._header.dtype}, got {planes.dtype}"
             )
@@ -212,7 +212,7 @@ class _Packed:
         return self._size + self._file.write(LAST_BLOCK + end)
 
     def _pack(self, stop: int) -> None:
-        # One thread packs ahead of this one for each core that there is.
+        # Blocks are written in order, while others pack those behind them.
         for packed in ahead(packed_run, self._pieces(stop), most=2 * cores()):
             self._size += self._file.write(packed)
         del self._waiting[:stop]

@@ -13,13 +13,11 @@ import numpy.typing as npt
 from numba import njit
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.kernels.slicing import bilinear
 
 EDGE_TOLERANCE = 1e-6
 """Fraction of a pixel or voxel by which a point may miss the border: rounding of poses."""
-
-EMPTY, MEASURED, FILLED = np.uint8(0), np.uint8(1), np.uint8(2)
-"""States of a point or voxel: it holds nothing, an image's level, one from between images."""
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath=False)
@@ -131,8 +129,8 @@ def blend_nearest(
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _neighbours(at, last):  # type: ignore[no-untyped-def]
-    """Lower neighbour along an axis, weight of the upper one, and whether that one is asked at all."""
+def _neighbours(at, last, stride):  # type: ignore[no-untyped-def]
+    """Where the lower neighbour along an axis is, weight of the upper one, and how far it is on, if asked."""
     at = min(max(at, 0.0), last)
     lower = int(at)
     share = at - lower
@@ -141,7 +139,7 @@ def _neighbours(at, last):  # type: ignore[no-untyped-def]
         share = 0.0
     elif share > 1.0 - EDGE_TOLERANCE:
         lower, share = lower + 1, 0.0
-    return lower, share, 1 if share > 0.0 else 0
+    return lower * stride, share, stride if share > 0.0 else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -186,12 +184,17 @@ def cut_voxels(
             out[line, point] = np.nan
         for point in range(stop, points):
             out[line, point] = np.nan
+        # Along a line that follows an axis of the grid, its neighbours across that axis stay the same.
+        still_v, still_w = abs(dv) * points < EDGE_TOLERANCE, abs(dw) * points < EDGE_TOLERANCE
+        j, b, step_j = _neighbours(v, last_j, strides[1])
+        k, c, step_k = _neighbours(w, last_k, strides[2])
         for point in range(first, stop):
-            i, a, step_i = _neighbours(u + du * point, last_i)
-            j, b, step_j = _neighbours(v + dv * point, last_j)
-            k, c, step_k = _neighbours(w + dw * point, last_k)
-            at = i * strides[0] + j * strides[1] + k * strides[2]
-            step_i, step_j, step_k = step_i * strides[0], step_j * strides[1], step_k * strides[2]
+            i, a, step_i = _neighbours(u + du * point, last_i, strides[0])
+            if not still_v:
+                j, b, step_j = _neighbours(v + dv * point, last_j, strides[1])
+            if not still_w:
+                k, c, step_k = _neighbours(w + dw * point, last_k, strides[2])
+            at = i + j + k
             if stated:
                 level = _counted(voxels, state, at, step_i, step_j, step_k, a, b, c)
             else:

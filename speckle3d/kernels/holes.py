@@ -7,11 +7,9 @@ import numpy.typing as npt
 from numba import njit
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 
 CountArray = npt.NDArray[np.uint32]
-
-# States of a voxel, as `speckle3d.imaging.holes` has them.
-_EMPTY, _MEASURED, _FILLED = 0, 1, 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -26,7 +24,7 @@ def fill_planes(voxels: Float32Array, state: ByteArray, boxes: IntArray, first: 
     ----------
     voxels : ndarray, shape (n_k, n_j, n_i), changed in place
     state : ndarray, shape (n_k, n_j, n_i), changed in place
-        0 empty, 1 measured, 2 filled; other planes may be changed from empty to filled meanwhile.
+        `EMPTY`, `MEASURED` or `FILLED`; other planes may be changed from empty to filled meanwhile.
     boxes : ndarray, shape (n, 3)
         Half edges (k, j, i) of the boxes to try in turn, each at least as large as the one before.
     first, stop : int
@@ -41,7 +39,7 @@ def fill_planes(voxels: Float32Array, state: ByteArray, boxes: IntArray, first: 
         for j in range(n_j):
             holes[j] = 0
             for i in range(n_i):
-                holes[j] += state[k, j, i] == _EMPTY
+                holes[j] += state[k, j, i] == EMPTY
             left += holes[j]
         if left == 0:
             continue
@@ -72,7 +70,7 @@ def _add_plane(voxels: Float32Array, state: ByteArray, total: FloatArray, count:
     """Add the measured voxels of a plane to the sum and the number so far."""
     for j in range(voxels.shape[0]):
         for i in range(voxels.shape[1]):
-            measured = state[j, i] == _MEASURED
+            measured = state[j, i] == MEASURED
             total[j, i] += voxels[j, i] if measured else np.float32(0.0)
             count[j, i] += np.uint32(measured)
 
@@ -96,7 +94,7 @@ def _fill_row(
     n_i = voxels.shape[0]
     done = 0
     for i in range(n_i):
-        if state[i] != _EMPTY:
+        if state[i] != EMPTY:
             continue
         total, count = 0.0, 0
         for c in range(max(i - half, 0), min(i + half + 1, n_i)):
@@ -104,6 +102,6 @@ def _fill_row(
             count += row_count[c]
         if count > 0:
             voxels[i] = total / count
-            state[i] = _FILLED
+            state[i] = FILLED
             done += 1
     return done

@@ -158,7 +158,8 @@ def add_nearest(
                 total, weight = 0.0, 0.0
                 inside = True
                 while inside:
-                    level, share = float(images[n, line, sample]), float(weights[n, line, sample])
+                    level = np.float64(images[n, line, sample])
+                    share = np.float64(weights[n, line, sample])
                     if level == level and share > 0.0:
                         total += share * level
                         weight += share
@@ -253,7 +254,8 @@ def add_linear(
                 w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = 0.0
                 inside = True
                 while inside:
-                    level, share = float(images[n, line, sample]), float(weights[n, line, sample])
+                    level = np.float64(images[n, line, sample])
+                    share = np.float64(weights[n, line, sample])
                     if level == level and share > 0.0:
                         fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
                         gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz

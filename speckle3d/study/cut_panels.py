@@ -20,7 +20,7 @@ LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN, NAME_IN = 0.75, 0.95, 0.45, 0.5, 0.45
 _ACROSS_IN, _DOWN_IN = 0.2, 0.62
 """Between panels side by side, and one above the other: for the lower one's name."""
 
-_LEAST_IN, _MOST_IN, _NARROWEST_IN = 0.4, 7.0, 4.5
+_LEAST_IN, _MOST_IN, _NARROWEST_IN = 0.4, 7.0, 6.0
 """Sides of a panel, and width of a figure."""
 
 _TICKS_PER_IN, _FEWEST_TICKS, _MOST_TICKS = 2.0, 2, 8

@@ -6,13 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.curved import CurvedSheet
 from speckle3d.imaging.reslice import reslice_at, reslice_volume
@@ -72,13 +74,15 @@ class CutPicture:
     place : str
         Where the cut is.
     unit : str
-        Of the images: "dB" or "level".
+        Of the images: "dB" or "level", and of what.
     levels : tuple of float, optional
         Black and white.
     reference : str, optional
         Mode that the others are compared with.
     name : str
         Of the sweep or the volume.
+    numbers : ndarray of int, shape (n,), optional
+        Of the frames; by default from 0.
     """
 
     cuts: Mapping[str, DrawnCut]
@@ -88,6 +92,7 @@ class CutPicture:
     levels: tuple[float, float] | None = None
     reference: str | None = None
     name: str = ""
+    numbers: IntArray | None = None
 
 
 @dataclass(frozen=True)
@@ -128,49 +133,61 @@ def open_modes(
     InvalidInputError, InsufficientDataError
         If there is no such mode.
     """
-    known = [mode for mode in modes if mode not in REFERENCES]
-    if kind_of(path) != FORMAT:
-        known = list(modes)
-    first = open_posed(path, known[0] if known else None, sweep_file)
+    is_reconstruction = kind_of(path) == FORMAT
+    own = [mode for mode in modes if mode not in REFERENCES or not is_reconstruction]
+    first = open_posed(path, own[0] if own else None, sweep_file)
     asked = list(dict.fromkeys(modes)) or [first.mode]
-    own = find_reference(first.sweep) if len(asked) > 1 and reference is None else None
-    if reference is None:
-        reference = own.name if own is not None and own.covered.all() else asked[0]
-    if reference not in asked:
-        asked.append(reference)
-    covered = np.zeros(len(first.sweep), dtype=bool)
-    covered[first.frames] = True
-    every: dict[str, tuple[RigidTransform, IntArray]] = {}
-    for mode in asked:
-        if mode == first.mode:
-            every[mode] = first.world_from_image, first.frames
-        elif first.reconstruction is not None and mode not in REFERENCES:
-            every[mode] = poses_of(first.reconstruction, mode), first.frames
-        else:
-            itself = posed_by_itself(first.sweep, mode)
-            every[mode] = itself.world_from_image, itself.frames
+    reference = reference or _known_reference(first.sweep, asked)
+    every = {mode: _posed(first, mode) for mode in dict.fromkeys([*asked, reference])}
     shared = reduce(np.intersect1d, [frames for _, frames in every.values()])
+    if not shared.size:
+        raise InsufficientDataError(
+            f"{path}: expected a frame that has a pose in {' and '.join(every)}, got none"
+        )
     poses = {mode: each[np.isin(frames, shared)] for mode, (each, frames) in every.items()}
     posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
     return OpenedModes(posed, poses, reference)
+
+
+def _known_reference(sweep: Sweep, asked: Sequence[str]) -> str:
+    """What several modes are compared with, if nobody says."""
+    known = find_reference(sweep) if len(asked) > 1 else None
+    return known.name if known is not None and known.covered.all() else asked[0]
+
+
+def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
+    """Poses of one mode, and the frames that have them."""
+    if mode == first.mode:
+        return first.world_from_image, first.frames
+    if first.reconstruction is not None and mode not in REFERENCES:
+        return poses_of(first.reconstruction, mode), first.frames
+    itself = posed_by_itself(first.sweep, mode)
+    return itself.world_from_image, itself.frames
 
 
 def cut_posed(
     opened: OpenedModes,
     place: Place,
     dynamic_range_db: float = 60.0,
-    voxels: Volume | None = None,
+    voxels: tuple[Volume, ByteArray | None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CutPicture:
-    """Cut a sweep at the poses of every mode, from its frames or from voxels made of it."""
+    """Cut a sweep at the poses of every mode, from its frames or from voxels made of it and their states.
+
+    Raises
+    ------
+    InvalidInputError
+        If the place is none, or shows nothing; says where the sweep is.
+    """
     images, grid = opened.posed.images(dynamic_range_db, progress)
-    placed = place.cuts(opened.poses, grid, opened.reference)
+    numbers = opened.posed.frames
+    placed = place.counted_in(numbers).cuts(opened.poses, grid, opened.reference)
     if voxels is None:
         pairs = [(opened.poses[mode], cut) for mode, cut in placed.items()]
         levels = reslice_at(images, grid, pairs, place.reach_mm)
         found = [((each / 255 - 1) * dynamic_range_db).astype(np.float32) for each in levels]
     else:
-        found = [reslice_volume(voxels, cut) for cut in placed.values()]
+        found = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
     there = opened.poses[opened.reference]
     if not any(np.isfinite(each).any() for each in found):
         raise InvalidInputError(
@@ -183,27 +200,37 @@ def cut_posed(
     }
     shown = placed[opened.reference]
     where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
-    unit, range_db = ("dB", (-dynamic_range_db, 0.0)) if voxels is None else ("level", None)
+    unit = "dB" if voxels is None else _unit_of(voxels[0])
+    range_db = (-dynamic_range_db, 0.0) if voxels is None else None
     reference = opened.reference if len(cuts) > 1 else None
-    return CutPicture(
-        cuts, place.axes(shown, there), where, unit, range_db, reference, opened.posed.sweep.name
-    )
+    axes, name = place.axes(shown, there), opened.posed.sweep.name
+    return CutPicture(cuts, axes, where, unit, range_db, reference, name, numbers)
 
 
-def cut_voxels(volume: Volume, place: Place, name: str = "") -> CutPicture:
-    """Cut a volume; by default across the middle of its third axis."""
+def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
+    """Cut a volume; by default across the middle of its third axis.
+
+    Raises
+    ------
+    InvalidInputError
+        If the place is none, or misses the volume.
+    """
     cut = place.cut_of_box(volume)
-    image = reslice_volume(volume, cut)
-    names = (
-        ("i", "j")
-        if place == Place(pixel_mm=place.pixel_mm, reach_mm=place.reach_mm)
-        else ("in the cut",) * 2
-    )
-    return CutPicture({"volume": DrawnCut(image, cut)}, names, place.words(), "level", name=name)
+    drawn = DrawnCut(reslice_volume(volume, cut, state), cut)
+    names = ("i", "j") if place.is_along_sweep else ("in the cut", "in the cut")
+    return CutPicture({"volume": drawn}, names, place.words(), _unit_of(volume), name=name)
+
+
+def _unit_of(volume: Volume) -> str:
+    """What a volume's levels are, as far as its file says."""
+    told = volume.fields.get("levels", "")
+    return f"level, {told}" if told else "level"
 
 
 def cut_as_volume(picture: CutPicture) -> Volume:
-    """The only cut as a volume of one plane at its place: levels 1 to 255, and 0 where nothing was seen.
+    """The only cut as a volume of one plane at its place.
+
+    Of frames, levels are 1 to 255, and 0 where nothing was seen; of voxels they stay as they are, NaN there.
 
     Raises
     ------
@@ -215,12 +242,13 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     ((mode, drawn),) = picture.cuts.items()
     if isinstance(drawn.cut, CurvedSheet):
         raise InvalidInputError("expected a picture (.png) of a curved cut, which lies in no one plane")
-    low, high = picture.levels or (0.0, 255.0)
-    # From 1 up, so that 0 means nothing was seen.
-    level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
-    voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
     fields = {"cut": picture.place, "of": picture.name, "mode": mode}
-    if picture.unit == "dB":
+    voxels: npt.NDArray[Any] = drawn.image
+    if picture.levels is not None:
+        low, high = picture.levels
+        # From 1 up, so that 0 means nothing was seen.
+        level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
+        voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
         fields["levels"] = f"log-compressed, {high - low:g} dB from 1 to 255; 0 where nothing was seen"
     step = drawn.cut.pixel_mm
     return Volume(voxels[None].T, (step, step, step), drawn.cut.world_from_plane, fields)

@@ -178,7 +178,7 @@ def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
 
 def name_figure(figure: Figure, title: str) -> None:
     """Put a name over a figure as it is: a dollar in the name of a file begins no formula."""
-    figure.suptitle(printable(title), parse_math=False)
+    figure.suptitle(printable(title, kept="\n"), parse_math=False)
 
 
 def figure_panels(panels: Sequence[Panel], columns: int, size_in: tuple[float, float]) -> Figure:

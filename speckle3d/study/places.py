@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
@@ -58,7 +58,8 @@ class Place:
     depth_mm : float, optional
         Along the sweep at one depth.
     frame : int, optional
-        In a frame, turned out of it by `angle_deg` about its depth line: 90 is along the sweep.
+        In a frame, counted among those with a pose, turned out of it by `angle_deg` about its depth line: 90
+        is along the sweep.
     angle_deg : float
     points_mm : ndarray, shape (3, 3), optional
         Through three points of the world.
@@ -101,10 +102,26 @@ class Place:
             return dict(planes_from_first_frame(poses, line, self.pixel_mm))
         there = poses[reference]
         frame = 0 if self.frame is None else self.frame
-        if not 0 <= frame < len(there):
-            raise InvalidInputError(f"frame: expected 0 to {len(there) - 1}, got {frame}")
         cut = self._in_world(grid, there)
         return {mode: _moved(cut, each[frame] * there[frame].inv()) for mode, each in poses.items()}
+
+    def counted_in(self, numbers: IntArray) -> Place:
+        """The same place with its frame counted among those that have a pose.
+
+        Raises
+        ------
+        InvalidInputError
+            If the frame has none.
+        """
+        if self.frame is None:
+            return self
+        at = np.flatnonzero(numbers == self.frame)
+        if not at.size:
+            held = f"{numbers[0]} to {numbers[-1]}" + (
+                ", with gaps" if np.ptp(numbers) >= len(numbers) else ""
+            )
+            raise InvalidInputError(f"--frame: expected one with a pose, {held}, got {self.frame}")
+        return replace(self, frame=int(at[0]))
 
     def cut_of_box(self, volume: Volume) -> AnyCut:
         """Place the cut in a volume, as large as it shows of that; by default the middle of i and j.
@@ -134,13 +151,14 @@ class Place:
             return "along the curve", _name(cut.down, world_from_image)
         if self.depth_mm is not None:
             return "along the sweep", "lateral"
-        if self._is_along_sweep:
+        if self.is_along_sweep:
             return "along the sweep", "depth"
         right, down = cut.world_from_plane.rotation.as_matrix().T[:2]
         return _name(right, world_from_image), _name(down, world_from_image)
 
     @property
-    def _is_along_sweep(self) -> bool:
+    def is_along_sweep(self) -> bool:
+        """Whether nothing else is asked for than a lateral position or a depth."""
         placed = (self.frame, self.points_mm, self.origin_mm, self.curve_mm)
         return all(each is None for each in placed)
 
@@ -165,7 +183,7 @@ class Place:
     def _line(self, grid: ImageGrid) -> FloatArray | None:
         if self.depth_mm is not None:
             return depth_line(grid, self.depth_mm)
-        if not self._is_along_sweep:
+        if not self.is_along_sweep:
             return None
         return lateral_line(grid, grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm)
 

@@ -1,4 +1,4 @@
-"""Joint errors of the poses of a reconstruction's modes, from what its file claims."""
+"""Joint errors of the poses of a reconstruction's modes, from what its file claims; measurements by them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,49 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
+from speckle3d.imaging.belonging import require_inside
+from speckle3d.imaging.measure import Measurement, measured
 from speckle3d.motion.joint_errors import joint_errors, turn_factors
 from speckle3d.scoring.trajectories import poses_of
+
+PICKED = 0.5
+"""Standard deviation of a picked point's place on each axis, over the distance of the image's vectors."""
+
+
+def measure(
+    reconstruction: Reconstruction, points_mm: FloatArray, mode: str = "image", pick_mm: float | None = None
+) -> list[Measurement]:
+    """Say how long it is between points of a reconstructed sweep, and how sure that is.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Its pairs are not needed.
+    points_mm : ndarray, shape (k, 3)
+        In the world of the mode, in order.
+    mode : str
+        At whose poses the points were picked.
+    pick_mm : float, optional
+        Standard deviation of each point's place on each axis by picking; by default half the distance of the
+        image's vectors.
+
+    Returns
+    -------
+    list of Measurement
+        Distances from each point to the next; of three points and more also the length of the line through
+        all, and the angles between.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are fewer than two points, one lies outside the sweep, or there is no such mode.
+    InsufficientDataError
+        As `errors_of`.
+    """
+    points = np.asarray(points_mm, dtype=float).reshape(-1, 3)
+    errors, grid = posed_errors_of(reconstruction, mode), reconstruction.grid
+    near = require_inside(points, grid, errors.world_from_image)
+    return measured(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)
 
 
 def posed_errors_of(reconstruction: Reconstruction, mode: str = "image") -> PosedErrors:
@@ -24,10 +65,10 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
     """Joint errors of the poses of one mode.
 
     `image`: what the file holds. `crossed`, `inertial`, `fused`: their own claims; the claimed error of the
-    length stretches the whole sweep, and the rest has grown from frame to frame. `orientation`: the images'
-    error of length, with the angles' errors of the sensor, which bend the path. `pose` and `image+subset`
-    claim nothing and are taken to be no better than the images; in `pose` the sweep's direction is further as
-    uncertain as the image's place on the tracker is.
+    length stretches the whole sweep, and what the covariances have beyond it has grown from frame to frame.
+    `orientation`: the images' error of length, with the angles' errors of the sensor, which bend the path.
+    `pose` and `image+subset` claim nothing and are taken to be no better than the images; in `pose` the
+    sweep's direction is further as uncertain as the image's place on the tracker is.
 
     Parameters
     ----------

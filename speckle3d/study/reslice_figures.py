@@ -22,6 +22,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.printable import printable
 from speckle3d.study.cut_geometry import save_cuts
 from speckle3d.study.cut_panels import add_axes_in, laid_out, name_axes
 from speckle3d.study.cuts import CutPicture, DrawnCut
@@ -75,17 +76,16 @@ def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, list[Axes]]]:
     picture = _reference_last(picture)
     cuts, reference = picture.cuts, picture.reference
     levels = picture.levels or _levels(cuts, picture.unit)
-    largest = [
-        max(side) for side in zip(*((d.cut.width_mm, d.cut.height_mm) for d in cuts.values()), strict=True)
-    ]
-    layout = laid_out(len(cuts), (largest[0], largest[1]), reference is not None)
+    width, height = np.max([(drawn.cut.width_mm, drawn.cut.height_mm) for drawn in cuts.values()], axis=0)
+    layout = laid_out(len(cuts), (float(width), float(height)), reference is not None)
     rows = _sweep_rows(picture)
     figure = layout.figure(0.8 + _ROW_IN * len(rows) if rows else 0.0)
     panels = {mode: [layout.add_panel(figure, i, False)] for i, mode in enumerate(cuts)}
     for mode, drawn in cuts.items():
-        _draw_cut(
-            panels[mode][0], drawn, (label_of(mode), colour_of(mode, list(cuts))), levels, layout.panel_in[0]
-        )
+        # A volume has no mode, and none of the colours of modes.
+        colour = colour_of(mode, list(cuts)) if len(drawn.frames) else "#404040"
+        _draw_cut(panels[mode][0], drawn, (label_of(mode), colour), levels, layout.panel_in[0])
+        _number_frames(panels[mode][0], drawn, picture.numbers, layout.panel_in[0])
     if reference is not None:
         contrast = _contrast(cuts[reference], levels)
         for i, mode in enumerate(cuts):
@@ -98,8 +98,10 @@ def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, list[Axes]]]:
     name_axes([each for row in panels.values() for each in row], picture.axes)
     _draw_colours(figure, panels[next(iter(cuts))][0], picture.unit)
     if rows:
-        _draw_rows(figure, rows, reference)
-    name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
+        _draw_rows(figure, rows, reference, picture.numbers)
+    # The suptitle's letters are a fifth larger than those that `wrapped` counts on.
+    title = printable(": ".join(filter(None, [picture.name, picture.place])))
+    name_figure(figure, wrapped(title, figure.get_figwidth() / 1.2))
     return figure, panels
 
 
@@ -112,7 +114,7 @@ def figure_outlines(outlines_mm: Mapping[str, FloatArray], title: str = "") -> F
         By mode, in one world, that of the first frame: from `frame_outlines`.
     """
     figure = new_figure(7.0, 6.5, None)
-    axes: Any = figure.add_axes((0.02, 0.05, 0.86, 0.85), projection="3d")
+    axes: Any = figure.add_axes((0.08, 0.1, 0.8, 0.8), projection="3d")
     for mode, outlines in outlines_mm.items():
         # Depth down: the image's y is the picture's -z.
         lines = [each[:, [0, 2, 1]] for each in outlines[_shown_frames(len(outlines), 30)]]
@@ -138,20 +140,30 @@ def _reference_last(picture: CutPicture) -> CutPicture:
 def _draw_cut(
     axes: Axes, drawn: DrawnCut, name: tuple[str, str], levels: tuple[float, float], width_in: float
 ) -> None:
-    """Draw a cut under its name and colour, with lines of some frames and their numbers."""
+    """Draw a cut under its name and colour, with lines of some frames."""
     label, colour = name
     show_grey(axes, drawn.image, drawn.cut.extent_mm, levels)
     title = wrapped(label, width_in)
     axes.set_title(title, fontsize="medium", color=colour, y=1.0, pad=12, parse_math=False)
-    shown = _shown_frames(len(drawn.frames), max(2, int(width_in / _FRAME_IN)))
+    shown = _shown_frames(len(drawn.frames), _frames_in(width_in))
     # A black line in a grey picture would be taken for tissue.
     _draw_frames(axes, drawn.frames[shown], "#FFD700" if colour == "#000000" else colour)
-    for number, line in zip(shown, drawn.frames[shown], strict=True):
+    _draw_scale(axes, drawn.cut.extent_mm, width_in)
+
+
+def _number_frames(axes: Axes, drawn: DrawnCut, numbers: IntArray | None, width_in: float) -> None:
+    """Write the numbers of the frames that are drawn above their lines."""
+    left, right, _, top = drawn.cut.extent_mm
+    for index in _shown_frames(len(drawn.frames), _frames_in(width_in)):
+        line = drawn.frames[index]
         if np.isfinite(line).any():
             x = line[np.nanargmin(line[:, 1]), 0]
-            if drawn.cut.extent_mm[0] <= x <= drawn.cut.extent_mm[1]:
-                _write(axes, str(number), (x, drawn.cut.extent_mm[3]), 1, "0.4")
-    _draw_scale(axes, drawn.cut.extent_mm, width_in)
+            if abs(2 * x - left - right) <= 1.04 * (right - left):
+                _write(axes, str(index if numbers is None else numbers[index]), (x, top), 1, "0.4")
+
+
+def _frames_in(width_in: float) -> int:
+    return max(2, int(width_in / _FRAME_IN))
 
 
 def _draw_overlay(
@@ -244,7 +256,9 @@ def _sweep_rows(picture: CutPicture) -> dict[str, FloatArray]:
     return {mode: drawn.centres for mode, drawn in picture.cuts.items()}
 
 
-def _draw_rows(figure: Figure, rows: Mapping[str, FloatArray], reference: str | None) -> None:
+def _draw_rows(
+    figure: Figure, rows: Mapping[str, FloatArray], reference: str | None, numbers: IntArray | None
+) -> None:
     """Draw every mode's frames on a line of its own; dotted is where the reference has them."""
     axes = add_axes_in(figure, 1.7, 0.5, figure.get_figwidth() - 3.4, _ROW_IN * len(rows))
     there = rows[reference or next(iter(rows))]
@@ -264,8 +278,8 @@ def _draw_rows(figure: Figure, rows: Mapping[str, FloatArray], reference: str | 
         )
         axes.annotate(f"{high - low:.2f} mm{percent}", (1.01, y), color=colour, **look)
         axes.annotate(label_of(mode), (-0.01, y), color=colour, ha="right", parse_math=False, **look)
-    for number in shown:
-        _write(axes, str(number), (there[number], -0.55), 1, "0.4")
+    for index in shown:
+        _write(axes, str(index if numbers is None else numbers[index]), (there[index], -0.55), 1, "0.4")
     axes.set(ylim=(len(rows) - 0.5, -0.5), yticks=[])
     axes.spines[["left", "right", "top"]].set_visible(False)
     axes.tick_params(labelsize="small")

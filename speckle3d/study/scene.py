@@ -16,10 +16,18 @@ from speckle3d.imaging.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.polylines import write_polylines
 from speckle3d.io.transforms import write_transform
+from speckle3d.scoring.references import REFERENCES
 from speckle3d.study.mrml import COLOURED, Scene
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.sequences import PosedSequence
-from speckle3d.study.voxels import GridRequest, Progress, VolumeReport, VolumeRequest, write_voxels
+from speckle3d.study.voxels import (
+    BEST_FIRST,
+    GridRequest,
+    Progress,
+    VolumeReport,
+    VolumeRequest,
+    write_voxels,
+)
 
 SCENE = "scene.mrml"
 
@@ -112,13 +120,13 @@ def write_scene(
     target = Path(folder)
     names = [name for mode in modes for name in _Files.of(mode).written(asked)]
     with FileSet(SCENE, tuple(names), _left(target, names)).replaced(target) as part:
-        scene, reports = Scene(), []
+        scene, reports, volumes = Scene(), list[VolumeReport](), list[str]()
         for i, each in enumerate(posed):
             shown = _part_of(progress, i, len(posed))
             report = _write_mode(part, each, asked, shown)
             reports.append(replace(report, path=target / report.path.name))
-            _add_mode(scene, each, asked, i)
-        scene.show("vtkMRMLScalarVolumeNode1")
+            volumes.append(_add_mode(scene, each, asked, i))
+        scene.show(volumes[0])
         (part / SCENE).write_text(scene.text(), encoding="utf-8")
     return reports
 
@@ -143,9 +151,8 @@ def _left(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     """Files of a scene in the folder that the new one does not have."""
     if not (folder / SCENE).is_file():
         return ()
-    mode = "*"
-    patterns = vars(_Files.of(mode)).values()
-    return tuple(sorted({each.name for pattern in patterns for each in folder.glob(pattern)} - {*names}))
+    known = {name for mode in (*BEST_FIRST, *REFERENCES) for name in vars(_Files.of(mode)).values()}
+    return tuple(sorted(name for name in known - {*names} if (folder / name).exists()))
 
 
 def _part_of(progress: Progress | None, i: int, count: int) -> Progress | None:
@@ -174,7 +181,8 @@ def _write_mode(
     return report
 
 
-def _add_mode(scene: Scene, posed: PosedSweep, request: SceneRequest, i: int) -> None:
+def _add_mode(scene: Scene, posed: PosedSweep, request: SceneRequest, i: int) -> str:
+    """Add a mode's nodes; returns the identity of its volume."""
     files, name = _Files.of(posed.mode), f"{posed.sweep.name}, {posed.mode}"
     window = (0.0, 255.0) if request.settings.voxel_type == "uint8" else None
     volume = scene.add_volume(name, files.volume, window)
@@ -187,3 +195,4 @@ def _add_mode(scene: Scene, posed: PosedSweep, request: SceneRequest, i: int) ->
     if request.with_images:
         rate = len(posed.frames) / max(float(np.ptp(posed.sweep.frame_time_s[posed.frames])), 1e-3)
         scene.add_moving_images(f"{name}: frames", files.images, files.poses, rate)
+    return volume

@@ -15,12 +15,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.labels import STATE_SEGMENTS, Segment
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
-from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.settings import CompoundingSettings
@@ -228,7 +227,7 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
                 made.append(deviation.planes(slab.first, stop, slab.state))
             for writer, planes in zip(writers, made, strict=True):
                 writer.append(planes)
-            counts += np.bincount(slab.state.ravel(), minlength=3)
+            counts += [np.count_nonzero(slab.state == state) for state in range(3)]
             if progress is not None:
                 progress(stop, grid.shape[2])
         if counts[MEASURED] == 0:

@@ -96,6 +96,38 @@ def test_a_volume_is_cut_at_its_place_and_in_the_terms_of_its_sweep(run, bench, 
     assert code == 0, err
 
 
+def test_empty_voxels_are_not_shown_where_their_states_are_given(run, refused, bench, tmp_path):
+    placed = load_sweep(bench / "sweep.h5").truth[0]
+    states = np.ones((30, 40, 3), np.uint8)
+    states[:15] = 0
+    volume = Volume(np.full(states.shape, 7, np.uint8), (0.5, 0.5, 0.5), placed)
+    write_volume(tmp_path / "v.nrrd", volume)
+    write_volume(tmp_path / "s.nrrd", Volume(states, volume.spacing_mm, placed))
+    out = tmp_path / "cut.nrrd"
+    code, _, err = run(
+        "reslice", tmp_path / "v.nrrd", "-o", out, "--state", tmp_path / "s.nrrd", "--pixel-mm", 0.5
+    )
+    assert code == 0, err
+    cut = read_volume(out).voxels[:, :, 0]
+    assert np.isnan(cut[:15]).all()
+    np.testing.assert_allclose(cut[15:], 7.0)
+    write_volume(tmp_path / "other.nrrd", Volume(states[:20], volume.spacing_mm, placed))
+    told = refused("reslice", tmp_path / "v.nrrd", "-o", out, "--state", tmp_path / "other.nrrd")
+    assert "other.nrrd: expected states" in told
+
+
+def test_the_picture_of_a_reconstruction_says_where_its_cuts_lie(reconstructed, bench):
+    cuts = {each.mode: each for each in read_cuts(reconstructed / "reslice.png")}
+    assert list(cuts) == ["image", "orientation", "pose", "truth"]
+    # All begin with the first frame's line down the middle vector, each in its own world.
+    truth = load_sweep(bench / "sweep.h5").truth
+    first = truth[0].inv().apply(cuts["truth"].cut.world_from_mm([0.0, 0.0], [5.0, 15.0]))
+    # Of the depth a part in a thousand, as the plane may be tilted in the frame by two degrees.
+    np.testing.assert_allclose(first[:, 1:], [[5.0, 0.0], [15.0, 0.0]], rtol=1e-3, atol=1e-9)
+    found = cuts["image"].cut.world_from_mm(0.0, 5.0)
+    np.testing.assert_allclose(found[1:], [5.0, 0.0], rtol=1e-3, atol=1e-9)
+
+
 def test_outlines_are_a_picture(run, reconstructed, tmp_path):
     out = tmp_path / "o.png"
     modes = ("--mode", "image", "--mode", "pose", "--outlines")
@@ -114,7 +146,7 @@ def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp
     assert "not on one line" in told("--points", "0,0,0 1,1,1 2,2,2")
     assert "--points" in told("--points", "0,0,0 1,x,0 2,2,2")
     assert "three" in told("--points", "0,0,0 1,1,0")
-    assert "0 to 23" in told("--frame", "24")
+    assert "0 to 23, got 24" in told("--frame", "24")
     assert "--frame" in told("--angle-deg", "30")
     assert "--right" in told("--origin", "0", "0", "0")
     assert "--curve" in told("--on", out)

@@ -16,11 +16,13 @@ from fuzz import mutations
 
 from speckle3d.core.curves import TiltResponse
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
-from speckle3d.core.reconstruction import FramePairs, Provenance, Trust
+from speckle3d.core.reconstruction import FramePairs, ModeErrors, Provenance, SharedErrors, Trust
+from speckle3d.core.surface import Surface
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
 from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.surfaces import write_surface
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.tum import write_tum
 from speckle3d.io.volumes import write_volume
@@ -36,6 +38,7 @@ XML = """<PlusConfiguration version="2.1"><CoordinateDefinitions>
 </Pattern></Geometry></PhantomDefinition></PlusConfiguration>
 """
 POINTS = "# by hand\nframe,column_px,row_px,wire\n0,605.7,191.9,G1\n0,436.2,181.1,1\n3,5,6.5,0\n"
+PICKS = "name,x_mm,y_mm,z_mm\n# the vessel\na,605.7,191.9,-3\nb,1,2.5,1e1  # its end\n"
 LOGS = (
     "time_s,counter,acc_x,acc_y,acc_z\n0,1,0,0,9.8\n0.1,2,0,0,9.8\n0.2,3,0,0.1,9.8\n",
     "PacketCounter\tAcc_X\tAcc_Y\tAcc_Z\tMat[1][1]\n00472\t\t0.1\t4.8\t-8.5\n00473\t1\t2\t3\t4\n",
@@ -106,7 +109,9 @@ def reconstructions(folder, n=8, patches=6):
         patch_centre_mm=np.arange(2.0 * patches).reshape(patches, 2),
     )
     poses = {"image": sweep_examples.poses(n), "pose": sweep_examples.poses(n, 1)}
-    trust = Trust(np.tile(np.eye(6), (n, 1, 1)), np.zeros(n, dtype=np.int64))
+    each = np.tile(np.eye(6), (n, 1, 1))
+    shared, modes = SharedErrors(0.02, 0.07, np.array([1e-3, 2e-3])), {"fused": ModeErrors(each, 0.004)}
+    trust = Trust(each, np.zeros(n, dtype=np.int64), shared, modes)
     with ReconstructionWriter(folder / "r.h5", 0.04 * np.arange(n), sweep_examples.rf_sweep().grid) as writer:
         writer.append_pairs(pairs)
         writer.finish(poses, Provenance("sweep.h5", "ab" * 32, "0.1.0"), "[matching]\n", trust)
@@ -188,6 +193,14 @@ def volumes(folder):
     for path in (*of_volume, *of_labels):
         write_volume(path, labels if path in of_labels else volume, compress=path.name.startswith("v"))
     return [*of_volume, *of_labels]
+
+
+def surfaces(folder):
+    corners = np.random.default_rng(0).normal(size=(12, 3))
+    triangles = np.arange(12).reshape(4, 3)
+    for suffix in (".stl", ".ply", ".vtk"):
+        write_surface(folder / f"s{suffix}", Surface(corners, triangles))
+    return [folder / f"s{suffix}" for suffix in (".stl", ".ply", ".vtk")]
 
 
 def streams(folder):
@@ -358,9 +371,11 @@ def kinds():
     from speckle3d.config import load_config
     from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.curves import read_curves
+    from speckle3d.io.picks import read_places
     from speckle3d.io.plus_config import read_wire_phantom
     from speckle3d.io.points import read_points
     from speckle3d.io.reconstructions import read_reconstruction
+    from speckle3d.io.surfaces import read_surface
     from speckle3d.io.tum import read_tum
     from speckle3d.io.volumes import read_volume
     from xsens.logs.parts import Hints
@@ -387,6 +402,8 @@ def kinds():
         "metaimage": Kind(metaimages, read_image, text),
         "nrrd": Kind(nrrds, read_image, text),
         "volume": Kind(volumes, read_volume, text),
+        "surface": Kind(surfaces, read_surface, raw),
+        "picks": Kind(texts(".csv", PICKS), read_places, text),
         "stream": Kind(streams, read_stream, raw, seconds=5.0),
         "track": Kind(small_sweep, run_track, hdf5, seconds=60.0, beside_bytes=512 * 2**20),
     }

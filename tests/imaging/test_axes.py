@@ -12,7 +12,7 @@ from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.grid import grid_around
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), kind=KINDS)
 def test_the_principal_box_is_the_smallest(seed, kind):
     passes, frames, turned = kind
@@ -57,7 +57,7 @@ def test_a_translated_sweep_keeps_its_own_axes():
         np.testing.assert_allclose((axes.inv() * found).as_rotvec(), 0.0, atol=1e-12)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_mean_axes_of_a_probe_that_was_turned_between_passes(seed):
     poses, axes = sweep(np.random.default_rng(seed), 60, passes=2, turned=True)

@@ -8,13 +8,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.backward import backward_slabs
 from speckle3d.imaging.grid import VoxelGrid, grid_around
-from speckle3d.imaging.holes import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.volume import compound
+from speckle3d.kernels.cuts import EDGE_TOLERANCE
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -27,8 +28,11 @@ def shaken(rng, frames, step_mm, turn_rad=0.05):
 def sampled(image, x, y):
     """Bilinear sample at a point of the image in mm; NaN outside and beside NaN."""
     u, v = x / GRID.vector_pitch_mm, (y - GRID.first_sample_depth_mm) / GRID.sample_spacing_mm
-    if not (0 <= u <= GRID.vectors - 1 and 0 <= v <= GRID.samples - 1):
+    # A millionth of a pixel outside is on the border: rounding of poses.
+    inside = min(max(u, 0.0), GRID.vectors - 1.0), min(max(v, 0.0), GRID.samples - 1.0)
+    if max(abs(u - inside[0]), abs(v - inside[1])) > EDGE_TOLERANCE:
         return np.nan
+    u, v = inside
     i, j = min(int(u), GRID.vectors - 2), min(int(v), GRID.samples - 2)
     a, b = u - i, v - j
     near = (1 - b) * image[i][j] + b * image[i][j + 1]
@@ -70,7 +74,7 @@ def joined(slabs):
     return np.concatenate([slab.voxels for slab in slabs]), np.concatenate([slab.state for slab in slabs])
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     spacing=st.sampled_from([(0.4, 0.4, 0.4), (0.6, 0.5, 1.2), (0.9, 0.7, 0.2)]),
@@ -139,17 +143,31 @@ def test_images_are_read_once_for_each_slab_they_reach():
     assert len(read) == 40 + 3 * 2
 
 
-def test_any_number_of_threads_gives_the_same(monkeypatch):
+def test_images_that_share_their_memory_are_looked_up_as_any_others():
+    rng = np.random.default_rng(4)
+    poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
+    buffer, grid = np.empty((9, 14), np.float32), grid_around(GRID, poses, 0.4)
+
+    def read(number):
+        buffer[:] = images[number]
+        return buffer
+
+    shared = joined(backward_slabs(PosedImages(read, GRID, poses), grid, 2.0))
+    alone = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.0))
+    for found, expected in zip(shared, alone, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_any_number_of_threads_gives_the_same(many_threads):
     rng = np.random.default_rng(3)
     poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
     source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.25)
-    results = []
-    for cores in (1, 2, 5):
-        monkeypatch.setattr(threads, "cores", lambda cores=cores: cores)
-        results.append(joined(backward_slabs(source, grid, 2.0)))
-    for result in results[1:]:
-        for found, expected in zip(result, results[0], strict=True):
-            np.testing.assert_array_equal(found, expected)
+    shared = joined(backward_slabs(source, grid, 2.0))
+    with pytest.MonkeyPatch.context() as one:
+        one.setattr(threads, "cores", lambda: 1)
+        alone = joined(backward_slabs(source, grid, 2.0))
+    for found, expected in zip(shared, alone, strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("seed", range(3))

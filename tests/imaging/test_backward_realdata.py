@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from speckle3d.core.labels import FILLED
 from speckle3d.imaging.axes import sweep_axes
 from speckle3d.imaging.grid import grid_around
-from speckle3d.imaging.holes import FILLED
 from speckle3d.imaging.images import ChosenImages, PosedImages
 from speckle3d.imaging.volume import compound
 from speckle3d.io.import_settings import ImportSettings

@@ -13,7 +13,7 @@ from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.grid import grid_around, grid_as_asked, grid_like, spacing_within
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=KINDS,
@@ -33,7 +33,7 @@ def test_every_image_corner_is_within_the_grid(seed, kind, spacing, way):
     assert voxels.spacing_mm == spacing
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     spacing=st.tuples(*[st.floats(0.01, 10.0)] * 3),
@@ -83,7 +83,7 @@ def test_a_grid_like_a_volume_is_its_grid():
     np.testing.assert_array_equal(voxels.world_from_grid.as_matrix(), pose.as_matrix())
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), gigabytes=st.floats(1e-7, 10.0))
 def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     poses, axes = sweep(np.random.default_rng(seed), 4)

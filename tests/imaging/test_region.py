@@ -28,7 +28,7 @@ def winding(x, y, corners):
     return round((angle[-1] - angle[0]) / (2 * np.pi))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     apex=st.tuples(st.floats(-3, 12), st.floats(-20, 3)),
     angles=st.tuples(st.floats(-89, 0), st.floats(1, 89)),

@@ -127,6 +127,16 @@ def test_a_cavity_is_no_volume():
     hollow = np.minimum(volume.voxels, 2.0 - volume.voxels)
     surface = surface_of(Volume(hollow, volume.spacing_mm, PLACED), 0.0)
     assert surface.volume_mm3 == pytest.approx(4 / 3 * np.pi * (4**3 - 2**3), rel=0.01)
+    assert measures_of(surface).volume_mm3 == pytest.approx(surface.volume_mm3)
+
+
+def test_a_cavity_in_what_is_open_has_no_volume():
+    """The ball's outside is cut by the grid; the hollow in it is closed, but nothing is known to hold it."""
+    volume, _ = ball(4.0, (25, 25, 25))
+    hollow = np.minimum(volume.voxels, 2.0 - volume.voxels)
+    found = measures_of(surface_of(Volume(hollow, volume.spacing_mm, PLACED), 0.0))
+    assert found.open_mm > 0.0
+    assert found.volume_mm3 is None
 
 
 def test_smoothing_evens_noise_out_and_keeps_the_volume():

@@ -15,9 +15,9 @@ from commands import run_command
 from igsio_twin import Clip
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.labels import FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.grid import VoxelGrid, grid_like
-from speckle3d.imaging.holes import FILLED, MEASURED
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.splatting import Placed

@@ -37,6 +37,7 @@ def test_headers_say_the_axes_as_slicer_looks_for_them(path):
         assert b"SPACE=LPS" in start.split(b"\n")[1]
 
 
+@pytest.mark.slow
 def test_vtk_reads_the_same_points_and_header(path):
     vtk = pytest.importorskip("vtk")
     reader = {".stl": vtk.vtkSTLReader, ".ply": vtk.vtkPLYReader, ".vtk": vtk.vtkUnstructuredGridReader}[
@@ -60,6 +61,14 @@ def test_damaged_files_are_one_clear_error(path):
         path.write_bytes(whole[:cut])
         with pytest.raises((FileError, InvalidInputError), match=path.name):
             read_surface(path)
+
+
+def test_a_header_without_an_end_is_refused_at_once(tmp_path):
+    write_surface(tmp_path / "t.ply", Surface(CORNERS, FACES))
+    head = (tmp_path / "t.ply").read_bytes().split(b"end_header")[0]
+    (tmp_path / "t.ply").write_bytes(head)
+    with pytest.raises(FileError, match="header has no end"):
+        read_surface(tmp_path / "t.ply")
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):

@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io import deflate, volume_writer
@@ -91,6 +91,27 @@ def test_a_voxel_is_at_the_same_place_in_everybodys_reader(
     np.testing.assert_array_equal(back.voxels, volume.voxels)
 
 
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
+@pytest.mark.parametrize(
+    ("suffix", "reader"),
+    [(".nrrd", "Nrrd"), (".mha", "MetaImage"), (".nii.gz", "NIFTIImage"), (".nii", "NIFTIImage")],
+)
+def test_vtk_finds_the_same_voxels(tmp_path, suffix, reader, dtype):
+    readers = pytest.importorskip("vtkmodules.vtkIOImage")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    volume = volume_of(10, dtype, (7, 6, 5), fields=FIELDS)
+    write_volume(tmp_path / f"v{suffix}", volume)
+    found = getattr(readers, f"vtk{reader}Reader")()
+    found.SetFileName(str(tmp_path / f"v{suffix}"))
+    found.Update()
+    voxels = vtk_to_numpy(found.GetOutput().GetPointData().GetScalars())
+    np.testing.assert_array_equal(voxels.reshape(5, 6, 7).T, volume.voxels)
+    assert voxels.dtype == dtype
+    if reader != "Nrrd":  # which loses the first of oblique directions, in files of ITK's too
+        np.testing.assert_allclose(found.GetOutput().GetSpacing(), volume.spacing_mm, rtol=1e-6)
+
+
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 179.99, 179.0])
 @pytest.mark.parametrize("axis", [(0, 0, 1), (1, 0, 0), (1, 2, 3)])
 def test_near_a_half_turn_nifti_is_as_exact(tmp_path, turn_deg, axis):
@@ -139,6 +160,15 @@ def test_slabs_and_threads_do_not_show_in_the_file(tmp_path, suffix, monkeypatch
         assert path.read_bytes() == whole
 
 
+def test_numbers_in_the_other_byte_order_are_the_same(tmp_path):
+    volume = volume_of(3, "int16")
+    turned = Volume(volume.voxels.astype(">i2"), volume.spacing_mm, volume.world_from_grid)
+    for suffix in SUFFIXES:
+        for name, each in (("little", volume), ("big", turned)):
+            write_volume(tmp_path / f"{name}{suffix}", each)
+        assert (tmp_path / f"big{suffix}").read_bytes() == (tmp_path / f"little{suffix}").read_bytes()
+
+
 def test_larger_than_its_batches_and_what_does_not_pack(tmp_path, monkeypatch):
     monkeypatch.setattr(volume_writer, "_PIECE_BYTES", 2**12)
     monkeypatch.setattr(volume_writer, "_BATCH_BYTES", 2**14)
@@ -155,6 +185,21 @@ def test_larger_than_its_batches_and_what_does_not_pack(tmp_path, monkeypatch):
     header, _, packed = (tmp_path / "zlib.mha").read_bytes().partition(b"ElementDataFile = LOCAL\n")
     assert zlib.decompress(packed) == noise.tobytes(order="F")
     assert f"CompressedDataSize = {len(packed)} ".encode() in header
+
+
+def test_members_of_gzip_that_follow_one_another_are_one_volume(tmp_path):
+    """As bgzip and pigz write them."""
+    volume = volume_of(4, "int16")
+    write_volume(tmp_path / "v.nii", volume)
+    whole = (tmp_path / "v.nii").read_bytes()
+    parts = [gzip.compress(whole[i : i + 100]) for i in range(0, len(whole), 100)]
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts))
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts[:-1]))
+    with pytest.raises(FileError, match=r"bytes of pixels unpacked, got \d+"):
+        read_volume(tmp_path / "v.nii.gz")
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts) + b"behind it")
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
 
 
 FIELDS = {

@@ -75,6 +75,30 @@ def test_without_the_split_no_distance_on_a_one_way_sweep_is_claimed_surer():
         assert without > 0.97 * with_split
 
 
+@pytest.mark.parametrize("frames", [1, 2, 3, 300])
+def test_sweeps_of_any_length_keep_their_covariances(frames):
+    poses = curved(frames) if frames > 1 else curved(2)[:1]
+    claimed = chain(poses) + shared_covariance(poses, CENTRE_MM, SHARED)
+    found = joint_errors(claimed, poses, CENTRE_MM, SHARED)
+    assert len(found) == frames
+    np.testing.assert_allclose(found.covariance(), claimed, rtol=1e-4, atol=1e-9 * claimed.max())
+
+
+def test_a_probe_at_rest_without_errors_has_none():
+    still = RigidTransform.identity(5)
+    found = joint_errors(np.zeros((5, 6, 6)), still, CENTRE_MM, SHARED)
+    assert found.factors.shape == (0, 5, 6)
+
+
+def test_what_is_no_covariance_is_taken_for_the_nearest_that_is():
+    poses = curved(30)
+    wrong = chain(poses)
+    wrong[:, 0, 0] = -1e-6
+    found = joint_errors(wrong, poses, CENTRE_MM).covariance()
+    assert np.isfinite(found).all()
+    assert (np.linalg.eigvalsh(found) > -1e-12).all()
+
+
 def test_a_sensor_that_wanders_turns_frames_and_bends_the_path():
     poses, time_s = curved(), np.linspace(0, 4, 90)
     factors = turn_factors(np.array([0.0, 0.01, 0.0]), 1e7, time_s, poses, CENTRE_MM)

@@ -11,7 +11,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, SharedErrors, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.pose_errors import errors_of, posed_errors_of
+from speckle3d.study.pose_errors import errors_of, measure, posed_errors_of
 
 GRID = ImageGrid(41, 81, 0.5, 0.5)
 N = 61
@@ -80,6 +80,14 @@ def test_errors_come_with_the_poses_they_are_of():
     posed = posed_errors_of(made(), "fused")
     np.testing.assert_allclose(posed.world_from_image.translation, (WORLD * IMAGE).translation)
     np.testing.assert_allclose(posed.centre_mm, GRID.centre_mm)
+
+
+def test_points_of_the_world_are_measured_at_once():
+    (row,) = measure(made(), (WORLD * IMAGE[10]).apply([[5.0, 9.0, 0.0], [15.0, 9.0, 0.0]]), "fused")
+    assert row.value == pytest.approx(10.0)
+    assert row.sigma == pytest.approx(0.25 * np.sqrt(2))
+    with pytest.raises(InvalidInputError, match=r"point 1 .*is it a point of this mode's world"):
+        measure(made(), np.zeros((2, 3)), "fused")
 
 
 def test_what_claims_nothing_is_refused():

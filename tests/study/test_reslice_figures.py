@@ -32,7 +32,8 @@ def picture_of(modes, **words):
         plane = plane_at()
         image = rng.normal(-20, 5, plane.shape).astype(np.float32)
         image[:, :3] = np.nan
-        cuts[mode] = DrawnCut(image, plane, frames_across(stretch * np.linspace(0, 12, 25)))
+        x = stretch * np.linspace(0, 12, 25)
+        cuts[mode] = DrawnCut(image, plane, frames_across(x), x)
     return CutPicture(cuts, name="s5", place="at lateral 3 mm", **words)
 
 
@@ -44,6 +45,50 @@ def test_cuts_share_one_scale_and_their_axes_are_true():
     assert [each.get_clim() for each in drawn] == [(-50.0, 0.0)] * 2
     # Half a pixel of 0.5 mm around the first and the last centre.
     assert [tuple(each.get_extent()) for each in drawn] == [(-1.25, 14.25, 22.75, 2.25)] * 2
+
+
+def words_of(figure):
+    return [text.get_text() for axes in figure.axes for text in axes.texts]
+
+
+def test_a_mode_that_is_too_long_is_told_and_shown_so():
+    figure, panels = draw_cuts(picture_of({"truth": 1.0, "image": 1.06, "pose": 0.99}, reference="truth"))
+    words = words_of(figure)
+    assert {"12.72 mm  +6.0 %", "11.88 mm  -1.0 %", "12.00 mm"} <= set(words)
+    # Laid over the reference: magenta is this mode's, green the reference's, grey where both are alike.
+    assert [len(panels[mode]) for mode in ("image", "pose", "truth")] == [2, 2, 1]
+    # The first three columns show nothing.
+    colours = np.asarray(panels["image"][1].images[0].get_array())[:, 3:]
+    red, green, blue = np.moveaxis(colours, -1, 0)
+    np.testing.assert_array_equal(red, blue)
+    assert np.corrcoef(red.ravel(), green.ravel())[0, 1] < 0.2
+    alone = draw_cuts(picture_of({"image": 1.0}))[0]
+    assert "12.00 mm" in words_of(alone)
+
+
+def test_frames_go_by_their_own_numbers():
+    numbers = np.arange(25) * 3 + 100
+    figure, _ = draw_cuts(picture_of({"image": 1.0}, numbers=numbers))
+    shown = {text for text in words_of(figure) if text.isdecimal()}
+    assert {"100", "172"} <= shown <= {str(number) for number in numbers}
+
+
+@pytest.mark.parametrize("modes", [2, 7])
+@pytest.mark.parametrize("size_mm", [(300.0, 20.0), (12.0, 45.0), (0.5, 0.5)])
+def test_panels_do_not_overlap_and_keep_their_proportions(modes, size_mm):
+    plane = ReslicePlane(PLACED, *size_mm, size_mm[0] / 20)
+    image = np.arange(np.prod(plane.shape), dtype=np.float32).reshape(plane.shape)
+    names = ["image", "orientation", "pose", "crossed", "inertial", "fused", "truth"][:modes]
+    cuts = {name: DrawnCut(image, plane) for name in names}
+    figure, panels = draw_cuts(CutPicture(cuts, reference=names[-1] if modes > 1 else None))
+    boxes = [axes.get_position() for row in panels.values() for axes in row]
+    assert all(box.x0 >= 0 and box.x1 <= 1 and box.y0 >= 0 and box.y1 <= 1 for box in boxes)
+    for i, one in enumerate(boxes):
+        for other in boxes[:i]:
+            apart = one.x0 >= other.x1 or other.x0 >= one.x1 or one.y0 >= other.y1 or other.y0 >= one.y1
+            assert apart
+    assert figure.get_figwidth() < 14
+    assert figure.get_figheight() < 14
 
 
 def test_points_picked_in_a_picture_are_points_of_the_world(tmp_path):

@@ -19,6 +19,7 @@ from speckle3d.io.headers import read_header
 from speckle3d.study.mrml import Scene
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scene import SceneRequest, require_scene_place, write_scene
+from speckle3d.study.sequences import PosedSequence
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
@@ -161,6 +162,22 @@ def test_images_move_through_the_volume(folder):
     assert poses.frames[5]["ImageToWorldTransform"] == header["Seq_Frame0005_ImageToWorldTransform"]
 
 
+def test_the_extension_of_slicer_finds_the_images_by_vtk(tmp_path):
+    """SlicerIGSIO reads pixels of .seq.mha by VTK's reader, and transforms from the text before them."""
+    readers = pytest.importorskip("vtkmodules.vtkIOImage")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    posed = posed_sweep()
+    PosedSequence.of(posed).write(tmp_path / "s.seq.mha")
+    reader = readers.vtkMetaImageReader()
+    reader.SetFileName(str(tmp_path / "s.seq.mha"))
+    reader.Update()
+    pixels = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars()).reshape(8, 20, 12)
+    np.testing.assert_array_equal(pixels.transpose(0, 2, 1), posed.sweep.frames)
+    assert reader.GetOutput().GetSpacing() == (1.0, 1.0, 1.0)
+    assert read_header(tmp_path / "s.seq.mha").transforms == ["ImageToWorld"]
+
+
 def test_slicer_finds_every_transform_before_a_line_that_its_reader_would_break(folder):
     """It reads pieces of 1,000 characters, and stops at the first one without a colon."""
     header = (folder / "images-image.seq.nrrd").read_bytes().split(b"\n\n")[0].split(b"\n")
@@ -190,7 +207,9 @@ def test_the_browser_plays_both_sequences_into_a_volume_under_a_transform(folder
 def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
     target = tmp_path / "s"
     write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST)
+    (target / "volume-crop.nrrd").write_bytes(b"somebody's own")
     write_scene(target, [posed_sweep("image")], replace(REQUEST, with_images=False))
+    (target / "volume-crop.nrrd").unlink()
     stems = ("first-frame", "outlines", "scene", "state", "volume")
     assert sorted(path.name.split(".")[0].removesuffix("-image") for path in target.iterdir()) == [*stems]
 
