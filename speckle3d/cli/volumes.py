@@ -45,7 +45,11 @@ def volume(
         str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
     ] = None,
     rule: Annotated[
-        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
+        str | None,
+        typer.Option(
+            help="Of a voxel's samples: mean, maximum, latest, weighted; plus: mean kept in whole grey "
+            "levels as PLUS and 3D Slicer keep it, to compare with their volumes."
+        ),
     ] = None,
     fill_radius: Annotated[
         int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
