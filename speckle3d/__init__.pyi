@@ -10,8 +10,8 @@ from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
 from .corrections import correct as correct
 from .crossing_sweeps import cross_sweeps as cross_sweeps
-from .imaging.surface import surface_of as surface_of
-from .imaging.volume import compound as compound
+from .imaging.measures.surface import surface_of as surface_of
+from .imaging.voxels.volume import compound as compound
 from .io.calibrations import load_calibration as load_calibration
 from .io.calibrations import write_calibration as write_calibration
 from .io.curves import load_curves as load_curves
@@ -38,6 +38,6 @@ from .study.images import grey_images as grey_images
 from .study.job import JobResult as JobResult
 from .study.job import run_job as run_job
 from .study.pose_errors import measure as measure
-from .study.scene import write_scene as write_scene
+from .study.scenes.scene import write_scene as write_scene
 
 __version__: str

@@ -11,7 +11,7 @@ from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.correction.fused.settings import FusedSettings
 from speckle3d.correction.inertial.settings import InertialSettings
-from speckle3d.imaging.settings import CompoundingSettings
+from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.toml import load_toml, parsed, validated
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings

@@ -91,7 +91,7 @@ def _reached(points, splat):
 
 
 def fill_holes(voxels, cap):
-    """Twin of `speckle3d.imaging.holes.fill_holes`: grow a cube until it holds a value."""
+    """Twin of `speckle3d.imaging.voxels.holes.fill_holes`: grow a cube until it holds a value."""
     filled = voxels.copy()
     for at in np.argwhere(np.isnan(voxels)):
         for radius in range(1, cap + 1):

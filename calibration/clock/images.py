@@ -35,9 +35,9 @@ from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.cuts.planes import image_plane
+from speckle3d.imaging.cuts.reslice import resample_image, reslice_frames
 from speckle3d.imaging.images import ChosenImages, Images
-from speckle3d.imaging.planes import image_plane
-from speckle3d.imaging.reslice import resample_image, reslice_frames
 
 STEP_S = 0.01
 

@@ -24,9 +24,9 @@ from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.core.threads import ahead
+from speckle3d.imaging.cuts.planes import image_plane
+from speckle3d.imaging.cuts.reslice import resample_image, reslice_frames
 from speckle3d.imaging.images import ChosenImages
-from speckle3d.imaging.planes import image_plane
-from speckle3d.imaging.reslice import resample_image, reslice_frames
 
 PIXEL_MM = 0.15
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")

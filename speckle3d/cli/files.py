@@ -228,7 +228,7 @@ def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.plus.write import SUFFIXES
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.sequences import PosedSequence
+    from speckle3d.study.scenes.sequences import PosedSequence
 
     if out.suffix.lower() not in SUFFIXES:
         raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")

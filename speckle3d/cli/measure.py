@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
     from speckle3d.core.reconstruction import Reconstruction
-    from speckle3d.imaging.measure import Measurement
+    from speckle3d.imaging.measures.measure import Measurement
 
 
 @app.command()
@@ -81,7 +81,7 @@ def _in_world(
 ) -> tuple[FloatArray, str]:
     """Points of the world that lie under points of a picture, and the mode whose poses it shows."""
     from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.cut_geometry import read_plane, require_same_poses
+    from speckle3d.study.reslices.cut_geometry import read_plane, require_same_poses
 
     shown = read_plane(picture, mode)
     require_same_poses(shown, poses_of(held, shown.mode), str(picture))

@@ -149,7 +149,7 @@ def _require_mode(wanted: str | None, modes: Sequence[str]) -> None:
 def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | None, settings: Config) -> None:
     """Compound the sweep at the poses just found."""
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.voxels import VolumeRequest, best_mode, write_voxels
+    from speckle3d.study.scenes.voxels import VolumeRequest, best_mode, write_voxels
 
     made = result.directory / "reconstruction.h5"
     posed = open_posed(made, mode or best_mode(made), sweep_file)

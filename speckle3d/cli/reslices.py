@@ -16,8 +16,8 @@ from speckle3d.core.errors import InvalidInputError
 if TYPE_CHECKING:
     from speckle3d.core.arrays import ByteArray, FloatArray
     from speckle3d.core.volume import Volume
-    from speckle3d.study.cuts import CutPicture
-    from speckle3d.study.places import Place
+    from speckle3d.study.reslices.cuts import CutPicture
+    from speckle3d.study.reslices.places import Place
 
 Triple = tuple[float, float, float]
 
@@ -87,7 +87,7 @@ def reslice(
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
     from speckle3d.io.volume_writer import SUFFIXES
-    from speckle3d.study.places import Place
+    from speckle3d.study.reslices.places import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)
     require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, on, volume, state)
@@ -135,7 +135,7 @@ def _cut_sweep(
     sweep_file: Path | None,
     dynamic_range_db: float,
 ) -> None:
-    from speckle3d.study.cuts import cut_posed, open_modes
+    from speckle3d.study.reslices.cuts import cut_posed, open_modes
 
     volume, state = made
     voxels = None if volume is None else _voxels(volume, state)
@@ -164,7 +164,7 @@ def _modes_of(volume: Volume, modes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> None:
-    from speckle3d.study.cuts import cut_voxels
+    from speckle3d.study.reslices.cuts import cut_voxels
 
     volume, states = _voxels(source, state)
     _write(cut_voxels(volume, place, source.name, states), out)
@@ -182,8 +182,8 @@ def _write(picture: CutPicture, out: Path) -> None:
     """Write a cut as a volume of one plane if the name says so, else as a picture."""
     from speckle3d.io.volume_writer import SUFFIXES
     from speckle3d.io.volumes import write_volume
-    from speckle3d.study.cuts import cut_as_volume
-    from speckle3d.study.reslice_figures import save_reslices
+    from speckle3d.study.reslices.cuts import cut_as_volume
+    from speckle3d.study.reslices.reslice_figures import save_reslices
 
     if out.name.lower().endswith(SUFFIXES):
         write_volume(out, cut_as_volume(picture))
@@ -194,11 +194,11 @@ def _write(picture: CutPicture, out: Path) -> None:
 def _draw_outlines(
     source: Path, out: Path, modes: tuple[str, ...], difference_to: str | None, sweep_file: Path | None
 ) -> None:
-    from speckle3d.imaging.outlines import frame_outlines
+    from speckle3d.imaging.cuts.outlines import frame_outlines
     from speckle3d.matching.intensity import IntensityExtractor
-    from speckle3d.study.cuts import open_modes
     from speckle3d.study.figures import save_figure
-    from speckle3d.study.reslice_figures import figure_outlines
+    from speckle3d.study.reslices.cuts import open_modes
+    from speckle3d.study.reslices.reslice_figures import figure_outlines
 
     opened = open_modes(source, modes, difference_to, sweep_file)
     grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
@@ -247,7 +247,7 @@ def _points(text: str | None) -> FloatArray | None:
 def _curve(path: Path, picture: Path | None, mode: str | None) -> FloatArray:
     """Points of a curve in the world, read as such or as points of a picture of the mode."""
     from speckle3d.io.picks import PICTURE, WORLD, read_places
-    from speckle3d.study.cut_geometry import read_plane
+    from speckle3d.study.reslices.cut_geometry import read_plane
 
     if picture is None:
         return read_places(path, WORLD)

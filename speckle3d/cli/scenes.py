@@ -70,9 +70,9 @@ def scene(
     config_file: ConfigFile = None,
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames."""
-    from speckle3d.imaging.settings import CompoundingSettings
+    from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.scene import SceneRequest, require_scene_place, write_scene
+    from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
 
     options = locals()
     require_scene_place(out, source, sweep_file, *files_of(plus_config, calibration))

@@ -59,7 +59,7 @@ def surface(
     Where the sweep ends the surface stays open, and what is open has no volume.
     """
     from speckle3d.core.labels import EMPTY
-    from speckle3d.imaging.surface import largest_part, smoothed, surface_of, surfaces_of_labels
+    from speckle3d.imaging.measures.surface import largest_part, smoothed, surface_of, surfaces_of_labels
     from speckle3d.io.surfaces import require_suffix, write_surface
     from speckle3d.io.volumes import read_states, read_volume
 
@@ -114,7 +114,7 @@ def _sizes(
     """What is said of one surface."""
     from dataclasses import asdict
 
-    from speckle3d.imaging.surface import measures_of
+    from speckle3d.imaging.measures.surface import measures_of
 
     found = measures_of(surface, errors, grid)
     parts = int(surface.parts().max()) + 1

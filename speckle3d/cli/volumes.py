@@ -47,7 +47,11 @@ def volume(
         str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
     ] = None,
     rule: Annotated[
-        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
+        str | None,
+        typer.Option(
+            help="Of a voxel's samples: mean, maximum, latest, weighted; plus: mean kept in whole grey "
+            "levels as PLUS and 3D Slicer keep it, to compare with their volumes."
+        ),
     ] = None,
     fill_radius: Annotated[
         int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
@@ -113,9 +117,9 @@ def volume(
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
-    from speckle3d.imaging.settings import CompoundingSettings
+    from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.voxels import GridRequest, VolumeRequest, write_voxels
+    from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
     for place in (out, state, deviation):

@@ -1,1 +1,1 @@
-"""Voxels and reslices from frames with poses."""
+"""Frames with poses to voxels, cuts, surfaces and measures."""

@@ -10,8 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.grid import image_corners
-from speckle3d.imaging.images import require_poses
+from speckle3d.imaging.images import image_corners, require_poses
 
 _LEAST_COMMON = 0.5
 """Length of a mean of unit vectors that makes it a direction: as of a spread of 110 degrees either way."""

@@ -133,3 +133,9 @@ def require_poses(world_from_image: RigidTransform) -> None:
     if world_from_image.single or len(world_from_image) == 0:
         got = "a single one outside a row" if world_from_image.single else "none"
         raise InvalidInputError(f"world_from_image: expected a row of poses, one per image, got {got}")
+
+
+def image_corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
+    """Corners of all images in the world, shape (4 n, 3), mm."""
+    require_poses(world_from_image)
+    return np.concatenate([world_from_image.apply(corner) for corner in grid.corners_mm])

@@ -22,7 +22,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.imaging.planes import ReslicePlane
+from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction

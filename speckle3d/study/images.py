@@ -16,10 +16,10 @@ from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
+from speckle3d.imaging.cuts.planes import ReslicePlane, lateral_line, planes_from_first_frame
+from speckle3d.imaging.cuts.reslice import reslice_frames
 from speckle3d.imaging.images import Images
-from speckle3d.imaging.planes import ReslicePlane, lateral_line, planes_from_first_frame
-from speckle3d.imaging.reslice import reslice_frames
-from speckle3d.imaging.settings import Levels
+from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings

@@ -33,15 +33,15 @@ from speckle3d.pipeline import Progress, Tracked, after, track
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
 from speckle3d.study.crossed import Companion
-from speckle3d.study.cut_geometry import anchors_of
-from speckle3d.study.cuts import CutPicture, DrawnCut
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_planes
-from speckle3d.study.places import view_of
 from speckle3d.study.request import SUBSET, Request, require_possible
-from speckle3d.study.reslice_figures import save_reslices
+from speckle3d.study.reslices.cut_geometry import anchors_of
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
+from speckle3d.study.reslices.places import view_of
+from speckle3d.study.reslices.reslice_figures import save_reslices
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
 
 

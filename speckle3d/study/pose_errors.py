@@ -10,8 +10,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
-from speckle3d.imaging.belonging import require_inside
-from speckle3d.imaging.measure import Measurement, measured
+from speckle3d.imaging.measures.belonging import require_inside
+from speckle3d.imaging.measures.measure import Measurement, measured
 from speckle3d.motion.joint_errors import joint_errors, turn_factors
 from speckle3d.scoring.trajectories import poses_of
 

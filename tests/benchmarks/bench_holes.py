@@ -12,10 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.labels import MEASURED
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.backward import backward_slabs
-from speckle3d.imaging.grid import VoxelGrid
-from speckle3d.imaging.holes import fill_holes
 from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.grid import VoxelGrid
+from speckle3d.imaging.voxels.holes import fill_holes
 
 SHAPE = (240, 193, 273)
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.planes import ReslicePlane, along_sweep_plane, surface_plane
-from speckle3d.imaging.reslice import reslice_frames, reslice_volume
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.cuts.planes import ReslicePlane, along_sweep_plane, surface_plane
+from speckle3d.imaging.cuts.reslice import reslice_frames, reslice_volume
+from speckle3d.imaging.voxels.volume import compound
 
 GRID = ImageGrid(127, 1000, 0.3, 0.04)
 FRAMES, STEP_MM, PIXEL_MM = 200, 0.15, 0.05

@@ -39,13 +39,13 @@ from speckle3d.core.surface import Surface
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.corrections import correct
-from speckle3d.imaging.backward import backward_slabs
-from speckle3d.imaging.belonging import belonging_of
-from speckle3d.imaging.grid import grid_around
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.measure import measured
-from speckle3d.imaging.surface import measures_of, surface_of
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.imaging.measures.measure import measured
+from speckle3d.imaging.measures.surface import measures_of, surface_of
+from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.grid import grid_around
+from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction

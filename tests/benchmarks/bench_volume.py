@@ -37,9 +37,9 @@ from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from speckle3d.core.labels import MEASURED
 from speckle3d.core.sweep import BModeSettings, ImageGrid
 from speckle3d.core.threads import cores, on_one_thread
-from speckle3d.imaging.grid import VoxelGrid
-from speckle3d.imaging.holes import fill_holes
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.voxels.grid import VoxelGrid
+from speckle3d.imaging.voxels.holes import fill_holes
+from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.sweep_writer import SweepWriter
 
 GRID = ImageGrid(640, 480, 0.1, 0.1)

@@ -10,12 +10,12 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.reconstruction import Provenance, SharedErrors, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.planes import ReslicePlane
+from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.surfaces import read_surface
 from speckle3d.io.volumes import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.cut_geometry import anchors_of, save_cuts
+from speckle3d.study.reslices.cut_geometry import anchors_of, save_cuts
 
 GRID = ImageGrid(51, 51, 0.2, 0.2)
 N = 41

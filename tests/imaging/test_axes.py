@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.grid import grid_around
+from speckle3d.imaging.voxels.grid import grid_around
 
 
 @settings(max_examples=6, deadline=None)

@@ -6,11 +6,11 @@ from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Helix, Phantom, curved
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.backward import backward_slabs
-from speckle3d.imaging.grid import grid_around
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.surface import largest_part, measures_of, surface_of
-from speckle3d.imaging.volume import compound
+from speckle3d.imaging.measures.surface import largest_part, measures_of, surface_of
+from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.grid import grid_around
+from speckle3d.imaging.voxels.volume import compound
 
 GRID = ImageGrid(120, 120, 0.1, 0.1)
 STEP_MM = 0.25
@@ -80,8 +80,8 @@ def test_spheres_swept_at_reconstructed_poses_are_as_far_apart_and_as_large_as_c
     """
     import speckle3d as s3
     from speckle3d.core.pose_errors import PosedErrors
-    from speckle3d.imaging.belonging import belonging_of
-    from speckle3d.imaging.measure import measured
+    from speckle3d.imaging.measures.belonging import belonging_of
+    from speckle3d.imaging.measures.measure import measured
     from speckle3d.motion.joint_errors import joint_errors
 
     sweep = s3.load_sweep(shipped / "phantom.h5")

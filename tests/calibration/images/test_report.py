@@ -4,7 +4,7 @@ import crossing_scenes
 import numpy as np
 
 from calibration.images.report import PIXEL_MM, cut_of
-from speckle3d.imaging.reslice import resample_image
+from speckle3d.imaging.cuts.reslice import resample_image
 
 
 def test_a_cut_with_the_right_calibration_is_like_the_image():

@@ -1,0 +1,126 @@
+"""Distances, angles and lengths between points of a sweep, with their standard errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.pose_errors import Belonging, PosedErrors
+
+NORMAL_95 = 1.959964
+"""Deviations of a normal variable that 95 % of its values lie within."""
+LEAST_MM = 1e-6
+"""Points nearer than this are one."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A length or an angle and how sure it is.
+
+    Attributes
+    ----------
+    kind : str
+        "distance", "length" (of a line through several points) or "angle" (at a point).
+    points : tuple of int
+        Which of the points, from 0.
+    value, pose_sigma, pick_sigma : float
+        In `unit`; standard errors by the poses and by the picking of the points.
+    unit : {"mm", "rad"}
+    """
+
+    kind: str
+    points: tuple[int, ...]
+    value: float
+    pose_sigma: float
+    pick_sigma: float
+    unit: str = "mm"
+
+    @property
+    def sigma(self) -> float:
+        """Standard error of the value."""
+        return float(np.hypot(self.pose_sigma, self.pick_sigma))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the value; none reaches below zero, or past pi for angles."""
+        half, most = NORMAL_95 * self.sigma, np.pi if self.unit == "rad" else np.inf
+        return max(self.value - half, 0.0), min(self.value + half, float(most))
+
+
+def measured(
+    points_mm: FloatArray, belonging: Belonging, errors: PosedErrors, pick_mm: float
+) -> list[Measurement]:
+    """Measure what points have between them: distances in a row, their sum, angles at the points between.
+
+    Parameters
+    ----------
+    points_mm : ndarray, shape (k, 3)
+        In the world, k >= 2, in order.
+    belonging : Belonging
+        Of the points; see `speckle3d.imaging.measures.belonging`.
+    errors : PosedErrors
+    pick_mm : float
+        Standard deviation of each point's place on each axis by picking.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are fewer than two points, or two in a row are one.
+    """
+    points = np.asarray(points_mm, dtype=float)
+    if len(points) < 2:
+        raise InvalidInputError(f"expected at least 2 points to measure between, got {len(points)}")
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if (steps < LEAST_MM).any():
+        first = int(np.flatnonzero(steps < LEAST_MM)[0]) + 1
+        raise InvalidInputError(f"points {first} and {first + 1}: expected two places, got one")
+    moved = errors.displacements(points, belonging)
+
+    def row(kind: str, chosen: range, value_of: Valued, unit: str = "mm") -> Measurement:
+        value, gradient = value_of(points[chosen])
+        by_poses = np.einsum("mka,ka->m", moved[:, chosen], gradient)
+        pose_sigma, pick_sigma = float(np.linalg.norm(by_poses)), pick_mm * float(np.linalg.norm(gradient))
+        return Measurement(kind, tuple(chosen), value, pose_sigma, pick_sigma, unit)
+
+    found = [row("distance", range(k, k + 2), length) for k in range(len(points) - 1)]
+    found += [row("length", range(len(points)), length)] if len(points) > 2 else []
+    found += [row("angle", range(k, k + 3), angle, "rad") for k in range(len(points) - 2)]
+    return found
+
+
+Valued = Callable[[FloatArray], tuple[float, FloatArray]]
+"""Value of some points, and its derivative with respect to each, shape (k, 3)."""
+
+
+def length(points_mm: FloatArray) -> tuple[float, FloatArray]:
+    """Length of the line through points, and its derivative, shape (k, 3)."""
+    steps = np.diff(points_mm, axis=0)
+    sizes = np.linalg.norm(steps, axis=1, keepdims=True)
+    gradient = np.zeros_like(points_mm)
+    gradient[1:] += steps / sizes
+    gradient[:-1] -= steps / sizes
+    return float(sizes.sum()), gradient
+
+
+def angle(points_mm: FloatArray) -> tuple[float, FloatArray]:
+    """Angle at the second of three points, rad, and its derivative, shape (3, 3)."""
+    sides = points_mm[[0, 2]] - points_mm[1]
+    sizes = np.linalg.norm(sides, axis=1, keepdims=True)
+    one, other = sides / sizes
+    normal = np.cross(one, other)
+    sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
+    # Along a straight line every turn opens or closes the angle alike, to first order of its size.
+    across = normal / sine if sine > 1e-9 else _perpendicular(one)
+    ends = np.array([np.cross(one, across), -np.cross(other, across)]) / sizes
+    gradient = np.array([ends[0], -ends.sum(axis=0), ends[1]])
+    return float(np.arctan2(sine, cosine)), gradient
+
+
+def _perpendicular(direction: FloatArray) -> FloatArray:
+    """Any unit vector at a right angle to `direction`."""
+    across = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    return np.asarray(across / np.linalg.norm(across))

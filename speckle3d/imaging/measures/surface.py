@@ -1,0 +1,263 @@
+"""Surfaces of a volume: where its grey level crosses a threshold, or around its labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array, diags_array
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.surface import Surface
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.measures.belonging import belonging_of
+
+Inside = Literal["above", "below"]
+TAUBIN = (0.5, -0.53)
+"""Shares of the way to the neighbours' mean that a vertex goes, in and out again, in a pass of smoothing."""
+MAX_LABELS = 256
+"""More different values than a label map has: such a volume holds grey levels."""
+
+
+def surface_of(
+    volume: Volume,
+    level: float,
+    inside: Inside = "above",
+    known: BoolArray | None = None,
+    smooth: int = 0,
+) -> Surface:
+    """Surface on which the grey level, interpolated linearly between voxels, is `level`.
+
+    Empty voxels are not below the level, but unknown: where the sweep ends the surface ends, too, and stays
+    open (`Surface.open_edges`).
+
+    Parameters
+    ----------
+    volume : Volume
+    level : float
+        In the volume's own grey levels.
+    inside : {"above", "below"}
+        Where the grey level is, inside: above, of what is bright; below, of a cyst or a vessel.
+    known : ndarray of bool, optional
+        Voxels with a value, in the volume's shape; without it as `known_voxels` has them.
+    smooth : int
+        Passes of smoothing; see `smoothed`.
+
+    Raises
+    ------
+    InvalidInputError
+        If `level` is not among the grey levels.
+    InsufficientDataError
+        If there is no surface.
+
+    References
+    ----------
+    .. [1] T. Lewiner et al., "Efficient implementation of marching cubes' cases with topological guarantees",
+       Journal of Graphics Tools 8, 2003.
+
+    Examples
+    --------
+    >>> from scipy.spatial.transform import RigidTransform
+    >>> away = np.linalg.norm(np.mgrid[:21, :21, :21] - 10.0, axis=0)
+    >>> ball = Volume((20.0 - away).astype(np.float32), (0.5, 0.5, 0.5), RigidTransform.identity())
+    >>> surface = surface_of(ball, level=12.0)  # 8 voxels, 4 mm from the centre
+    >>> round(surface.volume_mm3), round(4 / 3 * np.pi * 4**3)
+    (266, 268)
+    """
+    if smooth < 0:
+        raise InvalidInputError(f"smooth: expected zero or more passes, got {smooth}")
+    held = known_voxels(volume) if known is None else known
+    if held.shape != volume.shape:
+        raise InvalidInputError(f"known: expected shape {volume.shape}, got {held.shape}")
+    values = volume.voxels[held]
+    low, high = (float(values.min()), float(values.max())) if values.size else (np.nan, np.nan)
+    if not low <= level <= high:
+        raise InvalidInputError(
+            f"level: expected a grey level of the volume, {low:g} to {high:g}, got {level:g}"
+        )
+    return _marched(volume, volume.voxels, level, inside, held, smooth)
+
+
+def surfaces_of_labels(volume: Volume, smooth: int = 0) -> dict[int, Surface]:
+    """Surfaces around each label of a label map, by label; 0 is no label.
+
+    A label that reaches the border of the grid is open there.
+
+    Raises
+    ------
+    InvalidInputError
+        If the voxels are no labels.
+    InsufficientDataError
+        If there is no label.
+    """
+    voxels = volume.voxels
+    if voxels.dtype.kind == "f" and not np.array_equal(voxels, np.rint(voxels)):
+        raise InvalidInputError("labels: expected whole numbers, got fractions or empty voxels")
+    labels = [int(label) for label in np.unique(voxels) if label != 0]
+    if not labels:
+        raise InsufficientDataError("labels: expected voxels other than 0, got none")
+    if len(labels) > MAX_LABELS:
+        raise InvalidInputError(
+            f"labels: expected at most {MAX_LABELS}, got {len(labels)}: are these grey levels?"
+        )
+    every = np.ones(volume.shape, dtype=bool)
+    found = {}
+    for label in labels:
+        surface = _marched(volume, (voxels == label).astype(np.float32), 0.5, "above", every, smooth)
+        found[label] = replace(surface, fields={**surface.fields, "label": str(label)})
+    return found
+
+
+def known_voxels(volume: Volume) -> BoolArray:
+    """Voxels that have a value, as far as the volume itself shows, in its shape.
+
+    Of float32 those that are not NaN. Of whole numbers an empty voxel is 0, and so is black: zeros that are
+    connected with the border of the grid are taken for empty, and those enclosed for black.
+    """
+    voxels = volume.voxels
+    if voxels.dtype.kind == "f":
+        return np.asarray(np.isfinite(voxels))
+    part, _ = ndimage.label(voxels == 0)
+    faces = [np.take(part, at, axis) for axis in range(3) for at in (0, -1)]
+    outside = np.unique(np.concatenate([face.ravel() for face in faces]))
+    return np.asarray(~np.isin(part, outside[outside > 0]))
+
+
+def smoothed(surface: Surface, passes: int) -> Surface:
+    """Smooth a surface: each vertex towards its neighbours' mean and back out, so that it hardly shrinks.
+
+    Vertices of open borders stay.
+
+    References
+    ----------
+    .. [1] G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH, 1995.
+    """
+    n, edges = len(surface.vertices_mm), surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    beside = coo_array((np.ones(len(both)), both.T), shape=(n, n)).tocsr()
+    beside.data[:] = 1.0
+    mean = diags_array(1.0 / np.maximum(beside.sum(axis=1), 1.0)) @ beside
+    free = np.ones((n, 1))
+    free[surface.open_edges().ravel()] = 0.0
+    vertices = surface.vertices_mm
+    for _ in range(passes):
+        for share in TAUBIN:
+            vertices = vertices + share * free * (mean @ vertices - vertices)
+    return replace(surface, vertices_mm=vertices)
+
+
+@dataclass(frozen=True)
+class PartMeasures:
+    """Size of a surface or a part of it.
+
+    Attributes
+    ----------
+    triangles : int
+    area_mm2 : float
+    volume_mm3 : float or None
+        What closed parts enclose, less cavities; None if none is closed.
+    open_mm : float
+        Length of the border along which it is open: where the sweep or the grid cuts it.
+    area_sigma_mm2, volume_sigma_mm3 : float or None
+        Standard errors by the poses' errors alone; None without these.
+    """
+
+    triangles: int
+    area_mm2: float
+    volume_mm3: float | None
+    open_mm: float
+    area_sigma_mm2: float | None = None
+    volume_sigma_mm3: float | None = None
+
+
+def measures_of(
+    surface: Surface, errors: PosedErrors | None = None, grid: ImageGrid | None = None
+) -> PartMeasures:
+    """Measure a surface; with its sweep's pose errors and image grid also the standard errors.
+
+    Every vertex moves with the frames nearest to it (`belonging_of`). Area and volume follow to first order.
+    The place of the level, the resolution of the images and the voxels' size are not in it.
+    """
+    edges = surface.open_edges()
+    open_mm = float(np.linalg.norm(np.diff(surface.vertices_mm[edges], axis=1), axis=2).sum())
+    closed = _closed_part(surface, edges)
+    volume = closed.volume_mm3 if len(closed) else None
+    area_sigma = volume_sigma = None
+    if errors is not None and grid is not None:
+        area_sigma = _sigma(surface.vertices_mm, surface.area_gradient(), errors, grid)
+        if volume is not None:
+            volume_sigma = _sigma(closed.vertices_mm, closed.volume_gradient(), errors, grid)
+    return PartMeasures(len(surface), surface.area_mm2, volume, open_mm, area_sigma, volume_sigma)
+
+
+def largest_part(surface: Surface) -> Surface:
+    """The connected part with the largest area."""
+    part = surface.parts()
+    areas = np.bincount(part, np.linalg.norm(surface.normals_mm2, axis=1))
+    return surface.of_triangles(part == int(areas.argmax()))
+
+
+def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
+    """The parts of a surface that have no border, and of cavities those within the bounds of such a part."""
+    part = surface.parts()
+    is_open = np.zeros(len(surface.vertices_mm), dtype=bool)
+    is_open[open_edges] = True
+    whole = np.ones(int(part.max()) + 1, dtype=bool)
+    whole[part[is_open[surface.triangles].any(axis=1)]] = False
+    middles = surface.vertices_mm[surface.triangles].mean(axis=1)
+    inner = np.einsum("ij,ij->i", surface.normals_mm2, middles - middles.mean(axis=0))
+    body = whole & (np.bincount(part, inner) > 0.0)
+    low, high = np.full((len(whole), 3), np.inf), np.full((len(whole), 3), -np.inf)
+    np.minimum.at(low, part, middles)
+    np.maximum.at(high, part, middles)
+    for cavity in np.flatnonzero(whole & ~body):
+        around = (low[body] <= low[cavity]).all(axis=1) & (high[body] >= high[cavity]).all(axis=1)
+        whole[cavity] = around.any()
+    return surface.of_triangles(whole[part])
+
+
+def _sigma(vertices: FloatArray, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:
+    near = belonging_of(vertices, grid, errors.world_from_image)
+    return float(np.linalg.norm(errors.of_gradient(vertices, gradient, near)))
+
+
+def _marched(
+    volume: Volume, values: FloatArray, level: float, inside: Inside, known: BoolArray, smooth: int
+) -> Surface:
+    """Marching cubes over the cells whose eight voxels are known, in the world."""
+    from skimage.measure import marching_cubes
+
+    if min(volume.shape) < 2:
+        raise InsufficientDataError(f"surface: expected two voxels along every axis, got {volume.shape}")
+    try:
+        # In the order of memory the axes are k, j, i: an odd permutation, which turns triangles over.
+        vertices, triangles, _, _ = marching_cubes(
+            values.T,
+            level,
+            spacing=volume.spacing_mm[::-1],
+            gradient_direction="descent" if inside == "above" else "ascent",
+            mask=_whole_cells(known.T),
+        )
+    except RuntimeError:
+        raise InsufficientDataError(
+            f"surface: expected grey levels on both sides of {level:g}, got none"
+        ) from None
+    world = volume.world_from_grid.apply(vertices[:, ::-1].astype(float))
+    side = f"{inside} {level:g}"
+    surface = Surface(world, triangles.astype(np.int64), {**volume.fields, "inside": side})
+    return smoothed(surface, smooth) if smooth else surface
+
+
+def _whole_cells(known: BoolArray) -> BoolArray:
+    """Cells all of whose corners are known, at the index of the farthest corner, as scikit-image wants it."""
+    whole = known.copy()
+    for axis in range(3):
+        whole = np.moveaxis(whole, axis, 0)
+        whole[1:] &= whole[:-1].copy()
+        whole = np.moveaxis(whole, 0, axis)
+    return np.ascontiguousarray(whole)

@@ -1,0 +1,270 @@
+"""Where voxels lie: grids around a sweep's images, or as asked for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.arrays import ByteArray, FloatArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.images import image_corners
+from speckle3d.imaging.voxels.settings import VoxelType
+
+MAX_VOXELS_ALONG = 1_000_000
+"""Most voxels along an axis, to catch wrong units: 100 m at 0.1 mm."""
+
+_ROUND_SPACINGS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+"""Between a power of ten and the next."""
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Where voxels lie.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Number of voxels along i, j and k.
+    spacing_mm : tuple of float
+        Distance between neighbouring voxel centres along i, j and k.
+    world_from_grid : RigidTransform
+        Its origin is the centre of voxel ``[0, 0, 0]``; mm.
+    """
+
+    shape: tuple[int, int, int]
+    spacing_mm: Triple
+    world_from_grid: RigidTransform
+
+    def part(self, first: int, stop: int) -> VoxelGrid:
+        """The planes `first` to before `stop` along k as a grid of their own."""
+        start = self.world_from_grid * RigidTransform.from_translation([0, 0, first * self.spacing_mm[2]])
+        return VoxelGrid((*self.shape[:2], stop - first), self.spacing_mm, start)
+
+    def size_gb(self, voxel_type: str) -> float:
+        """Size of the voxels alone, GB."""
+        return math.prod(float(n) for n in self.shape) * np.dtype(voxel_type).itemsize / 1e9
+
+    def __str__(self) -> str:
+        voxels = " x ".join(str(n) for n in self.shape)
+        return f"{voxels} voxels of {' x '.join(f'{step:g}' for step in self.spacing_mm)} mm"
+
+
+@dataclass(frozen=True)
+class Slab:
+    """Some planes of a volume.
+
+    Attributes
+    ----------
+    first : int
+        The first plane's number along k.
+    voxels : ndarray, shape (planes, n_j, n_i)
+        Of the type asked for; empty ones are NaN in float32 and 0 in whole numbers.
+    state : ndarray of uint8, shape (planes, n_j, n_i)
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
+    """
+
+    first: int
+    voxels: npt.NDArray[Any]
+    state: ByteArray
+
+
+def grid_around(
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    voxel_mm: float | Triple,
+    world_from_axes: Rotation | None = None,
+) -> VoxelGrid:
+    """Smallest grid that holds the corners of every image.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    voxel_mm : float, or tuple of float
+        Side of a cubic voxel, or sides along i, j and k.
+    world_from_axes : Rotation, optional
+        Directions of the voxel axes; without it, the world's.
+
+    Raises
+    ------
+    InvalidInputError
+        If `voxel_mm` is not positive, or there are no poses.
+    """
+    spacing = _checked_spacing(voxel_mm, "voxel_mm")
+    axes = _single(world_from_axes)
+    low, high = _bounds(grid, world_from_image, axes)
+    shape = _checked_shape(_counts(low, high, spacing), spacing)
+    return VoxelGrid(shape, spacing, RigidTransform.from_components(axes.apply(low), axes))
+
+
+def grid_as_asked(
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    spacing_mm: float | Triple,
+    *,
+    world_from_axes: Rotation | None = None,
+    origin_mm: npt.ArrayLike | None = None,
+    shape: tuple[int, int, int] | None = None,
+    size_mm: Triple | None = None,
+) -> VoxelGrid:
+    """Grid whose spacing, orientation, origin and size are as asked for, and what is not holds the images.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    spacing_mm : float, or tuple of float
+        The same along i, j and k, or each.
+    world_from_axes : Rotation, optional
+        Directions of the voxel axes; without it, the world's.
+    origin_mm : array_like, shape (3,), optional
+        Centre of voxel ``[0, 0, 0]`` in the world; without it, the images' least corner along the axes.
+    shape : tuple of int, optional
+        Voxels along i, j and k.
+    size_mm : tuple of float, optional
+        Instead of `shape`, sizes along i, j and k from outer side to outer side, rounded up to whole voxels.
+        With neither, the grid reaches to the images' greatest corner.
+
+    Raises
+    ------
+    InvalidInputError
+        If a value is not what it must be, both `shape` and `size_mm` are given, or the grid would end before
+        its origin.
+    """
+    spacing = _checked_spacing(spacing_mm, "spacing_mm")
+    axes = _single(world_from_axes)
+    low, high = _bounds(grid, world_from_image, axes)
+    if origin_mm is None:
+        origin = axes.apply(low)
+    else:
+        origin = _three(origin_mm, "origin_mm")
+        low = axes.inv().apply(origin)
+    if shape is not None and size_mm is not None:
+        raise InvalidInputError("voxels: expected a shape or a size in mm, got both")
+    if size_mm is not None:
+        # A hair less, so that rounding does not add a voxel to a whole number of them.
+        counts = np.ceil(np.divide(_positive(size_mm, "size_mm"), spacing) - 1e-6)
+    elif shape is not None:
+        counts = _positive(shape, "shape")
+    else:
+        counts = _counts(low, high, spacing)
+    return VoxelGrid(_checked_shape(counts, spacing), spacing, RigidTransform.from_components(origin, axes))
+
+
+def grid_like(volume: Volume) -> VoxelGrid:
+    """Grid of a volume, to make another one with the same voxels."""
+    return VoxelGrid(volume.shape, volume.spacing_mm, volume.world_from_grid)
+
+
+def spacing_within(
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    max_gb: float,
+    world_from_axes: Rotation | None = None,
+    voxel_type: VoxelType = "uint8",
+) -> float:
+    """Finest round spacing of cubic voxels with which the volume around the images stays within a size.
+
+    Spacings are 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 and 8 times a power of ten. None is finer than the images'
+    own samples: finer voxels would show no more.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    max_gb : float
+        Of the voxels: what a file, unpacked, and a viewer hold. To work on them takes `max_memory_gb` of the
+        settings, whatever the volume.
+    world_from_axes : Rotation, optional
+        Directions of the voxel axes; without it, the world's.
+    voxel_type : {"uint8", "int16", "uint16", "float32"}
+
+    Returns
+    -------
+    float
+        mm.
+
+    Raises
+    ------
+    InvalidInputError
+        If `max_gb` is not enough for any spacing up to 800 mm, or there are no poses.
+
+    Examples
+    --------
+    >>> spacing_within(ImageGrid(400, 400, 0.1, 0.1), RigidTransform.identity(1), max_gb=1e-4)
+    0.15
+    """
+    finest = min(grid.vector_pitch_mm, grid.sample_spacing_mm) * (1 - 1e-9)
+    low, high = _bounds(grid, world_from_image, _single(world_from_axes))
+    most = max_gb * 1e9 / np.dtype(voxel_type).itemsize
+    # As decimal text, so that 0.3 is 0.3 and not 3 x 0.1.
+    for spacing in (float(f"{step}e{power}") for power in range(-6, 3) for step in _ROUND_SPACINGS):
+        if spacing >= finest and np.prod(_counts(low, high, spacing)) <= most:
+            return spacing
+    raise InvalidInputError(f"max_gb: expected enough for some voxels, got {max_gb:g} GB")
+
+
+def _bounds(
+    grid: ImageGrid, world_from_image: RigidTransform, world_from_axes: Rotation
+) -> tuple[FloatArray, FloatArray]:
+    """Least and greatest coordinates along the axes of the images' corners."""
+    along = world_from_axes.inv().apply(image_corners(grid, world_from_image))
+    return along.min(axis=0), along.max(axis=0)
+
+
+def _counts(low: FloatArray, high: FloatArray, spacing: float | Triple) -> FloatArray:
+    """Voxels from a corner to another."""
+    # A corner half a voxel past the last centre would round up, and so may one a rounding error short of it.
+    return np.asarray(np.floor((high - low) / np.asarray(spacing) + 0.5 + 1e-6) + 1)
+
+
+def _single(world_from_axes: Rotation | None) -> Rotation:
+    axes = Rotation.identity() if world_from_axes is None else world_from_axes
+    if not axes.single:
+        raise InvalidInputError("world_from_axes: expected a single rotation, got a row of them")
+    return axes
+
+
+def _three(values: npt.ArrayLike, name: str) -> FloatArray:
+    found = np.asarray(values, dtype=float)
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise InvalidInputError(f"{name}: expected three finite values, got {found.tolist()}")
+    return found
+
+
+def _positive(values: npt.ArrayLike, name: str) -> FloatArray:
+    found = _three(values, name)
+    if (found <= 0).any():
+        raise InvalidInputError(f"{name}: expected values above zero, got {found.tolist()}")
+    return found
+
+
+def _checked_spacing(spacing_mm: float | Triple, name: str) -> Triple:
+    if np.ndim(spacing_mm) == 0 and not (np.isfinite(spacing_mm) and np.greater(spacing_mm, 0)):
+        raise InvalidInputError(f"{name}: expected a value above zero, got {spacing_mm}")
+    i, j, k = _positive(
+        np.broadcast_to(spacing_mm, 3) if np.ndim(spacing_mm) == 0 else spacing_mm, name
+    ).tolist()
+    return i, j, k
+
+
+def _checked_shape(counts: FloatArray, spacing_mm: Triple) -> tuple[int, int, int]:
+    if (counts < 1).any():
+        raise InvalidInputError("origin_mm: expected an origin before the images' end, got one beyond it")
+    if (counts > MAX_VOXELS_ALONG).any() or (counts != np.floor(counts)).any():
+        shown = " x ".join(f"{count:g}" for count in counts)
+        raise InvalidInputError(
+            f"voxels: expected whole numbers up to {MAX_VOXELS_ALONG} along each axis, got {shown} of "
+            f"{spacing_mm} mm"
+        )
+    n_i, n_j, n_k = (int(count) for count in counts)
+    return n_i, n_j, n_k

@@ -1,0 +1,198 @@
+"""Voxels from a sweep's images, all of them in memory.
+
+Voxels are indexed ``[i, j, k]`` along the grid's x, y and z, which are the world's axes unless asked
+otherwise: in the mode `image` lateral, axial and elevational of the first frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import ValidationError
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.arrays import BoolArray, ByteArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.images import Images, PosedImages
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
+from speckle3d.imaging.voxels.slabs import compound_slabs, working_gb
+from speckle3d.imaging.voxels.splatting import Weights, batch_gb
+
+DEFAULT_FILL_RADIUS = 3
+"""Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
+
+MAX_MEMORY_GB = 4.0
+"""Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
+
+
+@dataclass(frozen=True)
+class CompoundedVolume(Volume):
+    """A volume and where its voxels are from.
+
+    Attributes
+    ----------
+    state : ndarray of uint8, shape (n_i, n_j, n_k)
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
+    """
+
+    state: ByteArray = field(kw_only=True)
+
+
+def compound(
+    images: Images,
+    grid: ImageGrid,
+    world_from_image: RigidTransform,
+    voxel_mm: float | None = None,
+    *,
+    voxel_grid: VoxelGrid | None = None,
+    splat: Splat = "nearest",
+    rule: Rule = "mean",
+    weights: Weights | None = None,
+    region: BoolArray | None = None,
+    fill_radius: int = DEFAULT_FILL_RADIUS,
+    backward_mm: float = 0.0,
+    voxel_type: VoxelType = "float32",
+    world_from_axes: Rotation | None = None,
+    max_memory_gb: float = MAX_MEMORY_GB,
+) -> CompoundedVolume:
+    """Compound a sweep's images into voxels, cubic ones that hold all of it or those of a grid.
+
+    With "nearest" a sample counts in the voxel it lies in; with "linear" in the eight whose centres are
+    around it, by trilinear shares. A voxel becomes the mean of its samples by their shares, their maximum,
+    the mean of those of the latest image that has any there, or their mean by weight; with "linear", shares
+    below 1/8 do not count for the maximum and the latest. With "plus" the mean is kept in whole grey levels,
+    as PLUS and 3D Slicer keep it; see `speckle3d.imaging.voxels.whole_levels`.
+
+    An empty voxel is then the mean of those that are not in the smallest cube around it that holds any;
+    measured voxels stay as they are.
+
+    Parameters
+    ----------
+    images : indexable or callable
+        Grey images by frame number, shape (vector, sample), read one at a time; the latest is the last.
+    grid : ImageGrid
+    world_from_image : RigidTransform, length n
+    voxel_mm : float, optional
+        Side of cubic voxels; or give `voxel_grid`.
+    voxel_grid : VoxelGrid, optional
+        Where voxels lie; samples elsewhere are left out.
+    splat : {"nearest", "linear"}
+    rule : {"mean", "maximum", "latest", "weighted", "plus"}
+        With "plus" images and voxels must be of uint8.
+    weights : ndarray of shape (n,), or images of weights, optional
+        For the rule "weighted"; samples whose weight is 0 or NaN do not count.
+    region : ndarray of bool, shape (vector, sample), optional
+        Samples that count; by default all.
+    fill_radius : int
+        Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
+        stay empty. The volume also grows by so many voxels beyond the first and the last frame.
+    backward_mm : float
+        For sparse sweeps: if above zero, each voxel is interpolated between the images nearest on either
+        side, up to this far from it, without `splat`, `rule` and `fill_radius`; see
+        `speckle3d.imaging.voxels.backward`.
+    voxel_type : {"float32", "uint8", "int16", "uint16"}
+        With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
+        are 0.
+    world_from_axes : Rotation, optional
+        Directions of the axes of cubic voxels; without it, the world's.
+    max_memory_gb : float
+        For the volume and the work on it.
+
+    Returns
+    -------
+    CompoundedVolume
+
+    Raises
+    ------
+    InvalidInputError
+        If the volume would take more than `max_memory_gb`, or an input is not what it must be.
+    InsufficientDataError
+        If no sample has a value.
+
+    References
+    ----------
+    .. [1] R. Rohling, A. Gee and L. Berman, "A comparison of freehand three-dimensional ultrasound
+       reconstruction techniques", Medical Image Analysis, 1999.
+
+    Examples
+    --------
+    Four images, 1 mm apart, of four vectors and five samples:
+
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import RigidTransform
+    >>> from speckle3d.core.sweep import ImageGrid
+    >>> grid = ImageGrid(vectors=4, samples=5, vector_pitch_mm=1.0, sample_spacing_mm=1.0)
+    >>> poses = RigidTransform.from_translation([[0.0, 0.0, z] for z in range(4)])
+    >>> volume = compound([np.full((4, 5), level) for level in range(4)], grid, poses, voxel_mm=1.0)
+    >>> volume.shape, volume.voxels[0, 0].tolist()
+    ((4, 5, 4), [0.0, 1.0, 2.0, 3.0])
+    """
+    source = PosedImages(images, grid, world_from_image)
+    if (voxel_mm is None) == (voxel_grid is None):
+        raise InvalidInputError("compound: expected either voxel_mm or voxel_grid")
+    if voxel_grid is None:
+        voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)
+    try:
+        settings = CompoundingSettings(
+            splat=splat,
+            rule=rule,
+            fill_radius=fill_radius,
+            backward_mm=backward_mm,
+            voxel_type=voxel_type,
+            max_memory_gb=max_memory_gb,
+        )
+    except ValidationError as error:
+        found = error.errors()[0]
+        raise InvalidInputError(f"{found['loc'][0]}: {found['msg']}, got {found['input']!r}") from None
+    return _joined(
+        source, voxel_grid, _within_memory(voxel_grid, settings, batch_gb(source)), weights, region
+    )
+
+
+def _within_memory(
+    voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float
+) -> CompoundingSettings:
+    """Settings whose memory is what slabs may take beside the whole volume.
+
+    Raises
+    ------
+    InvalidInputError
+        If nothing is left.
+    """
+    if working_gb(voxel_grid, settings, frames_gb) <= settings.max_memory_gb:
+        return settings
+    # The type that the levels have, and a byte of state.
+    most, held = settings.max_memory_gb, voxel_grid.size_gb(settings.voxel_type) + voxel_grid.size_gb("uint8")
+    if held >= most:
+        raise InvalidInputError(
+            f"volume: expected at most {most:g} GB of memory, got {held:.3g} GB for {voxel_grid}: take "
+            "larger voxels, or check the poses"
+        )
+    return settings.model_copy(update={"max_memory_gb": most - held})
+
+
+def _joined(
+    source: PosedImages,
+    voxel_grid: VoxelGrid,
+    settings: CompoundingSettings,
+    weights: Weights | None,
+    region: BoolArray | None,
+) -> CompoundedVolume:
+    voxels, state = None, None
+    for slab in compound_slabs(source, voxel_grid, settings, weights, region):
+        if slab.voxels.shape[0] == voxel_grid.shape[2]:
+            voxels, state = slab.voxels, slab.state
+            break
+        if voxels is None or state is None:
+            voxels = np.empty(voxel_grid.shape[::-1], settings.voxel_type)
+            state = np.empty(voxel_grid.shape[::-1], np.uint8)
+        own = slice(slab.first, slab.first + len(slab.voxels))
+        voxels[own], state[own] = slab.voxels, slab.state
+    if voxels is None or state is None or not state.any():
+        raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
+    placed = voxel_grid.spacing_mm, voxel_grid.world_from_grid
+    return CompoundedVolume(voxels.T, *placed, state=state.T)

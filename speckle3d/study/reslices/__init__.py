@@ -1,0 +1,1 @@
+"""Where a sweep is cut, what shows there in every mode, and its figures."""

@@ -1,0 +1,259 @@
+"""Cuts through a sweep at the poses of one or several modes, as a person asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.cuts.curved import CurvedSheet
+from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
+from speckle3d.io.load import kind_of
+from speckle3d.io.reconstructions import FORMAT
+from speckle3d.scoring.references import REFERENCES, find_reference
+from speckle3d.scoring.trajectories import poses_of
+from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
+from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
+from speckle3d.study.reslices.places import (
+    AnyCut,
+    Place,
+    frame_centres,
+    frame_lines,
+    sweep_extent,
+    view_of,
+)
+
+
+@dataclass(frozen=True)
+class DrawnCut:
+    """A cut as it is drawn.
+
+    Attributes
+    ----------
+    image : ndarray of float32, shape (rows, columns)
+        dB or levels; NaN where nothing was seen.
+    cut : ReslicePlane or CurvedSheet
+        Where it is.
+    frames : ndarray, shape (n, m, 2)
+        Line in which each frame crosses the cut, by the picture's axes, mm; NaN where it does not. Empty for
+        cuts of voxels.
+    centres : ndarray, shape (n,)
+        Where along x the frames' centres are, from the first one's, mm.
+    """
+
+    image: Float32Array
+    cut: AnyCut
+    frames: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    centres: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    @classmethod
+    def of_sweep(cls, image: Float32Array, cut: AnyCut, grid: ImageGrid, poses: RigidTransform) -> DrawnCut:
+        """A cut with where the frames are that it was made from."""
+        return cls(image, cut, frame_lines(cut, grid, poses), frame_centres(cut, grid, poses))
+
+
+@dataclass(frozen=True)
+class CutPicture:
+    """Cuts of one place at the poses of several modes, and what a picture of them says.
+
+    Attributes
+    ----------
+    cuts : mapping of str to DrawnCut
+        By mode.
+    axes : tuple of str
+        Names of x and y, without the unit.
+    place : str
+        Where the cut is.
+    unit : str
+        Of the images: "dB" or "level", and of what.
+    levels : tuple of float, optional
+        Black and white.
+    reference : str, optional
+        Mode that the others are compared with.
+    name : str
+        Of the sweep or the volume.
+    numbers : ndarray of int, shape (n,), optional
+        Of the frames; by default from 0.
+    anchors : mapping of str to mapping
+        Poses of some frames of each mode; see `cut_geometry.anchors_of`.
+    """
+
+    cuts: Mapping[str, DrawnCut]
+    axes: tuple[str, str] = ("along the sweep", "depth")
+    place: str = ""
+    unit: str = "dB"
+    levels: tuple[float, float] | None = None
+    reference: str | None = None
+    name: str = ""
+    numbers: IntArray | None = None
+    anchors: Mapping[str, Anchors] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class OpenedModes:
+    """A sweep at the poses of several modes.
+
+    Attributes
+    ----------
+    posed : PosedSweep
+        Of the frames that all modes have.
+    poses : dict of str to RigidTransform, length n
+    reference : str
+        One of the modes.
+    """
+
+    posed: PosedSweep
+    poses: dict[str, RigidTransform]
+    reference: str
+
+
+def open_modes(
+    path: Path, modes: Sequence[str] = (), reference: str | None = None, sweep_file: Path | None = None
+) -> OpenedModes:
+    """Open a reconstruction at several modes, or a recording at its own poses.
+
+    Parameters
+    ----------
+    path : path
+        As for `open_posed`.
+    modes : sequence of str
+        Modes of the reconstruction, "tracker" or "truth"; by default as for `open_posed`.
+    reference : str, optional
+        What to compare them with; by default the truth or a tracker that covers all frames, if there are
+        several modes, else the first.
+
+    Raises
+    ------
+    InvalidInputError, InsufficientDataError
+        If there is no such mode.
+    """
+    is_reconstruction = kind_of(path) == FORMAT
+    own = [mode for mode in modes if mode not in REFERENCES or not is_reconstruction]
+    first = open_posed(path, own[0] if own else None, sweep_file)
+    asked = list(dict.fromkeys(modes)) or [first.mode]
+    reference = reference or _known_reference(first.sweep, asked)
+    every = {mode: _posed(first, mode) for mode in dict.fromkeys([*asked, reference])}
+    shared = reduce(np.intersect1d, [frames for _, frames in every.values()])
+    if not shared.size:
+        raise InsufficientDataError(
+            f"{path}: expected a frame that has a pose in {' and '.join(every)}, got none"
+        )
+    poses = {mode: each[np.isin(frames, shared)] for mode, (each, frames) in every.items()}
+    posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
+    return OpenedModes(posed, poses, reference)
+
+
+def _known_reference(sweep: Sweep, asked: Sequence[str]) -> str:
+    """What several modes are compared with, if nobody says."""
+    known = find_reference(sweep) if len(asked) > 1 else None
+    return known.name if known is not None and known.covered.all() else asked[0]
+
+
+def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
+    """Poses of one mode, and the frames that have them."""
+    if mode == first.mode:
+        return first.world_from_image, first.frames
+    if first.reconstruction is not None and mode not in REFERENCES:
+        return poses_of(first.reconstruction, mode), first.frames
+    itself = posed_by_itself(first.sweep, mode)
+    return itself.world_from_image, itself.frames
+
+
+def cut_posed(
+    opened: OpenedModes,
+    place: Place,
+    dynamic_range_db: float = 60.0,
+    voxels: tuple[Volume, ByteArray | None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> CutPicture:
+    """Cut a sweep at the poses of every mode, from its frames or from voxels made of it and their states.
+
+    Raises
+    ------
+    InvalidInputError
+        If the place is none, or shows nothing; says where the sweep is.
+    """
+    images, grid = opened.posed.images(dynamic_range_db, progress)
+    numbers = opened.posed.frames
+    placed = place.counted_in(numbers).cuts(opened.poses, grid, opened.reference)
+    if voxels is None:
+        pairs = [(opened.poses[mode], cut) for mode, cut in placed.items()]
+        levels = reslice_at(images, grid, pairs, place.reach_mm)
+        found = [((each / 255 - 1) * dynamic_range_db).astype(np.float32) for each in levels]
+    else:
+        found = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
+    there = opened.poses[opened.reference]
+    if not any(np.isfinite(each).any() for each in found):
+        raise InvalidInputError(
+            f"cut: expected one that meets the sweep, which lies {sweep_extent(there, grid)}, got one that "
+            "shows nothing"
+        )
+    cuts = {
+        mode: DrawnCut.of_sweep(image, cut, grid, opened.poses[mode])
+        for (mode, cut), image in zip(placed.items(), found, strict=True)
+    }
+    shown = placed[opened.reference]
+    where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
+    unit = "dB" if voxels is None else _unit_of(voxels[0])
+    range_db = (-dynamic_range_db, 0.0) if voxels is None else None
+    reference = opened.reference if len(cuts) > 1 else None
+    axes, name = place.axes(shown, there), opened.posed.sweep.name
+    anchors = {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()}
+    return CutPicture(cuts, axes, where, unit, range_db, reference, name, numbers, anchors)
+
+
+def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
+    """Cut a volume; by default across the middle of its third axis.
+
+    Raises
+    ------
+    InvalidInputError
+        If the place is none, or misses the volume.
+    """
+    cut = place.cut_of_box(volume)
+    drawn = DrawnCut(reslice_volume(volume, cut, state), cut)
+    names = ("i", "j") if place.is_along_sweep else ("in the cut", "in the cut")
+    return CutPicture({"volume": drawn}, names, place.words(), _unit_of(volume), name=name)
+
+
+def _unit_of(volume: Volume) -> str:
+    """What a volume's levels are, as far as its file says."""
+    told = volume.fields.get("levels", "")
+    return f"level, {told}" if told else "level"
+
+
+def cut_as_volume(picture: CutPicture) -> Volume:
+    """The only cut as a volume of one plane at its place.
+
+    Of frames, levels are 1 to 255, and 0 where nothing was seen; of voxels they stay as they are, NaN there.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are several, or it is curved.
+    """
+    if len(picture.cuts) > 1:
+        raise InvalidInputError(f"expected one mode for a volume file, got {', '.join(picture.cuts)}")
+    ((mode, drawn),) = picture.cuts.items()
+    if isinstance(drawn.cut, CurvedSheet):
+        raise InvalidInputError("expected a picture (.png) of a curved cut, which lies in no one plane")
+    fields = {"cut": picture.place, "of": picture.name, "mode": mode}
+    voxels: npt.NDArray[Any] = drawn.image
+    if picture.levels is not None:
+        low, high = picture.levels
+        # From 1 up, so that 0 means nothing was seen.
+        level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
+        voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
+        fields["levels"] = f"log-compressed, {high - low:g} dB from 1 to 255; 0 where nothing was seen"
+    step = drawn.cut.pixel_mm
+    return Volume(voxels[None].T, (step, step, step), drawn.cut.world_from_plane, fields)

@@ -1,0 +1,307 @@
+"""Voxels of a sweep into files, a slab at a time: ``speckle3d volume`` and ``reconstruct --volume``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segment
+from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.axes import principal_axes, sweep_axes
+from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.measures.uncertainty import DeviationField
+from speckle3d.imaging.region import Region
+from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.imaging.voxels.slabs import compound_slabs
+from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.volume_writer import VolumeWriter
+from speckle3d.io.volumes import read_volume
+from speckle3d.study.pose_errors import posed_errors_of
+from speckle3d.study.posed import PosedSweep
+
+BEST_FIRST = ("fused", "crossed", "pose", "inertial", "orientation", "image")
+"""Modes in the order in which a volume takes its poses: those that set the length first."""
+
+Axes = Literal["sweep", "world", "principal"]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class GridRequest:
+    """Where voxels are asked to lie.
+
+    Attributes
+    ----------
+    axes : {"sweep", "world", "principal"}
+        Along the images' mean lateral, axial and elevational direction; the world's axes; or those of the
+        smallest box.
+    spacing_mm : tuple of float, optional
+        Along i, j and k; by default the same along each, that of the settings.
+    origin_mm : tuple of float, optional
+        Centre of the first voxel in the world; by default the grid begins where the images do.
+    shape : tuple of int, optional
+        Voxels along i, j and k; by default the grid reaches to where the images end.
+    size_mm : tuple of float, optional
+        Instead of `shape`: sizes along i, j and k from outer side to outer side.
+    within_gb : float, optional
+        Instead of `spacing_mm`: the finest round one with which voxels that hold the images take no more.
+    like : path, optional
+        A volume whose grid to take instead of all this.
+    """
+
+    axes: Axes = "sweep"
+    spacing_mm: tuple[float, float, float] | None = None
+    origin_mm: tuple[float, float, float] | None = None
+    shape: tuple[int, int, int] | None = None
+    size_mm: tuple[float, float, float] | None = None
+    within_gb: float | None = None
+    like: Path | None = None
+
+    def grid(
+        self, images: ImageGrid, world_from_image: RigidTransform, settings: CompoundingSettings
+    ) -> VoxelGrid:
+        """Grid for a sweep's images, or for a part of each.
+
+        Raises
+        ------
+        InvalidInputError
+            If a grid like another's is asked for and anything else beside it, a size in both voxels and mm, a
+            spacing and a bound of it, or a value is not what it must be.
+        """
+        if self.like is not None:
+            if self != GridRequest(like=self.like):
+                raise InvalidInputError("--like: expected no other option of the grid beside it")
+            return grid_like(read_volume(self.like))
+        if self.spacing_mm is not None and self.within_gb is not None:
+            raise InvalidInputError("--within-gb: expected no --spacing-mm beside it")
+        axes = self._axes(images, world_from_image)
+        spacing: float | tuple[float, float, float] = self.spacing_mm or settings.voxel_mm
+        if self.within_gb is not None:
+            spacing = spacing_within(images, world_from_image, self.within_gb, axes, settings.voxel_type)
+        return grid_as_asked(
+            images,
+            world_from_image,
+            spacing,
+            world_from_axes=axes,
+            origin_mm=self.origin_mm,
+            shape=self.shape,
+            size_mm=self.size_mm,
+        )
+
+    def _axes(self, images: ImageGrid, world_from_image: RigidTransform) -> Rotation:
+        if self.axes == "world":
+            return Rotation.identity()
+        if self.axes == "principal":
+            return principal_axes(images, world_from_image)
+        return sweep_axes(world_from_image)
+
+
+@dataclass(frozen=True)
+class VolumeRequest:
+    """A volume to make of a sweep.
+
+    Attributes
+    ----------
+    path : path
+        With a suffix of `speckle3d.io.volume_writer.SUFFIXES`.
+    region : Region, optional
+        Of the images; samples outside it do not count.
+    state_path : path, optional
+        Where to write which voxels are measured and filled, as labels.
+    deviation_path : path, optional
+        Where to write each voxel's standard deviation of position along the sweep, mm.
+    """
+
+    path: Path
+    settings: CompoundingSettings = field(default_factory=CompoundingSettings)
+    grid: GridRequest = GridRequest()
+    region: Region | None = None
+    state_path: Path | None = None
+    deviation_path: Path | None = None
+
+
+@dataclass(frozen=True)
+class VolumeReport:
+    """A volume that was written.
+
+    Attributes
+    ----------
+    counts : ndarray of int, shape (3,)
+        Voxels that are empty, measured and filled.
+    size_bytes : int
+        Of the file.
+    seconds : float
+        It took.
+    """
+
+    path: Path
+    mode: str
+    grid: VoxelGrid
+    counts: IntArray
+    size_bytes: int
+    seconds: float
+
+    def summary(self) -> dict[str, Any]:
+        """Everything as JSON has it."""
+        shares = self.counts / self.counts.sum()
+        return {
+            "file": str(self.path),
+            "size_bytes": self.size_bytes,
+            "mode": self.mode,
+            "shape": list(self.grid.shape),
+            "spacing_mm": list(self.grid.spacing_mm),
+            "world_from_grid": self.grid.world_from_grid.as_matrix().tolist(),
+            "measured": float(shares[MEASURED]),
+            "filled": float(shares[FILLED]),
+            "empty": float(shares[EMPTY]),
+            "seconds": self.seconds,
+        }
+
+    @property
+    def line(self) -> str:
+        """File, size, voxels, and the share of each state in one line."""
+        shares = 100 * self.counts / self.counts.sum()
+        named = ", ".join(
+            f"{shares[state]:.1f} % {word}"
+            for state, word in ((MEASURED, "measured"), (FILLED, "filled"), (EMPTY, "empty"))
+        )
+        size = f"{self.size_bytes / 1e6:.3g} MB"
+        return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {named}; {self.seconds:.1f} s"
+
+
+def best_mode(reconstruction_file: Path) -> str:
+    """First of `BEST_FIRST` that a reconstruction holds."""
+    held = read_reconstruction(reconstruction_file, with_pairs=False).poses
+    return next(mode for mode in BEST_FIRST if mode in held)
+
+
+def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress | None = None) -> VolumeReport:
+    """Compound a sweep's images and write the volume as it is made.
+
+    Parameters
+    ----------
+    posed : PosedSweep
+    request : VolumeRequest
+    progress : callable, optional
+        Called with the number of planes done and of all.
+
+    Raises
+    ------
+    InvalidInputError
+        If a part of the request is not what it must be.
+    InsufficientDataError
+        If no sample of the images lies in the grid, or the rule "weighted" finds no claimed errors.
+    FileError
+        If a file cannot be written.
+    """
+    began, settings = time.perf_counter(), request.settings
+    levels = None if settings.levels == "auto" else settings.levels
+    source, meaning = posed.source(levels, settings.dynamic_range_db)
+    images = source.grid, source.world_from_image
+    grid = request.grid.grid(*(request.region.part(*images) if request.region else images), settings)
+    counts = np.zeros(3, dtype=np.int64)
+    place = grid.shape, grid.spacing_mm, grid.world_from_grid
+    fields = fields_of(posed, request, meaning)
+    with ExitStack() as files:
+        writers = [
+            files.enter_context(VolumeWriter(path, *place, kind, fields | more, segments=segments))
+            for path, kind, more, segments in _outputs(request)
+        ]
+        deviation = _deviation(posed, source, grid) if request.deviation_path else None
+        for slab in _slabs(posed, source, grid, request):
+            stop = slab.first + len(slab.state)
+            made = [slab.voxels, *([slab.state] if request.state_path else [])]
+            if deviation is not None:
+                made.append(deviation.planes(slab.first, stop, slab.state))
+            for writer, planes in zip(writers, made, strict=True):
+                writer.append(planes)
+            counts += [np.count_nonzero(slab.state == state) for state in range(3)]
+            if progress is not None:
+                progress(stop, grid.shape[2])
+        if counts[MEASURED] == 0:
+            raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
+    seconds = time.perf_counter() - began
+    return VolumeReport(request.path, posed.mode, grid, counts, request.path.stat().st_size, seconds)
+
+
+def _slabs(posed: PosedSweep, source: PosedImages, grid: VoxelGrid, request: VolumeRequest) -> Iterator[Slab]:
+    settings = request.settings
+    mask: BoolArray | None = None if request.region is None else request.region.mask(source.grid)
+    weighted = settings.rule == "weighted" and settings.backward_mm == 0
+    weights = confidence(posed, settings.voxel_mm) if weighted else None
+    return compound_slabs(source, grid, settings, weights, mask)
+
+
+def _outputs(
+    request: VolumeRequest,
+) -> Iterator[tuple[Path, str, dict[str, str], tuple[Segment, ...] | None]]:
+    """Files to write: path, type, what else they say, and segments of labels."""
+    yield request.path, request.settings.voxel_type, {}, None
+    if request.state_path is not None:
+        yield request.state_path, "uint8", {}, STATE_SEGMENTS
+    if request.deviation_path is not None:
+        said = {"levels": "standard deviation of position along the sweep, mm"}
+        yield request.deviation_path, "float32", said, None
+
+
+def _deviation(posed: PosedSweep, source: PosedImages, grid: VoxelGrid) -> DeviationField:
+    return DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
+
+
+def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
+    """Claimed errors of a reconstruction's poses.
+
+    Raises
+    ------
+    InsufficientDataError
+        If nothing says how well the frames' places are known.
+    """
+    if posed.reconstruction is None:
+        raise InsufficientDataError(
+            f"{posed.sweep.name}: {purpose}: expected a reconstruction with claimed errors, got a recording"
+        )
+    return posed_errors_of(posed.reconstruction, posed.mode)
+
+
+def confidence(posed: PosedSweep, voxel_mm: float) -> FloatArray:
+    """Weight of each frame: one over the variance of its place along the sweep and within a voxel.
+
+    Raises
+    ------
+    InsufficientDataError
+        If nothing says how well the frames' places are known.
+    """
+    errors = _errors(posed, "rule weighted").errors
+    place = (errors.factors[:, :, 2] ** 2).sum(axis=0) + voxel_mm**2 / 12
+    return np.asarray(place.min() / place)
+
+
+def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[str, str]:
+    """What a volume's file says of it."""
+    settings = request.settings
+    return {
+        "levels": meaning,
+        "poses": posed.mode,
+        **_method(settings),
+        "recording": posed.sweep.name,
+        "made_by": f"speckle3d {version('speckle3d')}",
+    }
+
+
+def _method(settings: CompoundingSettings) -> dict[str, str]:
+    if settings.backward_mm > 0:
+        return {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
+    filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
+    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}

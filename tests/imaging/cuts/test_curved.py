@@ -1,0 +1,89 @@
+"""Curved reslices against scenes whose place is known."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.cuts.curved import curved_sheet
+from speckle3d.imaging.cuts.reslice import reslice_frames, reslice_volume
+
+
+def arc(radius_mm, degrees, n, tilt=None):
+    angle = np.deg2rad(np.linspace(0, degrees, n))
+    points = radius_mm * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
+    return points if tilt is None else tilt.apply(points)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_columns_are_even_along_an_arc_of_known_radius(seed):
+    tilt = Rotation.random(rng=np.random.default_rng(seed))
+    down = tilt.apply([0, 0, 1.0])
+    sheet = curved_sheet(arc(20.0, 90.0, 12, tilt), 3.0 * down, (-2.0, 5.0), 0.1)
+    # A cubic spline through 12 points of a quarter circle leaves it by less than a micrometre.
+    assert sheet.width_mm == pytest.approx(20.0 * np.pi / 2, abs=0.1)
+    flat = tilt.inv().apply(sheet.base_mm)
+    np.testing.assert_allclose(np.linalg.norm(flat[:, :2], axis=1), 20.0, atol=2e-3)
+    np.testing.assert_allclose(flat[:, 2], -2.0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(sheet.base_mm, axis=0), axis=1), 0.1, rtol=1e-3)
+    np.testing.assert_allclose(
+        sheet.world_from_mm(10.0, 0.0), tilt.apply(20 * np.array([np.cos(0.5), np.sin(0.5), 0])), atol=2e-3
+    )
+
+
+def test_a_helix_swept_along_its_axis_is_a_straight_line_of_its_own_length():
+    """A bright thread on a cylinder: laid flat it is straight, and as long as it is."""
+    radius, pitch_mm = 8.0, 12.0
+    angle = np.linspace(0, 1.5 * np.pi, 40)
+    helix = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), pitch_mm * angle / (2 * np.pi)])
+    sheet = curved_sheet(helix, [0, 0, 1], (0.0, 10.0), 0.2)
+    x = radius * angle
+    np.testing.assert_allclose(sheet.world_from_mm(x[:-1], helix[:-1, 2]), helix[:-1], atol=5e-3)
+
+
+def test_a_cylinder_of_voxels_cut_along_its_wall_shows_its_level_alone():
+    radius = 6.0
+    i, j, _ = np.indices((80, 80, 20)) * 0.25
+    wall = np.hypot(i - 10, j - 10) - radius
+    volume = Volume(wall.astype(np.float32), (0.25,) * 3, RigidTransform.identity())
+    points = np.array([10.0, 10.0, 1.0]) + arc(radius, 300.0, 24)
+    cut = reslice_volume(volume, curved_sheet(points, [0, 0, 1], (0.0, 3.0), 0.25))
+    # Trilinear sampling of a distance is off by h^2 / (8 r): 1.3 micrometres; the spline by less than 1.
+    np.testing.assert_allclose(cut, 0.0, atol=3e-3)
+
+
+def test_frames_and_their_field_agree_along_a_curve():
+    grid = ImageGrid(41, 41, 0.5, 0.5)
+    poses = RigidTransform.from_translation(np.outer(np.arange(0, 12, 0.4), [0, 0, 1]))
+    gradient = np.array([0.7, -0.2, 1.1])
+    x, y = np.mgrid[:41, :41] * 0.5
+    images = [x * gradient[0] + y * gradient[1] + z * gradient[2] for z in poses.translation[:, 2]]
+    points = np.array([[2.0, 3.0, 1.0], [8.0, 3.0, 4.0], [10.0, 3.0, 9.0]])
+    sheet = curved_sheet(points, [0, 1, 0], (-3.0, 14.0), 0.25)
+    cut = reslice_frames(images, grid, poses, sheet, 0.5)
+    rows, columns = np.indices(sheet.shape)
+    world = sheet.world_from_mm(columns * 0.25, rows * 0.25 - 3.0)
+    # Single precision; the scene is linear, so blending adds nothing.
+    np.testing.assert_allclose(cut, world @ gradient, atol=1e-4)
+
+
+def test_straight_lines_between_points_and_points_picked_twice():
+    points = [[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 4, 0]]
+    sheet = curved_sheet(points, [0, 0, 1], (0.0, 1.0), 0.5, smooth=False)
+    assert sheet.width_mm == pytest.approx(7.0)
+    np.testing.assert_allclose(sheet.world_from_mm([1.0, 5.0], 0.0), [[1, 0, 0], [3, 2, 0]], atol=1e-9)
+
+
+def test_wrong_curves_say_what_was_expected():
+    for points, down, words in (
+        ([[0, 0, 0]], [0, 0, 1], "at least two"),
+        ([[0, 0, 0], [0, 0, 5]], [0, 0, 1], "at least two"),
+        ([[0, 0], [1, 1]], [0, 0, 1], "shape"),
+        ([[0, 0, 0], [np.nan, 0, 0]], [0, 0, 1], "finite"),
+        ([[0, 0, 0], [1, 0, 0]], [0, 0, 0], "direction"),
+        ([[0, 0, 0], [1e6, 0, 0]], [0, 0, 1], "100000000"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            curved_sheet(points, down, (0.0, 100.0), 0.1)

@@ -1,0 +1,114 @@
+"""Planes placed anywhere: by points, directions, a frame; and how much of them there is to see."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.cuts.oblique import (
+    covering_box,
+    covering_plane,
+    spanned_plane,
+    three_point_plane,
+    turned_frame_plane,
+)
+from speckle3d.imaging.cuts.planes import lateral_line, planes_from_first_frame
+
+GRID = ImageGrid(11, 21, 0.5, 0.5, 1.0)
+BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 6.0) for z in (0.0, 8.0)])
+
+
+def test_three_points_lie_on_their_plane_the_first_two_on_its_x():
+    points = np.random.default_rng(1).normal(0, 10, (3, 3))
+    there = three_point_plane(points).inv().apply(points)
+    np.testing.assert_allclose(there[:, 2], 0, atol=1e-12)
+    np.testing.assert_allclose(there[0], 0, atol=1e-12)
+    assert there[1, 0] > 0
+    assert there[1, 1] == pytest.approx(0, abs=1e-12)
+    assert there[2, 1] > 0
+
+
+def test_degenerate_planes_say_so():
+    for points in ([[0, 0, 0], [1, 1, 1], [3, 3, 3]], [[0, 0, 0], [0, 0, 0], [1, 0, 0]]):
+        with pytest.raises(InvalidInputError, match="not on one line"):
+            three_point_plane(points)
+    with pytest.raises(InvalidInputError, match="shape"):
+        three_point_plane([[0, 0, 0], [1, 0, 0]])
+    with pytest.raises(InvalidInputError, match="two directions"):
+        spanned_plane([0, 0, 0], [1, 0, 0], [-2, 0, 0])
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0])
+def test_a_turned_frame_holds_its_depth_line(angle_deg):
+    pose = RigidTransform.from_components([3.0, 1.0, -2.0], Rotation.from_euler("ZYX", [0.2, 0.5, -0.4]))
+    placed = pose.inv() * turned_frame_plane(pose, 2.0, angle_deg)
+    np.testing.assert_allclose(placed.apply([[0, 0, 0], [0, 7.0, 0]]), [[2, 0, 0], [2, 7, 0]], atol=1e-12)
+    turned = np.deg2rad(angle_deg)
+    right = placed.rotation.apply([1.0, 0, 0])
+    np.testing.assert_allclose(right, [np.cos(turned), 0, np.sin(turned)], atol=1e-12)
+
+
+def test_a_covering_plane_is_as_large_as_what_frames_show():
+    poses = RigidTransform.from_translation(np.outer(np.arange(9.0), [0, 0, 1]))
+    # Across all frames at depth 4, of a sweep 8 long and 5 wide.
+    placed = RigidTransform.from_components([-20.0, 4.0, 3.0], Rotation.from_euler("X", np.pi / 2))
+    plane = covering_plane(placed, GRID, poses, 0.5, 0.1)
+    assert (plane.width_mm, plane.height_mm) == pytest.approx((5.0, 8.0))
+    # Axes count from where the plane was placed.
+    np.testing.assert_allclose(plane.world_from_mm(22.0, 1.0), placed.apply([22.0, 1.0, 0.0]))
+    np.testing.assert_allclose(plane.world_from_plane.translation, [0, 4, 0], atol=1e-9)
+    with pytest.raises(InvalidInputError, match=r"49\.0 mm.*\(0, 1, 0\) and \(5, 11, 8\) mm"):
+        covering_plane(RigidTransform.from_translation([0, 0, 57.0]), GRID, poses, 0.5)
+
+
+def test_a_section_of_a_box_reaches_its_faces():
+    turned = Rotation.from_euler("Y", 45, degrees=True)
+    plane = covering_box(RigidTransform.from_components([2.0, 3.0, 4.0], turned), BOX, 0.1)
+    # From face to face of the shorter side, 4 mm, at 45 degrees.
+    assert (plane.width_mm, plane.height_mm) == pytest.approx((4.0 * np.sqrt(2), 6.0))
+    face = covering_box(RigidTransform.from_translation([0, 0, 8.0]), BOX, 0.1)
+    assert (face.width_mm, face.height_mm) == pytest.approx((4.0, 6.0))
+    with pytest.raises(InvalidInputError, match=r"between \(0, 0, 0\) and \(4, 6, 8\) mm, got one 2\.0 mm"):
+        covering_box(RigidTransform.from_translation([0, 0, 10.0]), BOX, 0.1)
+
+
+@pytest.mark.parametrize("back_and_forth", [False, True])
+def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer(back_and_forth):
+    """Two worlds, one of them 6 % too long: the first frame's line has one place in both pictures."""
+    z = np.arange(0, 20, 0.5)
+    z = np.concatenate([z, z[::-1]]) if back_and_forth else z
+    rng = np.random.default_rng(4)
+    moved = np.outer(z, [0.1, 0.05, 1.0])
+    worlds = [
+        RigidTransform.from_components(rng.normal(0, 50, 3), Rotation.random(rng=rng)) for _ in range(2)
+    ]
+    poses = {
+        "image": worlds[0] * RigidTransform.from_translation(1.06 * moved),
+        "truth": worlds[1] * RigidTransform.from_translation(moved),
+    }
+    planes = planes_from_first_frame(poses, lateral_line(GRID, 2.5), 0.1)
+    assert planes["image"].shape == planes["truth"].shape
+    line = lateral_line(GRID, 2.5)
+    for mode, plane in planes.items():
+        assert plane.first_mm == planes["truth"].first_mm
+        np.testing.assert_allclose(
+            plane.world_from_mm([0, 0], line[:, 1]), poses[mode][0].apply(line), atol=1e-9
+        )
+    far = int(np.argmax(z))
+    travelled = [
+        np.linalg.norm(each[far].apply(line[0]) - planes[mode].world_from_mm(0.0, 1.0))
+        for mode, each in poses.items()
+    ]
+    assert travelled[0] / travelled[1] == pytest.approx(1.06)
+    # Large enough for the longer one.
+    assert planes["truth"].width_mm == pytest.approx(1.06 * 19.5 * np.hypot(1.0, 0.1), rel=1e-9)
+
+
+def test_a_probe_turned_to_and_fro_keeps_its_plane():
+    turned = Rotation.from_rotvec(np.outer(0.5 * np.sin(np.arange(20.0)), [0, 1, 0]))
+    poses = RigidTransform.from_components(np.outer(np.arange(20.0), [0, 0, 0.5]), turned)
+    (plane,) = planes_from_first_frame({"image": poses}, lateral_line(GRID, 0.0)).values()
+    normal = plane.world_from_plane.rotation.apply([0, 0, 1.0])
+    # Turned about the line itself, which stays in one plane.
+    np.testing.assert_allclose(np.abs(normal), [1, 0, 0], atol=1e-9)

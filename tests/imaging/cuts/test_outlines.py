@@ -1,0 +1,53 @@
+"""Outlines of frames, and the lines in which frames cross a plane."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
+
+GRID = ImageGrid(11, 21, 0.4, 0.5, 1.0)
+
+
+def test_outlines_are_closed_and_keep_the_frames_sides():
+    rng = np.random.default_rng(3)
+    poses = RigidTransform.from_components(rng.normal(0, 20, (6, 3)), Rotation.random(6, rng=rng))
+    outlines = frame_outlines(GRID, poses)
+    np.testing.assert_array_equal(outlines[:, 0], outlines[:, 4])
+    sides = np.linalg.norm(np.diff(outlines, axis=1), axis=2)
+    np.testing.assert_allclose(sides, np.tile([4.0, 10.0, 4.0, 10.0], (6, 1)))
+    np.testing.assert_allclose(outlines[2, 1], poses[2].apply([4.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_crossings_are_on_the_plane_and_on_the_outline(seed):
+    """Against a dense walk along the line that a frame's and the cut's endless planes share."""
+    rng = np.random.default_rng(seed)
+    poses = RigidTransform.from_components(rng.normal(0, 3, (40, 3)), Rotation.random(40, rng=rng))
+    plane = RigidTransform.from_components(rng.normal(0, 1, 3), Rotation.random(rng=rng))
+    found = crossings(frame_outlines(GRID, poses), plane)
+    for pose, line in zip(poses, found, strict=True):
+        normals = np.array([each.rotation.apply([0, 0, 1.0]) for each in (pose, plane)])
+        along = np.cross(*normals)
+        offsets = [normals[0] @ pose.translation, normals[1] @ plane.translation, 0.0]
+        base = np.linalg.solve([*normals, along], offsets)
+        walk = base + np.arange(-60, 60, 0.001)[:, None] * along / np.linalg.norm(along)
+        x, y, _ = pose.inv().apply(walk).T
+        inside = (x > 0) & (x < 4) & (y > 1) & (y < 11)
+        assert inside.any() == np.isfinite(line).all()
+        if not inside.any():
+            continue
+        expected = plane.inv().apply(walk[inside][[0, -1]])[:, :2]
+        if y[inside][0] > y[inside][-1]:
+            expected = expected[::-1]
+        np.testing.assert_allclose(line, expected, atol=2e-3)
+    assert 5 < np.isfinite(found[:, 0, 0]).sum() < 40
+
+
+def test_a_frame_in_the_plane_or_beside_it_has_no_line():
+    poses = RigidTransform.from_translation([[0, 0, 0], [0, 0, 1.0]])
+    assert np.isnan(crossings(frame_outlines(GRID, poses), RigidTransform.identity())).all()
+    with pytest.raises(InvalidInputError, match="poses"):
+        frame_outlines(GRID, poses[0])

@@ -1,0 +1,218 @@
+"""Reslices straight from frames: against brute force, and against scenes whose place is known."""
+
+import numpy as np
+import oracles
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.cuts.planes import ReslicePlane, along_sweep_plane, surface_plane
+from speckle3d.imaging.cuts.reslice import reslice_frames
+
+GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
+FINE = ImageGrid(
+    vectors=61, samples=161, vector_pitch_mm=0.3, sample_spacing_mm=0.1, first_sample_depth_mm=2.0
+)
+
+
+def shaky_sweep(rng, frames, step_mm, shake_mm=0.2, shake_deg=3.0, reverse=True):
+    """Irregular steps, some backwards, with jitter in all six directions."""
+    z = np.cumsum(rng.uniform(-0.4 if reverse else 0.3, 1.6, frames) * step_mm)
+    shake = rng.normal(0.0, shake_mm, (frames, 3)) * [1, 1, 0]
+    turned = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(shake_deg), (frames, 3)))
+    return RigidTransform.from_components(shake + z[:, None] * [0, 0, 1], turned)
+
+
+def pixel_points(plane):
+    """Centre of every pixel in the world, shape (rows, columns, 3)."""
+    rows, columns = plane.shape
+    y, x = np.mgrid[:rows, :columns] * plane.pixel_mm
+    local = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    return plane.world_from_plane.apply(local.reshape(-1, 3)).reshape(rows, columns, 3)
+
+
+def image_points(grid, pose):
+    """Centre of every sample in the world, shape (vector, sample, 3)."""
+    i, j = np.mgrid[: grid.vectors, : grid.samples]
+    x, y = i * grid.vector_pitch_mm, grid.first_sample_depth_mm + j * grid.sample_spacing_mm
+    local = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    return pose.apply(local.reshape(-1, 3)).reshape(*i.shape, 3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), max_distance_mm=st.floats(0.05, 2.0), moderate=st.booleans())
+def test_matches_brute_force_for_any_plane(seed, max_distance_mm, moderate):
+    rng = np.random.default_rng(seed)
+    poses = shaky_sweep(rng, 7, 0.5)
+    images = rng.normal(size=(7, GRID.vectors, GRID.samples)).astype(np.float32)
+    images[rng.integers(7), :3, :3] = np.nan
+    turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) if moderate else Rotation.random(rng=rng)
+    plane = ReslicePlane(RigidTransform.from_components(rng.uniform(-1, 3, 3), turned), 4.0, 3.0, 0.21)
+    got = reslice_frames(images, GRID, poses, plane, max_distance_mm)
+    expected = oracles.reslice_nearest(images, 0.5, 0.3, 0.7, poses, pixel_points(plane), max_distance_mm)
+    # Distances are kept in single precision: 1e-7 of mm against gaps between frames of down to 1e-3 mm.
+    np.testing.assert_allclose(got, expected, atol=1e-3)
+
+
+def test_plane_of_an_image_returns_that_image():
+    rng = np.random.default_rng(3)
+    grid = ImageGrid(9, 14, 0.3, 0.3, 0.7)
+    poses = shaky_sweep(rng, 5, 0.5)
+    images = rng.normal(size=(5, 9, 14)).astype(np.float32)
+    corner = RigidTransform.from_translation([0.0, 0.7, 0.0])
+    plane = ReslicePlane(poses[2] * corner, grid.width_mm, grid.depth_mm - 0.7, 0.3)
+    got = reslice_frames(images, grid, poses, plane, 1e-3)
+    np.testing.assert_allclose(got, images[2].T, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_tilted_bright_plane_appears_where_it_is(seed):
+    """A bright sheet through an irregular sweep: its crest in the reslice against its equation."""
+    rng = np.random.default_rng(seed)
+    poses = shaky_sweep(rng, 80, 0.25)
+    normal = np.array([0.1, 1.0, 0.35]) / np.linalg.norm([0.1, 1.0, 0.35])
+    offset_mm = 10.0 * normal[1]
+    sheet = [np.exp(-0.5 * ((image_points(FINE, p) @ normal - offset_mm) / 0.4) ** 2) for p in poses]
+    plane = along_sweep_plane(poses, FINE, lateral_mm=9.0, pixel_mm=0.1)
+    cut = reslice_frames(sheet, FINE, poses, plane, 1.5)  # 3 degrees of shake open gaps of a millimetre
+    miss_mm = pixel_points(plane) @ normal - offset_mm
+    full = np.isnan(cut).mean(axis=0) < 0.3
+    # Before the first and after the last frame a pixel repeats the frame it projects onto: not measured here.
+    full[:15] = full[-15:] = False
+    weight = np.nan_to_num(cut[:, full]) ** 4
+    crest_mm = (weight * miss_mm[:, full]).sum(axis=0) / weight.sum(axis=0)
+    assert full.sum() > 80
+    # Half the closest sampling step, the 0.1 mm pixel: blending frames must not move it more.
+    assert np.abs(crest_mm).max() < 0.05
+
+
+def test_sphere_has_its_centre_and_diameter():
+    rng = np.random.default_rng(7)
+    poses = shaky_sweep(rng, 90, 0.2, reverse=False)
+    middle = poses.translation[:, 2].mean()
+    centre, radius = np.array([9.0, 10.0, middle]), 4.0
+    ball = [
+        (np.linalg.norm(image_points(FINE, p) - centre, axis=-1) < radius).astype(np.float32) for p in poses
+    ]
+    plane = along_sweep_plane(poses, FINE, lateral_mm=9.0, pixel_mm=0.1)
+    inside = np.nan_to_num(reslice_frames(ball, FINE, poses, plane, 0.6)) > 0.5
+    points = pixel_points(plane)[inside]
+    off_plane_mm = (centre - points[0]) @ plane.world_from_plane.rotation.apply([0.0, 0.0, 1.0])
+    diameter_mm = 2 * np.sqrt(inside.sum() * 0.1**2 / np.pi)
+    # A tenth of the 0.3 mm vector pitch for the centre of mass; half the pitch for the threshold's edge.
+    np.testing.assert_allclose(points.mean(axis=0)[1:], centre[1:], atol=0.03)
+    assert diameter_mm == pytest.approx(2 * np.sqrt(radius**2 - off_plane_mm**2), abs=0.15)
+
+
+def test_linear_scene_is_reproduced_between_parallel_frames():
+    """Bilinear sampling and linear blending are exact on a linear field, inside the sweep."""
+    poses = RigidTransform.from_translation(np.outer([0.0, 0.7, 0.3, 1.5, 1.1], [0, 0, 1]))
+    gradient = np.array([0.3, -1.1, 2.3])
+    images = [image_points(GRID, p) @ gradient for p in poses]
+    turned = Rotation.from_euler("ZYX", [0.2, 0.9, -0.3])
+    plane = ReslicePlane(RigidTransform.from_components([0.5, 1.0, 1.3], turned), 1.5, 1.5, 0.1)
+    cut, points = reslice_frames(images, GRID, poses, plane, 2.0), pixel_points(plane)
+    within = (points[..., 2] > 0) & (points[..., 2] < 1.5) & ~np.isnan(cut)
+    assert within.sum() > 100
+    np.testing.assert_allclose(cut[within], (points @ gradient)[within], atol=1e-5)
+
+
+def test_order_of_frames_does_not_matter():
+    rng = np.random.default_rng(11)
+    poses, images = shaky_sweep(rng, 9, 0.4), rng.normal(size=(9, 9, 14)).astype(np.float32)
+    plane = along_sweep_plane(poses, GRID, 2.0)
+    order = rng.permutation(9)
+    there = reslice_frames(images, GRID, poses, plane, 0.5)
+    np.testing.assert_array_equal(reslice_frames(images[order], GRID, poses[order], plane, 0.5), there)
+
+
+def test_probe_turned_round_still_brackets():
+    """The second image faces the other way: the pixel midway is the mean of both, not the nearer one."""
+    turned = RigidTransform.from_components([4.0, 0.0, 1.0], Rotation.from_rotvec([0, np.pi, 0]))
+    there = RigidTransform.from_translation([0.0, 0.0, 0.0])
+    poses = RigidTransform.concatenate([there, there, turned])
+    images = [np.full((9, 14), level) for level in (1.0, 1.0, 3.0)]
+    plane = ReslicePlane(RigidTransform.from_translation([1.0, 2.0, 0.5]), 1.0, 1.0, 0.5)
+    np.testing.assert_allclose(reslice_frames(images, GRID, poses, plane, 0.9), 2.0, atol=1e-6)
+
+
+def test_reads_only_frames_that_matter_and_one_at_a_time():
+    asked = []
+
+    def read(index):
+        asked.append(index)
+        return np.full((9, 14), index, dtype=np.uint8)
+
+    poses = RigidTransform.from_translation(np.outer(np.arange(50.0), [0, 0, 1]))
+    plane = ReslicePlane(RigidTransform.from_translation([0.0, 1.0, 20.25]), 2.0, 2.0, 0.5)
+    cut = reslice_frames(read, GRID, poses, plane, 1.0)
+    assert asked == [20, 21]
+    np.testing.assert_allclose(cut, 20.25, atol=1e-5)
+
+
+def test_unsupported_pixels_are_nan():
+    poses = RigidTransform.from_translation([[0.0, 0, 0], [0, 0, 1.0]])
+    plane = ReslicePlane(RigidTransform.from_translation([-1.0, 0.0, 0.5]), 8.0, 6.0, 0.5)
+    cut = reslice_frames(np.ones((2, 9, 14)), GRID, poses, plane, 1.0)
+    x, y = pixel_points(plane)[..., 0], pixel_points(plane)[..., 1]
+    inside = (x >= 0) & (x <= GRID.width_mm) & (y >= 0.7) & (y <= GRID.depth_mm + 1e-9)
+    np.testing.assert_array_equal(np.isnan(cut), ~inside)
+
+
+@pytest.mark.parametrize("back_and_forth", [False, True])
+def test_sweep_planes_cover_the_sweep_and_keep_its_length(back_and_forth):
+    z = (
+        np.concatenate([np.arange(0, 20, 0.5), np.arange(20, 0, -0.5)])
+        if back_and_forth
+        else np.arange(41) / 2
+    )
+    turned = Rotation.from_euler("ZYX", [0.4, -0.7, 1.0])
+    world = RigidTransform.from_components([30.0, -5.0, 12.0], turned)
+    poses = world * RigidTransform.from_translation(np.outer(z, [0, 0, 1]))
+    side, top = along_sweep_plane(poses, GRID, 1.5), surface_plane(poses, GRID, 2.0)
+    assert (side.width_mm, side.height_mm) == pytest.approx((20.0, GRID.depth_mm - 0.7))
+    assert (top.width_mm, top.height_mm) == pytest.approx((20.0, GRID.width_mm))
+    axes = (world.inv() * side.world_from_plane).rotation.as_matrix()
+    np.testing.assert_allclose(axes[:, :2], [[0, 0], [0, 1], [1, 0]], atol=1e-12)
+    origin = (world.inv() * top.world_from_plane).translation
+    np.testing.assert_allclose(origin, [0.0, 2.0, 0.0], atol=1e-12)
+
+
+def test_surface_plane_is_at_its_depth():
+    poses = shaky_sweep(np.random.default_rng(5), 40, 0.3, shake_mm=0.0, shake_deg=0.0)
+    images = [np.broadcast_to(0.7 + 0.3 * np.arange(14), (9, 14)) for _ in range(40)]
+    cut = reslice_frames(images, GRID, poses, surface_plane(poses, GRID, 2.35), 0.6)
+    np.testing.assert_allclose(cut[~np.isnan(cut)], 2.35, atol=1e-5)
+    assert np.isnan(cut).mean() < 0.05
+
+
+def test_travel_follows_a_probe_that_drifts_sideways():
+    poses = RigidTransform.from_translation(np.outer(np.arange(20.0), [0.3, 0.0, 1.0]))
+    side = along_sweep_plane(poses, GRID, 1.0)
+    np.testing.assert_allclose(side.world_from_plane.apply([0, 0, 0]), [1.0, 0.7, 0.0], atol=1e-9)
+    assert side.width_mm == pytest.approx(19 * np.hypot(1.0, 0.3))
+
+
+def test_wrong_inputs_say_what_was_expected():
+    one = RigidTransform.identity(2)
+    plane = ReslicePlane(RigidTransform.identity(), 1.0, 1.0, 0.5)
+    with pytest.raises(MismatchError, match=r"world_from_image.* 3 .* 2"):
+        reslice_frames(np.ones((3, 9, 14)), GRID, one, plane, 1.0)
+    with pytest.raises(MismatchError, match=r"images\[0\].*\(9, 14\).*\(9, 13\)"):
+        reslice_frames(lambda _: np.ones((9, 13)), GRID, one, plane, 1.0)
+    with pytest.raises(InvalidInputError, match="complex64"):
+        reslice_frames(np.ones((2, 9, 14), dtype=np.complex64), GRID, one, plane, 1.0)
+    with pytest.raises(InvalidInputError, match="max_distance_mm"):
+        reslice_frames(np.ones((2, 9, 14)), GRID, one, plane, 0.0)
+    with pytest.raises(InvalidInputError, match="world_from_image"):
+        reslice_frames(np.ones((2, 9, 14)), GRID, one[0], plane, 1.0)
+    with pytest.raises(InvalidInputError, match="100000000"):
+        ReslicePlane(RigidTransform.identity(), 1e4, 1e4, 0.01)
+    with pytest.raises(InvalidInputError, match=r"lateral_mm.* 0 to 4"):
+        along_sweep_plane(one, GRID, 4.5)
+    opposed = RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [0, np.pi, 0]]))
+    with pytest.raises(InsufficientDataError, match="elevational"):
+        along_sweep_plane(opposed, GRID, 1.0)

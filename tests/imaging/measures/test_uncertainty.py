@@ -1,0 +1,86 @@
+"""Deviation of position per voxel: along the sweep, smooth, empty where there is nothing."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.pose_errors import PosedErrors, PoseErrors
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.imaging.measures.uncertainty import DeviationField, deviation_slabs, deviations
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+
+GRID = ImageGrid(31, 41, 0.5, 0.5)
+
+
+def scaled(frames=41, turn_deg=0.0, sigma=0.05):
+    """A sweep of 20 mm whose scale is uncertain."""
+    t = np.linspace(0, 1, frames)
+    turns = Rotation.from_rotvec(np.deg2rad(turn_deg) * np.column_stack([0 * t, t, 0.5 * t]))
+    poses = RigidTransform.from_components(np.column_stack([0 * t, 0 * t, 20 * t]), turns)
+    factors = np.zeros((2, frames, 6))
+    factors[0, :, 2] = sigma * 20 * t
+    factors[1, :, 4] = 0.01 * t
+    return PosedErrors(PoseErrors(factors), poses, GRID.centre_mm)
+
+
+def test_an_error_of_scale_grows_along_the_sweep():
+    errors = PosedErrors(PoseErrors(scaled().errors.factors[:1]), scaled().world_from_image, GRID.centre_mm)
+    grid = grid_around(GRID, errors.world_from_image, 0.5)
+    found = DeviationField(errors, GRID, grid).planes(0, grid.shape[2])
+    assert found.shape == grid.shape[::-1]
+    assert found.dtype == np.float32
+    z = grid.world_from_grid.translation[2] + 0.5 * np.arange(grid.shape[2])
+    np.testing.assert_allclose(found, np.broadcast_to(0.05 * z[:, None, None], found.shape), atol=1e-5)
+
+
+def test_yaw_makes_the_images_sides_uncertain():
+    errors = scaled()
+    last = errors.world_from_image[-1]
+    centre, side = (deviations(errors, GRID, last.apply([[x, 10.0, 0.0]])) for x in (7.5, 15.0))
+    assert centre[0] == pytest.approx(1.0)
+    assert side[0] == pytest.approx(np.hypot(1.0, 0.01 * 7.5))
+
+
+def test_interpolated_deviations_are_those_of_the_voxels_themselves():
+    """A turning sweep: at voxels in it against the exact value there, to a hundredth of the largest."""
+    errors = scaled(turn_deg=8.0)
+    grid = grid_around(GRID, errors.world_from_image, 0.7, Rotation.from_euler("y", 0.3))
+    index = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3)[::29]
+    world = grid.world_from_grid.apply(index * np.array(grid.spacing_mm))
+    swept = belonging_of(world, GRID, errors.world_from_image).gap_mm < 1e-9
+    index, world = index[swept], world[swept]
+    found = DeviationField(errors, GRID, grid).planes(0, grid.shape[2])[tuple(index[:, ::-1].T)]
+    exact = deviations(errors, GRID, world)
+    assert len(index) > 500
+    assert np.abs(found - exact).max() < 0.01 * exact.max()
+
+
+def test_slabs_are_the_whole_and_empty_voxels_have_no_value():
+    errors = scaled()
+    grid = grid_around(GRID, errors.world_from_image, 0.9)
+    field = DeviationField(errors, GRID, grid)
+    whole = field.planes(0, grid.shape[2])
+    parts = list(deviation_slabs(errors, GRID, grid, planes=5))
+    assert [first for first, _ in parts] == list(range(0, grid.shape[2], 5))
+    np.testing.assert_array_equal(np.concatenate([values for _, values in parts]), whole)
+    state = np.random.default_rng(0).integers(0, 3, whole.shape).astype(np.uint8)
+    np.testing.assert_array_equal(np.isnan(field.planes(0, grid.shape[2], state)), state == 0)
+
+
+def test_a_grid_of_one_voxel_has_its_own_value():
+    errors = scaled()
+    at = errors.world_from_image[20].apply(GRID.centre_mm)
+    one = VoxelGrid((1, 1, 1), (0.5, 0.5, 0.5), RigidTransform.from_translation(at))
+    assert DeviationField(errors, GRID, one).planes(0, 1)[0, 0, 0] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_variances_by_neighbours_are_those_of_all_displacements():
+    rng = np.random.default_rng(2)
+    poses = scaled(turn_deg=8.0).world_from_image
+    errors = PosedErrors(PoseErrors(np.cumsum(rng.normal(size=(9, 41, 6)), axis=1)), poses, GRID.centre_mm)
+    points = rng.uniform([0, 0, -1], [15, 20, 21], (300, 3))
+    directions = Rotation.random(300, rng=rng).apply([0.0, 0.0, 1.0])
+    near = belonging_of(points, GRID, poses)
+    moved = np.einsum("mka,ka->mk", errors.displacements(points, near), directions)
+    np.testing.assert_allclose(errors.variance(points, directions, near), (moved**2).sum(axis=0))

@@ -1,0 +1,245 @@
+"""Volumes voxel by voxel: against brute force, in slabs, on any number of threads."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core import threads
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.images import PosedImages
+from speckle3d.imaging.region import Region
+from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.volume import compound
+from speckle3d.kernels.cuts import EDGE_TOLERANCE
+
+GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
+
+
+def shaken(rng, frames, step_mm, turn_rad=0.05):
+    moved = rng.normal(0.0, 0.2, (frames, 3)) + np.outer(np.arange(frames) * step_mm, [0, 0, 1])
+    return RigidTransform.from_components(moved, Rotation.from_rotvec(rng.normal(0.0, turn_rad, (frames, 3))))
+
+
+def sampled(image, x, y):
+    """Bilinear sample at a point of the image in mm; NaN outside and beside NaN."""
+    u, v = x / GRID.vector_pitch_mm, (y - GRID.first_sample_depth_mm) / GRID.sample_spacing_mm
+    # A millionth of a pixel outside is on the border: rounding of poses.
+    inside = min(max(u, 0.0), GRID.vectors - 1.0), min(max(v, 0.0), GRID.samples - 1.0)
+    if max(abs(u - inside[0]), abs(v - inside[1])) > EDGE_TOLERANCE:
+        return np.nan
+    u, v = inside
+    i, j = min(int(u), GRID.vectors - 2), min(int(v), GRID.samples - 2)
+    a, b = u - i, v - j
+    near = (1 - b) * image[i][j] + b * image[i][j + 1]
+    return (1 - a) * near + a * ((1 - b) * image[i + 1][j] + b * image[i + 1][j + 1])
+
+
+def by_definition(images, poses, voxel_grid, reach_mm):
+    """Each voxel from the nearest image that shows something there on either side, one after another."""
+    voxels = np.full(voxel_grid.shape, np.nan)
+    state = np.full(voxel_grid.shape, EMPTY, np.uint8)
+    normals = poses.rotation.apply([0.0, 0.0, 1.0])
+    facing = np.where(normals @ normals[0] < 0, -1.0, 1.0)
+    along = voxel_grid.world_from_grid.rotation.inv().apply(normals)
+    half = 0.5 * np.abs(along * voxel_grid.spacing_mm).max()
+    index = list(np.ndindex(*voxel_grid.shape))
+    points = voxel_grid.world_from_grid.apply(np.multiply(index, voxel_grid.spacing_mm))
+    in_images = np.stack([pose.inv().apply(points) for pose in poses], axis=1)
+    for at, in_each in zip(index, in_images.tolist(), strict=True):
+        nearest = {}
+        for image, side_of, (x, y, z) in zip(images, facing, in_each, strict=True):
+            away = z * side_of
+            if abs(away) < min(reach_mm, nearest.get(away >= 0, (np.inf,))[0]):
+                level = sampled(image, x, y)
+                if not np.isnan(level):
+                    nearest[away >= 0] = (abs(away), level)
+        if len(nearest) == 2:
+            (behind, level), (front, other) = nearest[True], nearest[False]
+            voxels[at] = (level * front + other * behind) / (behind + front)
+            state[at] = MEASURED if min(behind, front) <= half else FILLED
+        elif nearest and (alone := next(iter(nearest.values())))[0] <= half:
+            voxels[at], state[at] = alone[1], MEASURED
+    return voxels, state
+
+
+def joined(slabs):
+    slabs = list(slabs)
+    firsts = np.cumsum([0, *(len(slab.voxels) for slab in slabs)])
+    assert [slab.first for slab in slabs] == firsts[:-1].tolist()
+    return np.concatenate([slab.voxels for slab in slabs]), np.concatenate([slab.state for slab in slabs])
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    spacing=st.sampled_from([(0.4, 0.4, 0.4), (0.6, 0.5, 1.2), (0.9, 0.7, 0.2)]),
+    reach_mm=st.sampled_from([0.3, 1.1, 5.0]),
+)
+def test_matches_brute_force(seed, spacing, reach_mm):
+    rng = np.random.default_rng(seed)
+    poses, images = shaken(rng, 5, 0.9), rng.normal(size=(5, 9, 14)).astype(np.float32)
+    images[2, 3:5] = np.nan
+    grid = grid_around(GRID, poses, spacing, Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)))
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, reach_mm))
+    expected, expected_state = by_definition(images.tolist(), poses, grid, reach_mm)
+    np.testing.assert_array_equal(state, expected_state.T)
+    # Single precision of levels of order one, of distances up to 5 mm and of their ratios.
+    np.testing.assert_allclose(voxels, expected.T, atol=2e-5)
+
+
+def test_a_linear_field_is_met_between_sparse_images():
+    poses = RigidTransform.from_translation(np.outer(np.arange(4) * 2.0, [0, 0, 1]))
+    x = np.arange(9)[:, None] * 0.5
+    y = 0.7 + np.arange(14) * 0.3
+    images = [(3.0 * x - 2.0 * y + 5.0 * z) for z in poses.translation[:, 2]]
+    grid = VoxelGrid((7, 6, 17), (0.5, 0.5, 0.5), RigidTransform.from_translation([0.25, 1.0, -1.0]))
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.1))
+    z, y, x = np.meshgrid(
+        np.arange(17) * 0.5 - 1.0, 1.0 + np.arange(6) * 0.5, 0.25 + np.arange(7) * 0.5, indexing="ij"
+    )
+    inside = (z >= 0) & (z <= 6)
+    # Single precision of levels of some tens.
+    np.testing.assert_allclose(voxels[inside], (3.0 * x - 2.0 * y + 5.0 * z)[inside], atol=1e-5)
+    # Images lie on planes 2, 6, 10 and 14; half a voxel reaches no other, and nothing is extrapolated.
+    expected = np.full(17, EMPTY)
+    expected[2:15] = FILLED
+    expected[[2, 6, 10, 14]] = MEASURED
+    np.testing.assert_array_equal(state, np.broadcast_to(expected[:, None, None], state.shape))
+    assert np.isnan(voxels[state == EMPTY]).all()
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5, 6, 7], [3, 0, 7, 1, 6, 2, 5, 4]])
+def test_slabs_equal_the_whole_to_the_last_bit(order):
+    rng = np.random.default_rng(2)
+    poses, images = shaken(rng, 8, 0.8)[order], rng.normal(size=(8, 9, 14)).astype(np.float32)
+    source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.3)
+    whole = joined(backward_slabs(source, grid, 1.5))
+    images_gb = 16 * 9 * 14 * 4 / 1e9
+    plane_gb = grid.shape[0] * grid.shape[1] * 30 / 1e9
+    slabs = list(backward_slabs(source, grid, 1.5, max_memory_gb=images_gb + 4.5 * plane_gb))
+    assert len(slabs) > 3
+    assert max(len(slab.voxels) for slab in slabs) <= 4
+    for found, expected in zip(joined(slabs), whole, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_images_are_read_once_for_each_slab_they_reach():
+    poses, read = RigidTransform.from_translation(np.outer(np.arange(40.0), [0, 0, 1])), []
+
+    def image(number):
+        read.append(number)
+        return np.full((9, 14), number)
+
+    grid = grid_around(GRID, poses, 0.5)
+    memory_gb = 16 * 9 * 14 * 4 / 1e9 + grid.shape[0] * grid.shape[1] * 30 * 20.5 / 1e9
+    slabs = list(backward_slabs(PosedImages(image, GRID, poses), grid, 1.2, max_memory_gb=memory_gb))
+    assert len(slabs) == 4
+    # 79 planes of 0.5 mm in four slabs; images within 1.2 mm of either end are read for the next one, too.
+    assert len(read) == 40 + 3 * 2
+
+
+def test_images_that_share_their_memory_are_looked_up_as_any_others():
+    rng = np.random.default_rng(4)
+    poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
+    buffer, grid = np.empty((9, 14), np.float32), grid_around(GRID, poses, 0.4)
+
+    def read(number):
+        buffer[:] = images[number]
+        return buffer
+
+    shared = joined(backward_slabs(PosedImages(read, GRID, poses), grid, 2.0))
+    alone = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.0))
+    for found, expected in zip(shared, alone, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_any_number_of_threads_gives_the_same(many_threads):
+    rng = np.random.default_rng(3)
+    poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
+    source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.25)
+    shared = joined(backward_slabs(source, grid, 2.0))
+    with pytest.MonkeyPatch.context() as one:
+        one.setattr(threads, "cores", lambda: 1)
+        alone = joined(backward_slabs(source, grid, 2.0))
+    for found, expected in zip(shared, alone, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_as_many_images_of_either_facing_are_told_apart(seed):
+    # The sum of such normals points anywhere.
+    rng = np.random.default_rng(seed)
+    middle = RigidTransform.from_translation([2.0, 0.0, 0.0])
+    turned = middle * RigidTransform.from_rotation(Rotation.from_rotvec([0.0, np.pi, 0.0])) * middle.inv()
+    there, back = shaken(rng, 3, 1.0), shaken(rng, 3, 1.0) * turned
+    poses, images = RigidTransform.concatenate([there, back]), rng.normal(size=(6, 9, 14)).astype(np.float32)
+    grid = grid_around(GRID, poses, 0.6)
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.0))
+    expected, expected_state = by_definition(images.tolist(), poses, grid, 2.0)
+    np.testing.assert_array_equal(state, expected_state.T)
+    np.testing.assert_allclose(voxels, expected.T, atol=2e-5)
+
+
+def test_a_probe_turned_round_between_passes_interpolates_between_them():
+    there = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
+    turned = RigidTransform.from_components([4.0, 0.0, 2.0], Rotation.from_rotvec([0.0, np.pi, 0.0]))
+    poses = RigidTransform.concatenate([there, turned])
+    images = [np.full((9, 14), level) for level in (10.0, 50.0, 30.0)]
+    grid = VoxelGrid((5, 5, 5), (0.5, 0.5, 1.0), RigidTransform.from_translation([1.0, 1.0, 0.0]))
+    voxels, _ = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 4.5))
+    np.testing.assert_allclose(
+        voxels, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]], [[40.0]], [[50.0]]], (5, 5, 5))
+    )
+
+
+def test_only_the_region_counts():
+    poses = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    source = PosedImages(np.ones((2, 9, 14)), GRID, poses)
+    region = Region.from_text("rectangle 1,1 3,3").mask(GRID)
+    grid = grid_around(GRID, poses, 0.25)
+    voxels, state = joined(backward_slabs(source, grid, 2.0, region))
+    x, y = np.arange(grid.shape[0]) * 0.25, 0.7 + np.arange(grid.shape[1]) * 0.25
+    # Right on the far side a voxel is beside samples that do not count.
+    inside = (y[:, None] >= 1.0) & (y[:, None] < 2.8) & (x >= 1.0) & (x < 3.0)
+    np.testing.assert_array_equal(state != EMPTY, np.broadcast_to(inside, state.shape))
+    assert (voxels[state != EMPTY] == 1.0).all()
+
+
+def test_compounding_backward_is_this_in_any_type():
+    rng = np.random.default_rng(5)
+    poses, images = shaken(rng, 6, 1.1), rng.uniform(0.0, 255.0, (6, 9, 14)).astype(np.float32)
+    grid = grid_around(GRID, poses, 0.4)
+    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 1.7))
+    for voxel_type, expected in (("float32", voxels), ("uint8", np.nan_to_num(np.rint(voxels)))):
+        volume = compound(images, GRID, poses, 0.4, backward_mm=1.7, voxel_type=voxel_type)
+        np.testing.assert_array_equal(volume.voxels, expected.T)
+        np.testing.assert_array_equal(volume.state, state.T)
+
+
+def test_one_image_and_none_near():
+    source = PosedImages(np.full((1, 9, 14), 7.0), GRID, RigidTransform.identity(1))
+    grid = VoxelGrid((3, 3, 3), (0.5, 0.5, 0.5), RigidTransform.from_translation([1.0, 1.0, -0.5]))
+    voxels, state = joined(backward_slabs(source, grid, 3.0))
+    np.testing.assert_array_equal(state[:, 0, 0], [EMPTY, MEASURED, EMPTY])
+    assert (voxels[1] == 7.0).all()
+    far = VoxelGrid((3, 3, 3), (0.5, 0.5, 0.5), RigidTransform.from_translation([1.0, 1.0, 50.0]))
+    voxels, state = joined(backward_slabs(source, far, 3.0))
+    assert np.isnan(voxels).all()
+    assert (state == EMPTY).all()
+
+
+def test_wrong_input_is_refused():
+    source = PosedImages(np.ones((1, 9, 14)), GRID, RigidTransform.identity(1))
+    grid = VoxelGrid((300, 300, 3), (0.5, 0.5, 0.5), RigidTransform.identity())
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InvalidInputError, match="max_distance_mm"):
+            next(iter(backward_slabs(source, grid, bad)))
+    with pytest.raises(InvalidInputError, match="region"):
+        next(iter(backward_slabs(source, grid, 1.0, np.ones((3, 3), bool))))
+    with pytest.raises(InvalidInputError, match=r"within 0\.001 GB .* plane of 300 x 300"):
+        next(iter(backward_slabs(source, grid, 1.0, max_memory_gb=0.001)))

@@ -1,0 +1,125 @@
+"""Grids: as asked for to the last bit, around all images, and small."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from posed_sweeps import GRID, KINDS, corners_in, sweep
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.volume import Volume
+from speckle3d.imaging.axes import principal_axes, sweep_axes
+from speckle3d.imaging.voxels.grid import grid_around, grid_as_asked, grid_like, spacing_within
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=KINDS,
+    spacing=st.tuples(*[st.floats(0.2, 3.0)] * 3),
+    way=st.integers(0, 2),
+)
+def test_every_image_corner_is_within_the_grid(seed, kind, spacing, way):
+    passes, frames, turned = kind
+    poses, _ = sweep(np.random.default_rng(seed), frames, passes, turned)
+    axes = (None, sweep_axes(poses), principal_axes(GRID, poses))[way]
+    voxels = grid_around(GRID, poses, spacing, axes)
+    index = corners_in(voxels, poses)
+    # In the voxels, which reach half a voxel beyond their centres, and in no others.
+    assert (index > -0.5).all()
+    assert (index < np.array(voxels.shape) - 0.5 + 1e-5).all()
+    assert (index.max(axis=0) > np.array(voxels.shape) - 1.5 - 1e-5).all()
+    assert voxels.spacing_mm == spacing
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    spacing=st.tuples(*[st.floats(0.01, 10.0)] * 3),
+    origin=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
+    shape=st.tuples(*[st.integers(1, 3000)] * 3),
+)
+def test_what_is_asked_for_is_had_to_the_last_bit(seed, spacing, origin, shape):
+    rng = np.random.default_rng(seed)
+    poses, _ = sweep(rng, 3)
+    axes = Rotation.random(rng=rng)
+    voxels = grid_as_asked(GRID, poses, spacing, world_from_axes=axes, origin_mm=origin, shape=shape)
+    assert voxels.shape == shape
+    assert voxels.spacing_mm == spacing
+    np.testing.assert_array_equal(voxels.world_from_grid.translation, origin)
+    # SciPy normalises a turn each time it is passed on.
+    np.testing.assert_allclose(
+        voxels.world_from_grid.as_matrix()[:3, :3], axes.as_matrix(), atol=1e-15, rtol=0
+    )
+    upright = grid_as_asked(GRID, poses, spacing, origin_mm=origin, shape=shape).world_from_grid.as_matrix()
+    np.testing.assert_array_equal(upright[:3], np.column_stack([np.eye(3), origin]))
+    # A size of so many voxels is so many voxels.
+    size = tuple(np.multiply(shape, spacing))
+    assert grid_as_asked(GRID, poses, spacing, origin_mm=origin, size_mm=size).shape == shape
+
+
+def test_what_is_not_asked_for_holds_the_images():
+    poses, axes = sweep(np.random.default_rng(3), 20)
+    around = grid_around(GRID, poses, 0.5, axes)
+    same = grid_as_asked(GRID, poses, 0.5, world_from_axes=axes)
+    assert (same.shape, same.spacing_mm) == (around.shape, around.spacing_mm)
+    np.testing.assert_array_equal(same.world_from_grid.as_matrix(), around.world_from_grid.as_matrix())
+    sized = grid_as_asked(GRID, poses, 0.5, world_from_axes=axes, size_mm=(10.1, 20.0, 0.2))
+    assert sized.shape == (21, 40, 1)
+    np.testing.assert_array_equal(sized.world_from_grid.translation, around.world_from_grid.translation)
+    # From an origin 7 voxels in, the far side stays where it was.
+    inside = around.world_from_grid.apply([3.5, 3.5, 3.5])
+    placed = grid_as_asked(GRID, poses, 0.5, world_from_axes=axes, origin_mm=inside)
+    assert placed.shape == tuple(n - 7 for n in around.shape)
+
+
+def test_a_grid_like_a_volume_is_its_grid():
+    pose = RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([0.1, 0.7, 0.2]))
+    volume = Volume(np.zeros((3, 4, 5), np.uint8), (0.1, 0.2, 0.3), pose)
+    voxels = grid_like(volume)
+    assert voxels.shape == (3, 4, 5)
+    assert voxels.spacing_mm == (0.1, 0.2, 0.3)
+    np.testing.assert_array_equal(voxels.world_from_grid.as_matrix(), pose.as_matrix())
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), gigabytes=st.floats(1e-7, 10.0))
+def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
+    poses, axes = sweep(np.random.default_rng(seed), 4)
+    found = spacing_within(GRID, poses, gigabytes, axes)
+
+    def memory(spacing):
+        return grid_around(GRID, poses, spacing, axes).size_gb("uint8")
+
+    steps = ("1.0", "1.2", "1.5", "2.0", "2.5", "3.0", "4.0", "5.0", "6.0", "8.0")
+    assert f"{found:.1e}".split("e")[0] in steps
+    assert memory(found) <= gigabytes
+    if found > 0.4:  # the samples' spacing, than which none is finer
+        rounds = [float(f"{step}e{power}") for power in range(-2, 3) for step in steps]
+        assert memory(max(spacing for spacing in rounds if spacing < found)) > gigabytes
+
+
+def test_wrong_input_is_refused():
+    poses, _ = sweep(np.random.default_rng(4), 3)
+    for bad in (0.0, -1.0, np.nan, (1.0, 1.0), (1.0, 0.0, 1.0)):
+        with pytest.raises(InvalidInputError, match="spacing_mm"):
+            grid_as_asked(GRID, poses, bad)
+    with pytest.raises(InvalidInputError, match="got both"):
+        grid_as_asked(GRID, poses, 1.0, shape=(1, 1, 1), size_mm=(1.0, 1.0, 1.0))
+    with pytest.raises(InvalidInputError, match="shape"):
+        grid_as_asked(GRID, poses, 1.0, shape=(0, 1, 1))
+    with pytest.raises(InvalidInputError, match="whole numbers"):
+        grid_as_asked(GRID, poses, 1.0, shape=(1.5, 1, 1))
+    with pytest.raises(InvalidInputError, match="size_mm"):
+        grid_as_asked(GRID, poses, 1.0, size_mm=(-1.0, 1.0, 1.0))
+    with pytest.raises(InvalidInputError, match="origin_mm"):
+        grid_as_asked(GRID, poses, 1.0, origin_mm=(0.0, np.inf, 1.0))
+    with pytest.raises(InvalidInputError, match="origin_mm"):
+        grid_as_asked(GRID, poses, 1.0, origin_mm=(1e5, 0.0, 0.0))
+    with pytest.raises(InvalidInputError, match="single rotation"):
+        grid_around(GRID, poses, 1.0, Rotation.identity(2))
+    with pytest.raises(InvalidInputError, match="up to 1000000 along"):
+        grid_around(GRID, poses, 1e-6)
+    with pytest.raises(InvalidInputError, match="max_gb"):
+        spacing_within(GRID, poses, 0.0)

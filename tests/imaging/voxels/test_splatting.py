@@ -1,0 +1,280 @@
+"""Images given to voxels: against brute force, in slabs, on any number of threads, at borders."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import oracles
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core import threads
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.images import ChosenImages, PosedImages
+from speckle3d.imaging.voxels.grid import VoxelGrid
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.imaging.voxels.slabs import compound_slabs
+from speckle3d.imaging.voxels.volume import compound
+
+GRID = ImageGrid(
+    vectors=13, samples=21, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7
+)
+SPLATS, RULES = ("nearest", "linear"), ("mean", "maximum", "latest", "weighted")
+TYPES = ("uint8", "int16", "uint16", "float32")
+FRAMES = 6
+
+
+def any_scene(rng, kind):
+    """Frames in any pose, some of them off the grid, and voxels of any size and orientation."""
+    poses = RigidTransform.from_components(rng.normal(0, 2.0, (FRAMES, 3)), Rotation.random(FRAMES, rng=rng))
+    corner = RigidTransform.from_components(rng.normal(0, 2.0, 3) - 2.0, Rotation.random(rng=rng))
+    voxel_grid = VoxelGrid(tuple(rng.integers(1, 13, 3).tolist()), tuple(rng.uniform(0.2, 1.6, 3)), corner)
+    if kind == "float32":
+        images = rng.normal(size=(FRAMES, GRID.vectors, GRID.samples)).astype(np.float32)
+        images[rng.random(images.shape) < 0.2] = np.nan
+    else:
+        limits = np.iinfo(kind)
+        images = rng.integers(limits.min, limits.max + 1, (FRAMES, GRID.vectors, GRID.samples)).astype(kind)
+    return images, poses, voxel_grid
+
+
+def index_of(voxel_grid, poses, skew=0.0):
+    """Fractional voxel of every sample, shape (n, vector, sample, 3)."""
+    v, s = np.mgrid[: GRID.vectors, : GRID.samples]
+    u, v, half = v * GRID.vector_pitch_mm, s * GRID.sample_spacing_mm, skew / 2
+    x, y = np.cos(half) * u + np.sin(half) * v, np.sin(half) * u + np.cos(half) * v
+    local = np.stack([x, GRID.first_sample_depth_mm + y, 0 * y], axis=-1).reshape(-1, 3)
+    grid_from_world = voxel_grid.world_from_grid.inv()
+    points = np.stack([(grid_from_world * pose).apply(local) for pose in poses])
+    return (points / voxel_grid.spacing_mm).reshape(len(poses), GRID.vectors, GRID.samples, 3)
+
+
+def sweep_of(frames, step_mm, kind=np.uint8):
+    """A sweep of random levels that wavers, and voxels that hold most of it."""
+    rng = np.random.default_rng(5)
+    turned = Rotation.from_rotvec(rng.normal(0, 0.1, (frames, 3)))
+    poses = RigidTransform.from_components(np.outer(np.arange(frames), [0, 0, step_mm]), turned)
+    images = rng.integers(0, 256, (frames, GRID.vectors, GRID.samples)).astype(kind)
+    voxel_grid = VoxelGrid((24, 16, 60), (0.27, 0.41, 0.35), RigidTransform.from_translation([0, 0.5, 0]))
+    return PosedImages(images, GRID, poses), voxel_grid
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    splat=st.sampled_from(SPLATS),
+    rule=st.sampled_from(RULES),
+    kind=st.sampled_from(TYPES),
+    turned=st.booleans(),
+)
+def test_matches_brute_force(seed, splat, rule, kind, turned):
+    rng = np.random.default_rng(seed)
+    images, poses, voxel_grid = any_scene(rng, kind)
+    skew, region = rng.uniform(-0.2, 0.2), rng.random((GRID.vectors, GRID.samples)) < 0.8
+    weights = np.ones(FRAMES, np.float32)
+    if rule == "weighted":
+        weights = (rng.uniform(0, 2, FRAMES) * (rng.random(FRAMES) < 0.8)).astype(np.float32)
+    each = weights.astype(float)[:, None, None] * region
+    index = index_of(voxel_grid, poses, skew)
+    expected = oracles.splat(images, index, voxel_grid.shape, splat, rule, each)
+    if np.isnan(expected).all():
+        return
+    stored = [np.asfortranarray(image) for image in images] if turned else images
+    chosen = {"splat": splat, "rule": rule, "weights": weights, "region": region}
+    volume = compound(
+        stored, replace(GRID, skew_rad=skew), poses, voxel_grid=voxel_grid, fill_radius=0, **chosen
+    )
+    # Sums in double precision, of levels up to 2^16; means in single.
+    np.testing.assert_allclose(volume.voxels, expected, rtol=1e-6, atol=1e-9 * 2**16)
+    np.testing.assert_array_equal(volume.state, ~np.isnan(expected))
+
+
+@pytest.mark.parametrize("rule", [*RULES, "plus"])
+@pytest.mark.parametrize("splat", SPLATS)
+def test_slabs_and_threads_change_nothing(monkeypatch, splat, rule):
+    source, voxel_grid = sweep_of(60, 0.3)
+    weights = np.random.default_rng(6).uniform(0.5, 2.0, 60)
+    voxel_type = "uint8" if rule == "plus" else "float32"
+    chosen = CompoundingSettings(splat=splat, rule=rule, voxel_type=voxel_type, fill_radius=2)
+    (whole,) = compound_slabs(source, voxel_grid, chosen, weights)
+    monkeypatch.setattr(threads, "_pool", None)
+    monkeypatch.setattr(threads, "cores", lambda: 5)
+    memory = 1.8e-4 if rule in ("maximum", "plus") else 3.3e-4
+    slabs = list(compound_slabs(source, voxel_grid, replace_memory(chosen, memory), weights))
+    threads._pool.shutdown()
+    assert len(slabs) > 2
+    assert [slab.first for slab in slabs] == np.cumsum([0, *(len(s.voxels) for s in slabs[:-1])]).tolist()
+    np.testing.assert_array_equal(np.concatenate([slab.voxels for slab in slabs]), whole.voxels)
+    np.testing.assert_array_equal(np.concatenate([slab.state for slab in slabs]), whole.state)
+
+
+def replace_memory(chosen, gigabytes):
+    return chosen.model_copy(update={"max_memory_gb": gigabytes})
+
+
+def test_frames_are_read_only_for_slabs_they_touch():
+    source, voxel_grid = sweep_of(60, 0.3)
+    images, read = source.images, []
+
+    def reader(index):
+        read.append(index)
+        return images[index]
+
+    chosen = CompoundingSettings(fill_radius=0, max_memory_gb=2.6e-4)
+    slabs = len(list(compound_slabs(replace(source, images=reader), voxel_grid, chosen)))
+    assert slabs > 3
+    assert len(read) < 2 * 60  # each slab's first frame tells the type of the others
+    assert set(read) == set(range(60))
+
+
+class OnAnyThread:
+    """Frames made as they are asked for, by several threads at once."""
+
+    any_thread = True
+
+    def __init__(self, images):
+        self.images, self.threads = images, set()
+
+    def __getitem__(self, index):
+        self.threads.add(threading.get_ident())
+        time.sleep(1e-3)
+        return self.images[index].copy()
+
+
+def test_frames_are_made_by_several_threads_where_they_may_be(monkeypatch):
+    source, voxel_grid = sweep_of(40, 0.3)
+    monkeypatch.setattr(threads, "_pool", None)
+    monkeypatch.setattr(threads, "cores", lambda: 3)
+    made = OnAnyThread(source.images)
+    some = ChosenImages(made, np.arange(0, 40, 2))
+    volume = compound(some, GRID, source.world_from_image[::2], voxel_grid=voxel_grid)
+    threads._pool.shutdown()
+    assert len(made.threads) > 1
+    expected = compound(source.images[::2], GRID, source.world_from_image[::2], voxel_grid=voxel_grid)
+    np.testing.assert_array_equal(volume.voxels, expected.voxels)
+
+
+def test_a_part_of_the_grid_is_that_part_of_the_whole():
+    source, voxel_grid = sweep_of(40, 0.3, np.float32)
+    for splat in SPLATS:
+        chosen = {"splat": splat, "fill_radius": 0}
+        whole, part = (
+            compound(source.images, GRID, source.world_from_image, voxel_grid=grid, **chosen).voxels
+            for grid in (voxel_grid, voxel_grid.part(9, 20))
+        )
+        # Positions on the part's own grid round otherwise: by 1e-12 voxel.
+        np.testing.assert_allclose(part, whole[:, :, 9:20], rtol=1e-5)
+
+
+def test_samples_on_a_border_belong_to_the_voxel_above():
+    grid = ImageGrid(1, 9, 1.0, 0.5)
+    voxel_grid = VoxelGrid((1, 4, 1), (1.0, 1.0, 1.0), RigidTransform.identity())
+    for moved in (0.0, 1e-12, -1e-12):
+        pose = RigidTransform.from_translation([[0.0, moved, 0.0]])
+        volume = compound(np.arange(9, dtype=np.uint8)[None, None], grid, pose, voxel_grid=voxel_grid)
+        # Samples at 0; 0.5 and 1; 1.5 and 2; 2.5 and 3; at 3.5 and 4 outside.
+        np.testing.assert_array_equal(volume.voxels[0, :, 0], [0, 1.5, 3.5, 5.5])
+
+
+def test_linear_shares_are_those_of_the_position():
+    grid = ImageGrid(1, 1, 1.0, 1.0)
+    voxel_grid = VoxelGrid((2, 2, 2), (1.0, 2.0, 4.0), RigidTransform.identity())
+    poses = RigidTransform.from_translation([[0.25, 1.5, 1.0], [0.0, 0.0, 0.0]])
+    volume = compound(
+        [[[80.0]], [[20.0]]] @ np.ones((1, 1)), grid, poses, voxel_grid=voxel_grid, splat="linear"
+    )
+    share = 0.75 * 0.25 * 0.75
+    assert volume.voxels[0, 0, 0] == pytest.approx((80 * share + 20) / (share + 1), rel=1e-6)
+    np.testing.assert_allclose(volume.voxels.ravel()[1:], 80.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("splat", SPLATS)
+def test_a_hundred_thousand_samples_in_a_voxel_lose_nothing(splat, kind):
+    grid = ImageGrid(400, 500, 1e-4, 1e-4)
+    voxel_grid = VoxelGrid((1, 1, 1), (1.0, 1.0, 1.0), RigidTransform.identity())
+    rng = np.random.default_rng(7)
+    high = 1.0 if kind == "float32" else np.iinfo(kind).max
+    images = (rng.uniform(0.9, 1.0, (1, 400, 500)) * high).astype(kind)
+    images[0, 0, 0] = high
+    volume = compound(images, grid, RigidTransform.identity(1), voxel_grid=voxel_grid, splat=splat)
+    share = 1.0
+    if splat == "linear":
+        (index,) = np.mgrid[:400, :500][None] * 1e-4
+        share = np.prod(1 - np.round(index * 1024) / 1024, axis=0)
+    expected = np.average(images[0].astype(float), weights=np.broadcast_to(share, (400, 500)))
+    assert volume.voxels[0, 0, 0] == pytest.approx(expected, rel=1e-7)  # one rounding to single precision
+
+
+def test_more_samples_than_the_packed_count_holds(monkeypatch):
+    """2^24 samples in a voxel would run over its count: they are summed otherwise."""
+    grid = ImageGrid(4096, 2048, 1e-5, 1e-5)
+    voxel_grid = VoxelGrid((1, 1, 1), (1.0, 1.0, 1.0), RigidTransform.identity())
+    image = np.full((4096, 2048), 200, np.uint8)
+    image[:, ::2] = 100
+    volume = compound([image] * 3, grid, RigidTransform.identity(3), voxel_grid=voxel_grid)
+    assert volume.voxels[0, 0, 0] == 150.0
+
+
+def test_images_of_weights():
+    source, voxel_grid = sweep_of(12, 0.3)
+    weights = np.random.default_rng(8).uniform(-0.5, 1.0, source.images.shape).astype(np.float32)
+    weights[3] = np.nan
+    index = index_of(voxel_grid, source.world_from_image)
+    used = np.nan_to_num(np.maximum(weights, 0)).astype(float)
+    for splat in SPLATS:
+        expected = oracles.splat(source.images, index, voxel_grid.shape, splat, "weighted", used)
+        chosen = {"splat": splat, "rule": "weighted", "fill_radius": 0}
+        volume = compound(
+            source.images, GRID, source.world_from_image, voxel_grid=voxel_grid, weights=weights, **chosen
+        )
+        np.testing.assert_allclose(volume.voxels, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "int16", "uint16"])
+def test_levels_beyond_a_type_are_clipped_and_empty_voxels_are_zero(kind):
+    limits = np.iinfo(kind)
+    levels = [limits.min - 10.0, limits.max + 10.0, 12.6]
+    poses = RigidTransform.from_translation([[0.0, 0, 0], [0, 0, 2.0], [0, 0, 4.0]])
+    images = [np.full((GRID.vectors, GRID.samples), level) for level in levels]
+    volume = compound(images, GRID, poses, 1.0, fill_radius=0, voxel_type=kind)
+    assert volume.voxels.dtype == kind
+    np.testing.assert_array_equal(volume.voxels[2, 2], [limits.min, 0, limits.max, 0, 13])
+
+
+def test_what_cannot_be_compounded_is_refused():
+    source, voxel_grid = sweep_of(3, 0.3)
+    images, poses = source.images, source.world_from_image
+
+    def attempt(given=images, at=poses, **chosen):
+        compound(given, GRID, at, voxel_grid=voxel_grid, **chosen)
+
+    with pytest.raises(InvalidInputError, match=r"weights: expected one per frame"):
+        attempt(rule="weighted")
+    with pytest.raises(MismatchError, match=r"weights: expected 3, one per frame, got 2"):
+        attempt(rule="weighted", weights=np.ones(2))
+    with pytest.raises(InvalidInputError, match=r"weights\[1\]: expected zero or above, got -1"):
+        attempt(rule="weighted", weights=np.array([1.0, -1.0, 1.0]))
+    with pytest.raises(MismatchError, match=r"region: expected a mask of shape \(13, 21\)"):
+        attempt(region=np.ones((2, 2), bool))
+    with pytest.raises(InvalidInputError, match="region: expected samples"):
+        attempt(region=np.zeros((13, 21), bool))
+    with pytest.raises(MismatchError, match=r"images\[2\]: expected uint8 as the others, got int16"):
+        attempt([images[0], images[1], images[2].astype(np.int16)])
+    with pytest.raises(InvalidInputError, match="either voxel_mm or voxel_grid"):
+        attempt(voxel_mm=0.3)
+    with pytest.raises(InvalidInputError, match=r"rule: .*'median'"):
+        attempt(rule="median")
+    tiny = VoxelGrid((9, 9, 9), (1e-7, 1e-7, 1e-7), RigidTransform.from_translation([3.0, 3.0, 0.0]))
+    with pytest.raises(InvalidInputError, match=r"images\[0\]: expected to reach less than 4194304 voxels"):
+        list(compound_slabs(source, tiny, CompoundingSettings()))
+    with pytest.raises(InvalidInputError, match="slab of 24 x 16 voxels takes"):
+        list(compound_slabs(source, voxel_grid, CompoundingSettings(max_memory_gb=1e-5)))
+    with pytest.raises(
+        InvalidInputError, match=r"1e-06 GB, got 2.3e-05 GB for 24 x 16 x 60 voxels of 0.27 x"
+    ):
+        list(compound_slabs(source, voxel_grid, CompoundingSettings(max_file_gb=1e-6)))

@@ -1,0 +1,243 @@
+"""A folder for 3D Slicer, looked at by what is at hand of its readers: ITK, VTK, slicerio, XML."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from urllib.parse import unquote
+
+import nrrd
+import numpy as np
+import pytest
+import SimpleITK
+import slicerio
+from disks import FULL, limited
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import InvalidInputError, NoSpaceError
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.io.headers import read_header
+from speckle3d.study.posed import PosedSweep
+from speckle3d.study.scenes.mrml import Scene
+from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
+from speckle3d.study.scenes.sequences import PosedSequence
+
+NAME = 'Größe <&> "1"; a:b\n'
+"""Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
+BUILT_IN = {"vtkMRMLColorTableNodeGrey", "vtkMRMLColorTableNodeFileViridis.txt"}
+LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def posed_sweep(mode="image", frames=8):
+    rng = np.random.default_rng(2)
+    grid = ImageGrid(12, 20, 0.5, 0.25, 1.0)
+    images = rng.integers(30, 200, (frames, 12, 20)).astype(np.uint8)
+    images[5, 4, 9] = 255  # alone in the sweep
+    sweep = Sweep(images, grid, BModeSettings(60.0), 1.0 + 0.04 * np.arange(frames), name=NAME)
+    turned = Rotation.from_euler("yx", [20.0, -35.0], degrees=True)
+    along = RigidTransform.from_translation(np.outer(np.arange(frames), [0.0, 0.0, 0.6]))
+    poses = RigidTransform.from_components([40.0, -30.0, 20.0], turned) * along
+    return PosedSweep(sweep, np.arange(frames), poses, mode)
+
+
+REQUEST = SceneRequest(CompoundingSettings(voxel_mm=0.25, splat="nearest"), with_images=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    target = tmp_path_factory.mktemp("scene") / "a scene"
+    other = replace(posed_sweep("pose"), world_from_image=posed_sweep().world_from_image.inv())
+    write_scene(target, [posed_sweep(), other], REQUEST)
+    return target
+
+
+def nodes_of(folder):
+    return list(ElementTree.parse(folder / "scene.mrml").getroot())
+
+
+def references_of(node):
+    """Of a node by role, as Slicer parses them: a scene's own, and the colours that it has built in."""
+    held = node.get("references", "")
+    assert held == "" or held.endswith(";")
+    found = dict(part.split(":") for part in held.split(";") if part)
+    return found | {name: node.get(name) for name in ("colorNodeID", "backgroundVolumeID") if node.get(name)}
+
+
+def test_every_reference_leads_to_a_node_before_it_and_every_file_is_there(folder):
+    seen = set(BUILT_IN)
+    files = {"scene.mrml"}
+    for node in nodes_of(folder):
+        assert set(references_of(node).values()) <= seen
+        assert node.get("id") not in seen
+        seen.add(node.get("id"))
+        if node.get("fileName") is not None:
+            files.add(unquote(node.get("fileName")))
+    assert files == {path.name for path in folder.iterdir()}
+
+
+def test_every_node_that_has_data_is_of_the_class_that_its_reference_is_for(folder):
+    nodes = {node.get("id"): node for node in nodes_of(folder)}
+    classes = {
+        "Volume": "VolumeArchetypeStorage",
+        "Segmentation": "SegmentationStorage",
+        "Model": "ModelStorage",
+        "LinearTransform": "TransformStorage",
+    }
+    of = {tag: [] for tag in classes}
+    for node in nodes.values():
+        if node.tag in classes and "storage" in references_of(node):
+            of[node.tag].append(nodes[references_of(node)["storage"]].tag)
+    assert {tag: set(found) for tag, found in of.items()} == {tag: {of} for tag, of in classes.items()}
+    assert {len(found) for found in of.values()} == {2}
+    (geometry,) = {
+        references_of(each)["referenceImageGeometryRef"]
+        for each in nodes.values()
+        if each.tag == "Segmentation" and each.get("name").startswith('Größe <&> "1"; a:b\\n, image')
+    }
+    assert nodes[geometry].tag == "Volume"
+    assert {each.get("coordinateSystem") for each in nodes.values() if each.tag == "ModelStorage"} == {"LPS"}
+
+
+def test_the_name_of_the_sweep_is_text_and_nothing_else(folder):
+    names = [node.get("name") for node in nodes_of(folder) if node.get("name")]
+    assert all(name.startswith('Größe <&> "1"; a:b\\n, ') for name in names)
+    assert len({*names}) == len(names)
+
+
+def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
+    posed = posed_sweep()
+    mark = posed.world_from_image[5].apply([4 * 0.5, 1.0 + 9 * 0.25, 0.0])
+    volume = SimpleITK.ReadImage(str(folder / "volume-image.nrrd"))
+    at = volume.TransformPhysicalPointToIndex(mark.tolist())
+    # Nearest and mean: the mark shares its voxel with no other sample of twice the voxel's size.
+    assert volume.GetPixel(at) == 255
+    labels = slicerio.read_segmentation(str(folder / "state-image.seg.nrrd"))
+    index = np.rint(np.linalg.solve(labels["ijkToLPS"], [*mark, 1.0])[:3]).astype(int)
+    assert tuple(index) == at
+    assert labels["voxels"][tuple(index)] == 1
+    assert [each["name"] for each in labels["segments"]] == ["measured", "filled"]
+    pose = SimpleITK.ReadTransform(str(folder / "first-frame-image.tfm"))
+    inside = pose.TransformPoint(posed.world_from_image[0].apply([1.0, 2.0, 0.0]).tolist())
+    np.testing.assert_allclose(inside, [1.0, 2.0, 0.0], atol=1e-9)
+
+
+def test_outlines_are_lines_through_the_corners(folder):
+    pytest.importorskip("vtkmodules")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+
+    reader = vtkPolyDataReader()
+    reader.SetFileName(str(folder / "outlines-image.vtk"))
+    reader.Update()
+    lines, posed = reader.GetOutput(), posed_sweep()
+    assert reader.GetHeader() == "speckle3d lines. SPACE=LPS"
+    assert lines.GetNumberOfLines() == lines.GetNumberOfCells() == 8
+    points = vtk_to_numpy(lines.GetPoints().GetData()).reshape(8, 5, 3)
+    corners = posed.sweep.grid.corners_mm
+    for i in range(8):
+        expected = posed.world_from_image[i].apply(corners[[0, 1, 2, 3, 0]])
+        np.testing.assert_allclose(points[i], expected, atol=1e-5)
+        of = [lines.GetCell(i).GetPointId(n) for n in range(5)]
+        assert of == list(range(5 * i, 5 * i + 5))
+    np.testing.assert_array_equal(vtk_to_numpy(lines.GetCellData().GetArray("frame")), np.arange(8))
+
+
+def test_images_move_through_the_volume(folder):
+    """Image and pose of a frame as Slicer finds them: by the same index value; pixels to RAS."""
+    voxels, header = nrrd.read(str(folder / "images-image.seq.nrrd"))
+    posed = posed_sweep()
+    assert header["kinds"] == ["domain", "domain", "domain", "list"]
+    assert header["space"] == "right-anterior-superior"
+    np.testing.assert_array_equal(header["space directions"][:3], np.eye(3))
+    np.testing.assert_array_equal(header["space origin"], np.zeros(3))
+    np.testing.assert_array_equal(voxels[:, :, 0, 5], posed.sweep.frames[5])
+    poses = read_header(folder / "poses-image.seq.mha")
+    times = [f"{float(frame['Timestamp']):.3f}" for frame in poses.frames]
+    assert header["axis 3 index values"].split() == times
+    matrix = np.reshape([float(x) for x in poses.frames[5]["ImageToWorldTransform"].split()], (4, 4))
+    place = LPS_FROM_RAS @ matrix @ [4, 9, 0, 1]
+    np.testing.assert_allclose(
+        place[:3], posed.world_from_image[5].apply([2.0, 1.0 + 9 * 0.25, 0.0]), atol=1e-9
+    )
+    assert all(frame["ImageToWorldTransformStatus"] == "OK" for frame in poses.frames)
+    assert poses.frames[5]["ImageToWorldTransform"] == header["Seq_Frame0005_ImageToWorldTransform"]
+
+
+def test_the_extension_of_slicer_finds_the_images_by_vtk(tmp_path):
+    """SlicerIGSIO reads pixels of .seq.mha by VTK's reader, and transforms from the text before them."""
+    readers = pytest.importorskip("vtkmodules.vtkIOImage")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    posed = posed_sweep()
+    PosedSequence.of(posed).write(tmp_path / "s.seq.mha")
+    reader = readers.vtkMetaImageReader()
+    reader.SetFileName(str(tmp_path / "s.seq.mha"))
+    reader.Update()
+    pixels = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars()).reshape(8, 20, 12)
+    np.testing.assert_array_equal(pixels.transpose(0, 2, 1), posed.sweep.frames)
+    assert reader.GetOutput().GetSpacing() == (1.0, 1.0, 1.0)
+    assert read_header(tmp_path / "s.seq.mha").transforms == ["ImageToWorld"]
+
+
+def test_slicer_finds_every_transform_before_a_line_that_its_reader_would_break(folder):
+    """It reads pieces of 1,000 characters, and stops at the first one without a colon."""
+    header = (folder / "images-image.seq.nrrd").read_bytes().split(b"\n\n")[0].split(b"\n")
+    last = max(i for i, line in enumerate(header) if line.startswith(b"Seq_Frame"))
+    assert all(len(line) < 1000 for line in header[: last + 1])
+    assert max(i for i, line in enumerate(header) if b"index values" in line) > last
+
+
+def test_the_browser_plays_both_sequences_into_a_volume_under_a_transform(folder):
+    nodes = {node.get("id"): node for node in nodes_of(folder)}
+    browsers = [node for node in nodes.values() if node.tag == "SequenceBrowser"]
+    assert len(browsers) == 2
+    for browser in browsers:
+        held = references_of(browser)
+        images, poses, image, pose = (
+            nodes[held[role]]
+            for role in ("sequenceNodeRef0", "sequenceNodeRef1", "dataNodeRef0", "dataNodeRef1")
+        )
+        assert (images.tag, poses.tag) == ("Sequence", "Sequence")
+        assert nodes[references_of(images)["storage"]].tag == "VolumeSequenceStorage"
+        assert nodes[references_of(poses)["storage"]].tag == "LinearTransformSequenceStorage"
+        assert references_of(image)["transform"] == pose.get("id")
+        assert browser.get("virtualNodePostfixes") == "0 1"
+        assert float(browser.get("playbackRateFps")) == pytest.approx(8 / 0.28, rel=1e-5)
+
+
+def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
+    target = tmp_path / "s"
+    write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST)
+    (target / "volume-crop.nrrd").write_bytes(b"somebody's own")
+    write_scene(target, [posed_sweep("image")], replace(REQUEST, with_images=False))
+    (target / "volume-crop.nrrd").unlink()
+    stems = ("first-frame", "outlines", "scene", "state", "volume")
+    assert sorted(path.name.split(".")[0].removesuffix("-image") for path in target.iterdir()) == [*stems]
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InvalidInputError, match="another folder"):
+        require_scene_place(tmp_path)
+    (tmp_path / "scene.mrml").write_text("<MRML/>")
+    require_scene_place(tmp_path)
+    with pytest.raises(InvalidInputError, match="holds an input"):
+        require_scene_place(tmp_path, tmp_path / "notes.txt")
+
+
+def test_the_same_mode_twice_is_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match="each once, got image, image"):
+        write_scene(tmp_path / "s", [posed_sweep(), posed_sweep()], REQUEST)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("room", [100, 1000, 2500, 4000])
+def test_on_a_full_disk_there_is_no_folder(tmp_path, room):
+    with limited(room), pytest.raises(NoSpaceError, match=FULL) as caught:
+        write_scene(tmp_path / "s", [posed_sweep()], REQUEST)
+    assert str(tmp_path / "s") in str(caught.value)
+    assert ".part" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_scene_is_well_formed():
+    assert list(ElementTree.fromstring(Scene().text().encode())) == []

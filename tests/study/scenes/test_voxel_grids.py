@@ -1,0 +1,82 @@
+"""Grids of volumes as they are asked for, from the request to the file that other programs read."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.imaging.region import Region
+from speckle3d.imaging.voxels.settings import CompoundingSettings
+from speckle3d.study.posed import open_posed
+from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
+
+SPACING, ORIGIN, SHAPE = (0.7, 0.9, 1.1), (1.0 / 3.0, 2.0 / 7.0, -0.1), (19, 41, 7)
+COARSE = CompoundingSettings(voxel_mm=1.0)
+
+
+@pytest.fixture(scope="module")
+def posed(shipped):
+    return open_posed(shipped / "phantom.h5")
+
+
+def written(posed, path, **request):
+    write_voxels(posed, VolumeRequest(path, request.pop("settings", COARSE), **request))
+    return pytest.importorskip("SimpleITK").ReadImage(path)
+
+
+@pytest.mark.parametrize("name", ["v.nrrd", "v.mha"])
+def test_spacing_origin_and_shape_are_in_the_file_to_the_last_bit(posed, tmp_path, name):
+    asked = GridRequest("world", SPACING, ORIGIN, SHAPE)
+    image = written(posed, tmp_path / name, grid=asked)
+    assert (image.GetSpacing(), image.GetOrigin(), image.GetSize()) == (SPACING, ORIGIN, SHAPE)
+    assert image.GetDirection() == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    again = written(posed, tmp_path / "like.nrrd", grid=GridRequest(like=tmp_path / name))
+    assert (again.GetSpacing(), again.GetOrigin(), again.GetSize()) == (SPACING, ORIGIN, SHAPE)
+
+
+def test_a_size_in_mm_is_rounded_up_to_voxels(posed, tmp_path):
+    asked = GridRequest("principal", SPACING, size_mm=(7.0, 9.1, 4.4))
+    assert written(posed, tmp_path / "v.nrrd", grid=asked).GetSize() == (10, 11, 4)
+
+
+def test_the_finest_round_spacing_within_a_size(posed, tmp_path):
+    settings = CompoundingSettings(voxel_type="int16", fill_radius=0)
+    image = written(posed, tmp_path / "v.nrrd", grid=GridRequest("world", within_gb=2e-5), settings=settings)
+    (spacing,) = set(image.GetSpacing())
+    assert spacing in (0.8, 1.0, 1.2, 1.5)
+    assert np.prod(image.GetSize()) * 2 <= 2e4
+    finer = GridRequest("world", spacing_mm=(0.8 * spacing,) * 3)
+    assert np.prod(written(posed, tmp_path / "finer.nrrd", grid=finer).GetSize()) * 2 > 2e4
+
+
+@pytest.mark.parametrize("settings", [COARSE, CompoundingSettings(voxel_mm=1.0, backward_mm=1.0)])
+def test_a_region_bounds_the_grid_and_what_is_in_it(posed, tmp_path, settings):
+    region = Region.from_text("rectangle 3,10 9,20")
+    image = written(posed, tmp_path / "v.nrrd", region=region, settings=settings)
+    # Images are nearly parallel: the region's 6 x 10 mm, and a voxel or two more that their tilt takes.
+    assert image.GetSize()[0] in (7, 8, 9)
+    assert image.GetSize()[1] in (11, 12, 13)
+    whole = written(posed, tmp_path / "whole.nrrd", settings=settings)
+    assert image.GetSize()[0] < whole.GetSize()[0]
+    # Voxels of the middle lie in the region as the image beside them has it.
+    points = [image.TransformIndexToPhysicalPoint((4, y, 5)) for y in range(2, 9)]
+    inside = [posed.world_from_image[len(posed.frames) // 2].inv().apply(point)[:2] for point in points]
+    assert all(3 < x < 9 and 10 < y < 20 for x, y in inside)
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        (GridRequest(like=Path("v.nrrd"), shape=(1, 1, 1)), "--like: expected no other option"),
+        (GridRequest(within_gb=1.0, spacing_mm=SPACING), "--within-gb: expected no --spacing-mm"),
+        (GridRequest(shape=SHAPE, size_mm=(1.0, 1.0, 1.0)), "a shape or a size in mm, got both"),
+        (GridRequest(within_gb=0.0), "expected enough for some voxels"),
+        (GridRequest(spacing_mm=(1.0, -1.0, 1.0)), "above zero"),
+        (GridRequest(origin_mm=(1e4, 0.0, 0.0), axes="world"), "beyond it"),
+    ],
+)
+def test_what_cannot_be_had_is_refused_before_a_file_is_made(posed, tmp_path, asked, expected):
+    with pytest.raises(InvalidInputError, match=expected):
+        write_voxels(posed, VolumeRequest(tmp_path / "v.nrrd", COARSE, asked))
+    assert not list(tmp_path.iterdir())
