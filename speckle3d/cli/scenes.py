@@ -14,11 +14,10 @@ from speckle3d.cli.common import (
     SweepFile,
     Transform,
     app,
-    from_options,
-    load_settings,
     note,
     progress_bar,
 )
+from speckle3d.cli.compounding import FillRadius, LevelRange, Rule, Splat, VoxelMm, compounding_settings
 from speckle3d.cli.importing import (
     Importing,
     Number,
@@ -46,19 +45,11 @@ def scene(
     deviation: Annotated[
         bool, typer.Option("--deviation", help="Also each voxel's standard deviation of position, mm.")
     ] = False,
-    voxel_mm: Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")] = None,
-    splat: Annotated[
-        str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
-    ] = None,
-    rule: Annotated[
-        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
-    ] = None,
-    fill_radius: Annotated[
-        int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
-    ] = None,
-    dynamic_range_db: Annotated[
-        float | None, typer.Option(help="Range of log-compressed grey levels (60).")
-    ] = None,
+    voxel_mm: VoxelMm = None,
+    splat: Splat = None,
+    rule: Rule = None,
+    fill_radius: FillRadius = None,
+    dynamic_range_db: LevelRange = None,
     sweep_file: SweepFile = None,
     calibration: CalibrationFiles = None,
     plus_config: PlusConfig = None,
@@ -70,15 +61,12 @@ def scene(
     config_file: ConfigFile = None,
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames."""
-    from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
 
     options = locals()
     require_scene_place(out, source, sweep_file, *files_of(plus_config, calibration))
-    base = load_settings(config_file).volume.model_dump()
-    given = {name: value for name, value in options.items() if name in base and value is not None}
-    settings = from_options(CompoundingSettings, base | given)
+    settings = compounding_settings(config_file, options)
     # The range is that of the volume's levels; a recording's own is said beside it.
     imported = given_settings(source, {**options, "dynamic_range_db": None})
     modes: list[str | None] = list(mode) if mode else [None]

@@ -12,11 +12,9 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from speckle3d.core.arrays import BoolArray
     from speckle3d.core.pose_errors import PosedErrors
     from speckle3d.core.surface import Surface
     from speckle3d.core.sweep import ImageGrid
-    from speckle3d.core.volume import Volume
 
 
 @app.command()
@@ -60,9 +58,10 @@ def surface(
 
     Where the sweep ends the surface stays open, and what is open has no volume.
     """
+    from speckle3d.core.labels import EMPTY
     from speckle3d.imaging.measures.surface import largest_part, smoothed, surface_of, surfaces_of_labels
     from speckle3d.io.surfaces import require_suffix, write_surface
-    from speckle3d.io.volumes import read_volume
+    from speckle3d.io.volumes import read_states, read_volume
 
     if labels == (level is not None):
         raise InvalidInputError("expected --level or --labels, one of them")
@@ -75,7 +74,7 @@ def surface(
         require_own_place(out, "surface", source, reconstruction, state)
     volume = read_volume(source)
     errors, grid = _errors(reconstruction, mode or volume.fields.get("poses", "image"))
-    known = None if state is None else _known(volume, state)
+    known = None if state is None else read_states(state, volume) != EMPTY
     found: dict[str, Surface] = {}
     if labels:
         for label, each in surfaces_of_labels(volume).items():
@@ -94,19 +93,6 @@ def surface(
         emit_json(told)
     else:
         emit("\n".join(_line(each) for each in told))
-
-
-def _known(volume: Volume, path: Path) -> BoolArray:
-    """Voxels that are not empty by a state file."""
-    from speckle3d.io.volumes import read_volume
-
-    state = read_volume(path)
-    if state.shape != volume.shape:
-        raise InvalidInputError(
-            f"--state: expected {volume.shape} voxels, as the volume's, got {state.shape}"
-        )
-    empty: BoolArray = state.voxels == 0
-    return ~empty
 
 
 def _errors(path: Path | None, mode: str) -> tuple[PosedErrors | None, ImageGrid | None]:

@@ -17,11 +17,10 @@ from speckle3d.cli.common import (
     Transform,
     app,
     emit_json,
-    from_options,
-    load_settings,
     note,
     progress_bar,
 )
+from speckle3d.cli.compounding import FillRadius, LevelRange, Rule, Splat, VoxelMm, compounding_settings
 from speckle3d.cli.importing import (
     Importing,
     Number,
@@ -40,16 +39,10 @@ def volume(
     source: PosedFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha, .nii.gz or .nii to write.")],
     mode: Mode = None,
-    voxel_mm: Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")] = None,
-    splat: Annotated[
-        str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
-    ] = None,
-    rule: Annotated[
-        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
-    ] = None,
-    fill_radius: Annotated[
-        int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
-    ] = None,
+    voxel_mm: VoxelMm = None,
+    splat: Splat = None,
+    rule: Rule = None,
+    fill_radius: FillRadius = None,
     fill_mm: Annotated[
         float | None, typer.Option(help="Instead, in mm along each axis, whatever the voxels' shape.")
     ] = None,
@@ -59,9 +52,7 @@ def volume(
     levels: Annotated[
         str | None, typer.Option(help="log, linear, or stored (B-mode as it is, which is the default).")
     ] = None,
-    dynamic_range_db: Annotated[
-        float | None, typer.Option(help="Range of log-compressed grey levels (60).")
-    ] = None,
+    dynamic_range_db: LevelRange = None,
     axes: Annotated[
         Literal["sweep", "world", "principal"],
         typer.Option(help="Of the voxels: sweep (mean of the images), world, principal (smallest box)."),
@@ -111,7 +102,6 @@ def volume(
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
-    from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
@@ -119,11 +109,9 @@ def volume(
     for place in (out, state, deviation):
         if place is not None:
             require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
-    base = load_settings(config_file).volume.model_dump()
-    given = {name: value for name, value in options.items() if name in base and value is not None}
-    if levels == "linear" and voxel_type is None:  # most amplitudes are less than one
-        given["voxel_type"] = "float32"
-    settings = from_options(CompoundingSettings, base | given)
+    if levels == "linear" and voxel_type is None:
+        voxel_type = "float32"  # most amplitudes are less than one
+    settings = compounding_settings(config_file, {**options, "voxel_type": voxel_type})
     request = VolumeRequest(
         out,
         settings,

@@ -67,9 +67,7 @@ class ReslicePlane:
     @property
     def extent_mm(self) -> tuple[float, float, float, float]:
         """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
-        rows, columns = self.shape
-        left, top = (first - self.pixel_mm / 2 for first in self.first_mm)
-        return left, left + columns * self.pixel_mm, top + rows * self.pixel_mm, top
+        return outer_borders(self.shape, self.first_mm, self.pixel_mm)
 
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm."""
@@ -109,6 +107,15 @@ def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
             f"reslice of {width_mm:g} x {height_mm:g} mm: expected at most {MAX_PIXELS} "
             f"pixels, got more with pixels of {pixel_mm:g} mm"
         )
+
+
+def outer_borders(
+    shape: tuple[int, int], first_mm: tuple[float, float], pixel_mm: float
+) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of pixels of which the first one's centre is at `first_mm`, mm."""
+    rows, columns = shape
+    left, top = (first - pixel_mm / 2 for first in first_mm)
+    return left, left + columns * pixel_mm, top + rows * pixel_mm, top
 
 
 def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:
@@ -214,16 +221,23 @@ def planes_from_first_frame(
     high = reduce(np.maximum, [ends.max(axis=0) for _, ends in placed.values()])
     low, high = np.maximum(low, -np.array(largest_mm)), np.minimum(high, largest_mm)
     size = np.clip(high - low, pixel_mm, largest_mm)
-    return {mode: plane_part(axes, low, size, pixel_mm, line_mm) for mode, (axes, _) in placed.items()}
+    return {mode: _plane_part(axes, low, size, pixel_mm, line_mm) for mode, (axes, _) in placed.items()}
 
 
 def _mean_plane(world_from_image: RigidTransform, line_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
     axes, ends = _travelled(world_from_image, line_mm)
-    low, high = ends.min(axis=0), ends.max(axis=0)
-    return plane_part(axes, low, np.maximum(high - low, pixel_mm), pixel_mm, line_mm)
+    return plane_around(axes, ends, pixel_mm, line_mm)
 
 
-def plane_part(
+def plane_around(
+    placed: RigidTransform, points_mm: FloatArray, pixel_mm: float, line_mm: FloatArray | None = None
+) -> ReslicePlane:
+    """Smallest rectangle of a placed plane that holds points of it, shape (n, 2), mm."""
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    return _plane_part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm, line_mm)
+
+
+def _plane_part(
     placed: RigidTransform,
     low: FloatArray,
     size: FloatArray,

@@ -160,6 +160,11 @@ def grid_as_asked(
     return VoxelGrid(_checked_shape(counts, spacing), spacing, RigidTransform.from_components(origin, axes))
 
 
+def even_planes(n_k: int, most: int) -> int:
+    """Planes of a slab, at most `most` of `n_k`: slabs of nearly one size, none at the end worth little."""
+    return -(-n_k // -(-n_k // most))
+
+
 def grid_like(volume: Volume) -> VoxelGrid:
     """Grid of a volume, to make another one with the same voxels."""
     return VoxelGrid(volume.shape, volume.spacing_mm, volume.world_from_grid)
@@ -217,7 +222,7 @@ def _bounds(
     grid: ImageGrid, world_from_image: RigidTransform, world_from_axes: Rotation
 ) -> tuple[FloatArray, FloatArray]:
     """Least and greatest coordinates along the axes of the images' corners."""
-    along = world_from_axes.inv().apply(image_corners(grid, world_from_image))
+    along = world_from_axes.inv().apply(image_corners(grid, world_from_image).reshape(-1, 3))
     return along.min(axis=0), along.max(axis=0)
 
 

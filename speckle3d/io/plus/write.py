@@ -25,8 +25,9 @@ from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.headers import read_header
-from speckle3d.io.pixels import meta_type, type_of_word
+from speckle3d.io.header_text import header_bytes, packed_size_line, put_packed_size
+from speckle3d.io.headers import NRRD_NAMES, read_header
+from speckle3d.io.pixels import meta_type, nrrd_type, type_of_word
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.rows import Rows, number_of, rows_of, rows_without_images
 
@@ -41,15 +42,7 @@ _OF_SLICER = ".seq.nrrd"
 _LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
 
-_PLACE = 20
-"""Characters kept in a header for the size of the packed pixels, which is known after them."""
-
-_NRRD_WORDS = {"u1": "uint8", "i1": "int8", "i2": "int16", "u2": "uint16", "i4": "int32", "u4": "uint32",
-               "i8": "int64", "u8": "uint64", "f4": "float", "f8": "double"}  # fmt: skip
-_NRRD_NAMES = {
-    "UltrasoundImageOrientation": "ultrasound image orientation",
-    "UltrasoundImageType": "ultrasound image type",
-}
+_NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 _META_ONLY = ("NDims", "ElementType", "ElementSpacing")
 
 
@@ -124,9 +117,7 @@ def write_sequence(
         file.write(head)
         size = images.write(file, 15 if compressed else None)
         if compressed:
-            at = head.index(_SIZE_FIELD) + len(_SIZE_FIELD)
-            file.seek(at)
-            file.write(str(size).encode().ljust(_PLACE))
+            put_packed_size(file, head, size)
     return rows.left_out
 
 
@@ -163,7 +154,7 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
         "ElementDataFile = LOCAL",
     ]
     with atomic_path(path) as part:
-        part.write_bytes(_encoded(lines))
+        part.write_bytes(header_bytes(lines))
 
 
 def _require_own(header: Path, data: Path) -> None:
@@ -180,9 +171,6 @@ def _left_by(header: Path, beside: str) -> tuple[str, ...]:
         return ()
     names = {f"{header.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
     return tuple(names & {read_header(header).pixels.path.name})
-
-
-_SIZE_FIELD = b"CompressedDataSize = "
 
 
 @dataclass(frozen=True)
@@ -271,7 +259,7 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
         "BinaryData = True",
         "BinaryDataByteOrderMSB = False",
         f"CompressedData = {packed is not None}",
-        *([] if packed is None else [f"{_SIZE_FIELD.decode()}{str(packed).ljust(_PLACE)}"]),
+        *([] if packed is None else [packed_size_line(packed)]),
         f"DimSize = {_lengths(images, rows)}",
         f"Kinds = {'domain domain' if rows.is_plane else 'domain domain list'}",
         f"ElementSpacing = {spacing}",
@@ -280,13 +268,13 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
         *_frame_lines(rows, " = "),
         f"ElementDataFile = {data}",
     ]
-    return _encoded(lines)
+    return header_bytes(lines)
 
 
 def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -> bytes:
     lines = [
         "NRRD0004",
-        f"type: {_NRRD_WORDS[images.dtype.str[1:]]}",
+        f"type: {nrrd_type(images.dtype)}",
         *(_slicers_axes if is_slicers else _axes)(images, rows),
         "endian: little",
         f"encoding: {encoding}",
@@ -300,7 +288,7 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -
         *(_slicers_index(rows) if is_slicers else ()),
         "",
     ]
-    return _encoded(lines)
+    return header_bytes(lines)
 
 
 def _axes(images: _Images, rows: Rows) -> Iterator[str]:
@@ -339,8 +327,3 @@ def _slicers_index(rows: Rows) -> Iterator[str]:
     for axis in (3, 0):
         yield f"axis {axis} index type:=numeric"
         yield f"axis {axis} index values:={told}"
-
-
-def _encoded(lines: list[str]) -> bytes:
-    """Text of a header, as bytes that are read back as the same text."""
-    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
