@@ -15,12 +15,30 @@ def header_bytes(lines: Iterable[str]) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
 
 
-def packed_size_line(size: int = 0) -> str:
-    """Line of a MetaImage's header for the bytes of its packed pixels, with room for any number."""
-    return f"{_SIZE_FIELD}{str(size).ljust(_SIZE_PLACE)}"
+def meta_start(axes: int, packed_size: int | None) -> list[str]:
+    """First lines of a MetaImage's header.
+
+    Parameters
+    ----------
+    axes : int
+    packed_size : int or None
+        Bytes of the packed pixels, 0 if `put_packed_size` tells them later; None if they are not packed.
+    """
+    return [
+        "ObjectType = Image",
+        f"NDims = {axes}",
+        "BinaryData = True",
+        "BinaryDataByteOrderMSB = False",
+        f"CompressedData = {packed_size is not None}",
+        *([] if packed_size is None else [_packed_size_line(packed_size)]),
+    ]
 
 
 def put_packed_size(file: BinaryIO, header: bytes, size: int) -> None:
     """Write the size of the packed pixels where a file, which begins with the header, has room for it."""
     file.seek(header.index(_SIZE_FIELD.encode()))
-    file.write(packed_size_line(size).encode())
+    file.write(_packed_size_line(size).encode())
+
+
+def _packed_size_line(size: int) -> str:
+    return f"{_SIZE_FIELD}{str(size).ljust(_SIZE_PLACE)}"

@@ -23,7 +23,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import VOXEL_TYPES, require_spacing
-from speckle3d.io.header_text import header_bytes, packed_size_line
+from speckle3d.io.header_text import header_bytes, meta_start
 from speckle3d.io.pixels import meta_type, nrrd_type
 
 PREFIX = "Speckle3D_"
@@ -122,12 +122,7 @@ def meta_header(header: VolumeHeader, is_packed: bool) -> bytes:
     """Header of a MetaImage with its voxels behind it; `put_packed_size` tells it their size."""
     return header_bytes(
         (
-            "ObjectType = Image",
-            "NDims = 3",
-            "BinaryData = True",
-            "BinaryDataByteOrderMSB = False",
-            f"CompressedData = {is_packed}",
-            *((packed_size_line(),) if is_packed else ()),
+            *meta_start(3, 0 if is_packed else None),
             f"TransformMatrix = {_texts(header.axes.ravel())}",
             f"Offset = {_texts(header.origin_mm)}",
             "CenterOfRotation = 0 0 0",

@@ -25,7 +25,7 @@ from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.header_text import header_bytes, packed_size_line, put_packed_size
+from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
 from speckle3d.io.headers import NRRD_NAMES, read_header
 from speckle3d.io.pixels import meta_type, nrrd_type, type_of_word
 from speckle3d.io.plus.layout import Layout
@@ -41,6 +41,9 @@ _OF_SLICER = ".seq.nrrd"
 
 _LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
+
+_ZLIB, _GZIP = 15, 31
+"""Windows of deflate, and by them what is around it."""
 
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 _META_ONLY = ("NDims", "ElementType", "ElementSpacing")
@@ -93,31 +96,19 @@ def write_sequence(
         rows.add_transforms(name, matrices)
     images = _Images.of(sweep, rows, progress)
     if suffix == ".mhd":
-        beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
-        _require_own(target, target.with_name(beside))
-        files = FileSet(target.name, (beside,), _left_by(target, beside))
-        with files.replaced(target.parent) as part:
-            try:
-                with (part / beside).open("wb") as file:
-                    size = images.write(file, 15 if compressed else None)
-                header = _meta_header(images, rows, beside, size if compressed else None)
-                (part / target.name).write_bytes(header)
-            except Speckle3DError:
-                raise
-            except OSError as error:
-                raise cannot_write(path, error) from error
-        return rows.left_out
-    with atomic_path(target) as part, part.open("wb") as file:
-        if suffix == ".nrrd":
-            is_slicers = target.name.lower().endswith(_OF_SLICER)
+        _write_two_files(target, images, rows, compressed)
+    elif suffix == ".nrrd":
+        is_slicers = target.name.lower().endswith(_OF_SLICER)
+        with atomic_path(target) as part, part.open("wb") as file:
             file.write(_nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers))
-            images.write(file, 31 if compressed else None)
-            return rows.left_out
+            images.write(file, _GZIP if compressed else None)
+    else:
         head = _meta_header(images, rows, "LOCAL", 0 if compressed else None)
-        file.write(head)
-        size = images.write(file, 15 if compressed else None)
-        if compressed:
-            put_packed_size(file, head, size)
+        with atomic_path(target) as part, part.open("wb") as file:
+            file.write(head)
+            size = images.write(file, _ZLIB if compressed else None)
+            if compressed:
+                put_packed_size(file, head, size)
     return rows.left_out
 
 
@@ -141,11 +132,7 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     for name, matrices in transforms.items():
         rows.add_transforms(name, matrices)
     lines = [
-        "ObjectType = Image",
-        "NDims = 3",
-        "BinaryData = True",
-        "BinaryDataByteOrderMSB = False",
-        "CompressedData = False",
+        *meta_start(3, None),
         f"DimSize = 0 0 {len(times_s)}",
         "Kinds = domain domain list",
         "ElementSpacing = 1 1 1",
@@ -155,6 +142,22 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     ]
     with atomic_path(path) as part:
         part.write_bytes(header_bytes(lines))
+
+
+def _write_two_files(target: Path, images: _Images, rows: Rows, compressed: bool) -> None:
+    """Write a MetaImage's header, and its pixels into a file beside it; both appear, or neither."""
+    beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
+    _require_own(target, target.with_name(beside))
+    with FileSet(target.name, (beside,), _left_by(target, beside)).replaced(target.parent) as part:
+        try:
+            with (part / beside).open("wb") as file:
+                size = images.write(file, _ZLIB if compressed else None)
+            header = _meta_header(images, rows, beside, size if compressed else None)
+            (part / target.name).write_bytes(header)
+        except Speckle3DError:
+            raise
+        except OSError as error:
+            raise cannot_write(target, error) from error
 
 
 def _require_own(header: Path, data: Path) -> None:
@@ -254,12 +257,7 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
     spacing = fields.pop("ElementSpacing")
     fields.pop("ElementType", None)
     lines = [
-        "ObjectType = Image",
-        f"NDims = {2 if rows.is_plane else 3}",
-        "BinaryData = True",
-        "BinaryDataByteOrderMSB = False",
-        f"CompressedData = {packed is not None}",
-        *([] if packed is None else [packed_size_line(packed)]),
+        *meta_start(2 if rows.is_plane else 3, packed),
         f"DimSize = {_lengths(images, rows)}",
         f"Kinds = {'domain domain' if rows.is_plane else 'domain domain list'}",
         f"ElementSpacing = {spacing}",
