@@ -1,7 +1,7 @@
 """How IGSIO, on which PLUS and Slicer stand, makes a volume of tracked images: an oracle for tests.
 
-Written from what its sources do, `vtkIGSIOPasteSliceIntoVolume` and `vtkIGSIOFillHolesInVolume`, with
-``Optimization="FULL"``. What it does otherwise than the definition of a mean:
+Written from what its source does, `vtkIGSIOPasteSliceIntoVolume` with ``Optimization="FULL"``.
+What it does otherwise than the definition of a mean:
 
 - Places are whole multiples of 2^-14 voxel, and so are the steps between pixels: over a row of 820 pixels
   the place is off by up to 0.025 voxel.
@@ -16,20 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-POINT = 14
-"""Binary places of its fixed-point numbers."""
+ONE = 2**14
+"""A voxel's side, and the whole of a pixel, in its fixed-point numbers."""
 
 ONE_PIXEL, MOST, LAST = 256, 65535, 65535 - 256
 """Weight of a pixel, the most that is kept, and the most at which one more is added."""
-
-STICKS = np.array(
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1],
-     [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, -1, 0], [1, 0, -1], [0, 1, -1],
-     [1, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, 1]]
-)  # fmt: skip
-"""Directions in which holes are looked across, along i, j and k."""
 
 
 @dataclass(frozen=True)
@@ -96,109 +88,69 @@ def grid_of(reference_from_image, clip, width, height, spacing_mm):
     return low, tuple((np.rint((high - low) / spacing_mm).astype(int) + 1).tolist())
 
 
-def paste(images, voxel_from_pixel, shape, clip, linear=False, rule="mean", point=POINT):
+def paste(images, voxel_from_pixel, shape, clip, linear=False, rule="mean", mask=None):
     """Volume and weights, both indexed [i, j, k], of images (frame, row, column) put in one after another.
 
     Parameters
     ----------
     voxel_from_pixel : ndarray, shape (n, 3, 4)
         Affine maps from (column, row, 0, 1) to voxel indices.
-    point : int
-        Binary places of places and shares; with 24, a place is off by 0.00002 voxel over 820 pixels.
+    mask : ndarray of bool, shape (height, width), optional
+        Pixels that count, in place of the clip's.
     """
-    height, width = images.shape[1:]
-    volume, weight = np.zeros(shape, np.uint8), np.zeros(shape, np.uint16)
-    maps = np.rint(np.asarray(voxel_from_pixel) * 2.0**point).astype(np.int64)[:, :, [0, 1, 3]]
-    spans = clip.spans(width, height)
-    number = {"mean": 0, "maximum": 1, "latest": 2}[rule]
+    volume, weight = np.zeros(shape, int), np.zeros(shape, int)
     put = _linear if linear else _nearest
-    if images.size < 10_000:  # sooner done than compiled
-        put = put.py_func
+    maps = np.rint(np.asarray(voxel_from_pixel) * ONE).astype(int)[:, :, [0, 1, 3]]
+    rows, columns = np.nonzero(clip.mask(*images.shape[:0:-1]) if mask is None else mask)  # row by row
     for image, axes in zip(images, maps, strict=True):
-        put(np.ascontiguousarray(image), axes, spans, volume, weight, number, point)
-    return volume, weight
+        for row, column in zip(rows, columns, strict=True):
+            put(volume, weight, axes @ [column, row, 1], int(image[row, column]), rule)
+    return volume.astype(np.uint8), weight.astype(np.uint16)
 
 
-@njit(cache=True, fastmath=False)
-def _nearest(image, axes, spans, volume, weight, rule, point):
-    n_i, n_j, n_k = volume.shape
-    half = 1 << (point - 1)
-    for row in range(image.shape[0]):
-        for piece in range(2):
-            for column in range(spans[row, piece, 0], spans[row, piece, 1] + 1):
-                place = axes[:, 2] + row * axes[:, 1] + column * axes[:, 0]
-                i, j, k = (place + half) >> point
-                if not (0 <= i < n_i and 0 <= j < n_j and 0 <= k < n_k):
-                    continue
-                level, so_far, held = int(image[row, column]), int(weight[i, j, k]), int(volume[i, j, k])
-                if rule == 1:
-                    volume[i, j, k] = max(level, held)
-                    weight[i, j, k] = ONE_PIXEL
-                elif rule == 2:
-                    volume[i, j, k] = level
-                    weight[i, j, k] = ONE_PIXEL
-                elif so_far <= LAST:
-                    volume[i, j, k] = (level * ONE_PIXEL + held * so_far) // (so_far + ONE_PIXEL)
-                    weight[i, j, k] = so_far + ONE_PIXEL
-                else:
-                    volume[i, j, k] = int(level / 256 + held * 255 / 256)
+def _nearest(volume, weight, place, level, rule):
+    at = tuple((place + ONE // 2) // ONE)
+    if any(not 0 <= a < n for a, n in zip(at, volume.shape, strict=True)):
+        return
+    held, so_far = int(volume[at]), int(weight[at])
+    if rule != "mean":
+        volume[at] = max(level, held) if rule == "maximum" else level
+        weight[at] = ONE_PIXEL
+    elif so_far <= LAST:
+        volume[at] = (level * ONE_PIXEL + held * so_far) // (so_far + ONE_PIXEL)
+        weight[at] = so_far + ONE_PIXEL
+    else:
+        volume[at] = int(level / 256 + held * 255 / 256)
 
 
-@njit(cache=True, fastmath=False)
-def _linear(image, axes, spans, volume, weight, rule, point):
-    n_i, n_j, n_k = volume.shape
-    one = 1 << point
-    half = one >> 1
-    share = np.zeros((3, 2), np.int64)
-    for row in range(image.shape[0]):
-        for piece in range(2):
-            for column in range(spans[row, piece, 0], spans[row, piece, 1] + 1):
-                place = axes[:, 2] + row * axes[:, 1] + column * axes[:, 0]
-                i, j, k = place >> point
-                share[:, 1] = place & (one - 1)
-                share[:, 0] = one - share[:, 1]
-                if i < 0 or j < 0 or k < 0:
-                    continue
-                if (
-                    i + (share[0, 1] != 0) >= n_i
-                    or j + (share[1, 1] != 0) >= n_j
-                    or k + (share[2, 1] != 0) >= n_k
-                ):
-                    continue
-                level = int(image[row, column])
-                for corner in range(7, -1, -1):
-                    a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
-                    f = (share[1, b] * share[2, c] + half) >> point
-                    f = (share[0, a] * f + half) >> point
-                    if f == 0:
-                        continue
-                    held, so_far = int(volume[i + a, j + b, k + c]), int(weight[i + a, j + b, k + c])
-                    if rule == 0:
-                        r = so_far << (point - 8)
-                        mean = np.rint((f * level + r * held) / (f + r) * one)
-                        volume[i + a, j + b, k + c] = (int(mean) + half) >> point
-                        new = (f + r) << 8
-                    elif 8 * f >= one and (rule == 2 or level > held):
-                        volume[i + a, j + b, k + c] = level
-                        new = f << 8
-                    else:
-                        continue
-                    weight[i + a, j + b, k + c] = min((new + half) >> point, MOST)
+def _linear(volume, weight, place, level, rule):
+    first, ahead = place // ONE, place % ONE
+    if (first < 0).any() or (first + (ahead > 0) >= volume.shape).any():
+        return
+    for corner in np.ndindex(2, 2, 2):
+        share = np.where(corner, ahead, ONE - ahead)
+        f = int(share[0] * ((share[1] * share[2] + ONE // 2) // ONE) + ONE // 2) // ONE
+        if f == 0:
+            continue
+        at = tuple(first + corner)
+        held, so_far = int(volume[at]), int(weight[at])
+        if rule == "mean":
+            r = so_far * ONE // 256
+            volume[at] = (round((f * level + r * held) / (f + r) * ONE) + ONE // 2) // ONE
+            new = (f + r) * 256
+        elif 8 * f >= ONE and (rule == "latest" or level > held):
+            volume[at] = level
+            new = f * 256
+        else:
+            continue
+        weight[at] = min((new + ONE // 2) // ONE, MOST)
 
 
-def exact_mean(images, voxel_from_pixel, shape, clip, linear=False, true_places=False):
-    """Mean of the same pixels without rounding, NaN where there are none, and their weight, both [i, j, k].
-
-    Parameters
-    ----------
-    true_places : bool
-        Take places as they are, not as multiples of 2^-14 voxel.
-    """
+def exact_mean(images, voxel_from_pixel, shape, clip, linear=False):
+    """Mean of the same pixels without rounding, NaN where none are, and their weight, both [i, j, k]."""
     rows, columns = np.nonzero(clip.mask(images.shape[2], images.shape[1]))
     pixels = np.stack([columns, rows, np.ones_like(rows)])
-    maps = np.asarray(voxel_from_pixel)[:, :, [0, 1, 3]]
-    if not true_places:
-        maps = np.rint(maps * 2.0**POINT) / 2.0**POINT
+    maps = np.rint(np.asarray(voxel_from_pixel)[:, :, [0, 1, 3]] * ONE) / ONE
     total, weight = np.zeros(np.prod(shape)), np.zeros(np.prod(shape))
     for image, axes in zip(images, maps, strict=True):
         place, level = (axes @ pixels).T, image[rows, columns].astype(float)
@@ -215,54 +167,3 @@ def exact_mean(images, voxel_from_pixel, shape, clip, linear=False, true_places=
             weight += np.bincount(flat, share, total.size)
     with np.errstate(invalid="ignore"):
         return (total / weight).reshape(shape), weight.reshape(shape)
-
-
-@njit(cache=True, fastmath=False)
-def _across(volume, weight, sticks, longest, filled):
-    n_i, n_j, n_k = volume.shape
-    for i in range(n_i):
-        for j in range(n_j):
-            for k in range(n_k):
-                if weight[i, j, k]:
-                    continue
-                best, total, number = 0.0, 0.0, 0
-                for stick in range(sticks.shape[0]):
-                    step = sticks[stick]
-                    reach = np.zeros(2, np.int64)
-                    ends = np.zeros(2)
-                    for side in range(2):
-                        sign = 1 - 2 * side
-                        for steps in range(1, longest - reach[0]):
-                            x, y, z = (
-                                i + sign * steps * step[0],
-                                j + sign * steps * step[1],
-                                k + sign * steps * step[2],
-                            )
-                            if not (0 <= x < n_i and 0 <= y < n_j and 0 <= z < n_k):
-                                break
-                            if weight[x, y, z]:
-                                reach[side], ends[side] = steps, volume[x, y, z]
-                                break
-                        if reach[side] == 0:
-                            break
-                    if reach[1] == 0:
-                        continue
-                    all_steps = reach[0] + reach[1] + 1
-                    ahead = (reach[1] + 1) / all_steps
-                    score = 1.0 / (all_steps * np.sqrt(float((step**2).sum())))
-                    value = np.floor((1.0 - ahead) * ends[1] + ahead * ends[0])
-                    if score > best:
-                        best, total, number = score, 0.0, 0
-                    if score == best:
-                        total += value * score
-                        number += 1
-                # A level that came with less than half of 1/256 of a weight is lost.
-                filled[i, j, k] = int(total / (number * best)) if number else 0
-
-
-def fill_with_sticks(volume, weight, longest=9):
-    """Fill each hole across the shortest stick between measured voxels; equally short ones count alike."""
-    filled = volume.copy()
-    across = _across.py_func if volume.size < 10_000 else _across
-    across(volume, weight, STICKS, longest, filled)
-    return filled

@@ -17,7 +17,13 @@ VoxelMm = Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")]
 Splat = Annotated[
     str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
 ]
-Rule = Annotated[str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")]
+Rule = Annotated[
+    str | None,
+    typer.Option(
+        help="Of a voxel's samples: mean, maximum, latest, weighted; plus: mean kept in whole grey levels as "
+        "PLUS and 3D Slicer keep it, to compare with their volumes."
+    ),
+]
 FillRadius = Annotated[int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")]
 LevelRange = Annotated[float | None, typer.Option(help="Range of log-compressed grey levels (60).")]
 

@@ -10,6 +10,7 @@ import typer
 from speckle3d.cli.common import (
     CalibrationFiles,
     ConfigFile,
+    Modes,
     PosedFile,
     SweepFile,
     Transform,
@@ -32,13 +33,7 @@ from speckle3d.cli.importing import (
 def scene(
     source: PosedFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder to write; open its scene.mrml.")],
-    mode: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Which poses to use: image (default), orientation, pose, crossed, inertial, fused of a "
-            "reconstruction; tracker, truth of a recording. May be repeated."
-        ),
-    ] = None,
+    mode: Modes = None,
     images: Annotated[
         bool, typer.Option("--images", help="Also the images, which play as they move through the volume.")
     ] = False,

@@ -48,9 +48,7 @@ def _cut(start: int, stop: int, at: int, step: int, low: int, high: int) -> tupl
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _cut_to_box(
-    span: IntArray, m: IntArray, box: IntArray, reach: int
-) -> tuple[int, int, int, int, int, int]:
+def cut_to_box(span: IntArray, m: IntArray, box: IntArray, reach: int) -> tuple[int, int, int, int, int, int]:
     """Part of a span of samples inside a box: its line, first and end, and where its first lies."""
     line, start, stop = span[0], span[1], span[2]
     x, y, z = m[0, 0] * line + m[0, 2], m[1, 0] * line + m[1, 2], m[2, 0] * line + m[2, 2]
@@ -97,7 +95,7 @@ def count_nearest(
         m = maps[n]
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
         for span in range(spans.shape[0]):
-            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            line, start, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
             count = stop - start
             if count <= 0:
                 continue
@@ -154,7 +152,7 @@ def add_nearest(
         tag = first_tag + n if first_tag > 0 else 0
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
         for span in range(spans.shape[0]):
-            line, sample, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            line, sample, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
             while sample < stop:
                 i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
                 total, weight = 0.0, 0.0
@@ -193,7 +191,7 @@ def raise_nearest(
     for n in range(images.shape[0]):
         m = maps[n]
         for span in range(spans.shape[0]):
-            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 0)
+            line, start, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
             for sample in range(start, stop):
                 at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
                 level = np.float32(images[n, line, sample])
@@ -247,7 +245,7 @@ def add_linear(
         tag = first_tag + n if first_tag > 0 else 0
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
         for span in range(spans.shape[0]):
-            line, sample, stop, x, y, z = _cut_to_box(spans[span], m, box, 1)
+            line, sample, stop, x, y, z = cut_to_box(spans[span], m, box, 1)
             while sample < stop:
                 i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
                 # Sums of samples in a row between the same eight voxels, x fastest, in registers: arrays or
@@ -329,7 +327,7 @@ def raise_linear(
     for n in range(images.shape[0]):
         m = maps[n]
         for span in range(spans.shape[0]):
-            line, start, stop, x, y, z = _cut_to_box(spans[span], m, box, 1)
+            line, start, stop, x, y, z = cut_to_box(spans[span], m, box, 1)
             for sample in range(start, stop):
                 level = np.float32(images[n, line, sample])
                 i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS

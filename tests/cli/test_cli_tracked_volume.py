@@ -79,3 +79,26 @@ def test_other_levels_need_the_dynamic_range(run, refused, recording, tmp_path):
     assert volume.fields["levels"] == "echo amplitude, linear, of B-mode over 40 dB; 1 is full scale"
     assert volume.voxels.dtype == np.float32  # whole numbers hold no amplitude below 1
     assert 0 < np.nanmin(volume.voxels) < np.nanmax(volume.voxels) < 1
+
+
+def test_whole_grey_levels_are_kept_of_bytes_as_stored_alone(run, refused, recording, tmp_path):
+    out = tmp_path / "v.nrrd"
+    command = (
+        "volume",
+        recording[0],
+        "--plus-config",
+        tmp_path / "set.xml",
+        *GRID,
+        "--rule",
+        "plus",
+        "-o",
+        out,
+    )
+    told = refused(*command, "--voxel-type", "float32")
+    assert "rule plus: expected voxels of type uint8" in told
+    told = refused(*command, "--levels", "log", "--dynamic-range-db", 40)
+    assert "rule plus: expected images of type uint8, B-mode as stored, got float32" in told
+    assert not out.exists()
+    code, _, told = run(*command)
+    assert code == 0, told
+    assert read_volume(out).fields["rule"] == "plus"

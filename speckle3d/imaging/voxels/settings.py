@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Splat = Literal["nearest", "linear"]
-Rule = Literal["mean", "maximum", "latest", "weighted"]
+Rule = Literal["mean", "maximum", "latest", "weighted", "plus"]
 Levels = Literal["log", "linear", "stored"]
 VoxelType = Literal["float32", "uint8", "int16", "uint16"]
 
@@ -25,7 +25,8 @@ class CompoundingSettings(BaseModel):
     rule: Rule = Field(
         "mean",
         description="What several samples of a voxel make: their mean, the largest, the one of the latest "
-        "frame, or the mean weighted by how well each frame's place is known.",
+        "frame, or the mean weighted by how well each frame's place is known; plus: the mean kept in whole "
+        "grey levels as PLUS and 3D Slicer keep it, to compare with their volumes.",
     )
     backward_mm: float = Field(
         0.0,

@@ -17,6 +17,7 @@ from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, even_planes
 from speckle3d.imaging.voxels.holes import boxes_within, cubes_within, fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.voxels.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
+from speckle3d.imaging.voxels.whole_levels import splat_block_whole
 
 _SHARE = 0.8
 """Of the memory; the rest is for the interpreter, its libraries, and files being read and packed."""
@@ -69,6 +70,11 @@ def compound_slabs(
         for slab in backward_slabs(source, voxel_grid, chosen.backward_mm, region, chosen.max_memory_gb):
             yield Slab(slab.first, as_type(slab.voxels, slab.state, chosen.voxel_type), slab.state)
         return
+    if chosen.rule == "plus" and chosen.voxel_type != "uint8":
+        raise InvalidInputError(
+            "rule plus: expected voxels of type uint8, whose whole grey levels it keeps, got "
+            f"{chosen.voxel_type}"
+        )
     placed = Placed.on(voxel_grid, source, weights, region)
     planes = planes_per_slab(voxel_grid, chosen, batch_gb(source))
     for first in range(0, voxel_grid.shape[2], planes):
@@ -117,7 +123,10 @@ def _slab(
 ) -> Slab:
     boxes = boxes_of(voxel_grid, settings)
     below, above = max(first - _halo(boxes), 0), min(stop + _halo(boxes), voxel_grid.shape[2])
-    voxels, state = splat_block(placed, voxel_grid, settings.splat, settings.rule, below, above)
+    if settings.rule == "plus":
+        voxels, state = splat_block_whole(placed, voxel_grid, settings.splat, below, above)
+    else:
+        voxels, state = splat_block(placed, voxel_grid, settings.splat, settings.rule, below, above)
     fill_holes(voxels, state, boxes, first - below, stop - below)
     own = slice(first - below, stop - below)
     return Slab(first, as_type(voxels[own], state[own], settings.voxel_type), state[own])

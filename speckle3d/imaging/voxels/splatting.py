@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -124,7 +124,7 @@ def _checked_mask(mask: BoolArray | None, source: PosedImages) -> BoolArray | No
 
 
 @dataclass(frozen=True)
-class _Batch:
+class Batch:
     """Several frames in memory, as kernels read them.
 
     Attributes
@@ -138,13 +138,15 @@ class _Batch:
     turned: bool
 
 
-def _batches(source: PosedImages, frames: IntArray, direct: tuple[str, ...]) -> Iterator[_Batch]:
-    """Read frames a few at a time, in the order in memory of the first, and in its type if it is direct."""
+def batches(
+    source: PosedImages, frames: IntArray, direct: tuple[str, ...], by_row: bool = False
+) -> Iterator[Batch]:
+    """Read frames a few at a time, in the type of the first if it is direct, and in its order or by rows."""
     if frames.size == 0:
         return
     first = source.read_as_stored(int(frames[0]))
     kind = first.dtype if first.dtype.name in direct and first.dtype.isnative else np.dtype(np.float32)
-    turned = first.flags.f_contiguous and not first.flags.c_contiguous
+    turned = by_row or (first.flags.f_contiguous and not first.flags.c_contiguous)
     shape = first.shape[::-1] if turned else first.shape
     size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES)
     stored = first.dtype
@@ -157,7 +159,7 @@ def _batches(source: PosedImages, frames: IntArray, direct: tuple[str, ...]) -> 
             in_parallel(read, some.size)
         else:
             read(0, some.size)
-        yield _Batch(images[: some.size], some, turned)
+        yield Batch(images[: some.size], some, turned)
 
 
 def _read_into(
@@ -185,7 +187,7 @@ def batch_gb(source: PosedImages) -> float:
     return 2 * 4 * samples * (frames + 1) / 1e9
 
 
-def _spans(source: PosedImages, mask: BoolArray | None, turned: bool) -> IntArray:
+def spans_of(source: PosedImages, mask: BoolArray | None, turned: bool) -> IntArray:
     """Runs of samples that count: line, first and end of each, shape (m, 3)."""
     if mask is None:
         mask = np.ones((source.grid.vectors, source.grid.samples), dtype=bool)
@@ -235,14 +237,9 @@ class Accumulator:
         """Add images, shape (n, line, sample), whose maps are fixed-point ones from `fixed_maps`."""
         from speckle3d.kernels import splatting as kernels
 
-        whole = np.array([[0, n] for n in self.shape[::-1]], dtype=np.int64)
-        # Threads share out voxels, not images: what is added to one comes in the same order.
-        axis = _common_axis(maps, images.shape[1:], whole)
         tag = first_tag if self.rule == "latest" else 0
 
-        def work(first: int, stop: int) -> None:
-            box = whole.copy()
-            box[axis] = first, stop
+        def work(box: IntArray) -> None:
             if self.rule == "maximum":
                 raised = kernels.raise_nearest if self.splat == "nearest" else kernels.raise_linear
                 raised(images, maps, spans, box, self._table)
@@ -252,8 +249,7 @@ class Accumulator:
                 added = kernels.add_nearest if self.splat == "nearest" else kernels.add_linear
                 added(images, weights, maps, spans, box, tag, self._table, self._tags)
 
-        count = int(whole[axis, 1])
-        in_parallel(work, count, max(_LEAST_BLOCK, -(-count // (_BLOCKS_PER_CORE * cores()))))
+        share_out(work, self.shape, maps, images.shape[1:])
 
     def finish(self) -> tuple[Float32Array, ByteArray]:
         """Voxels, NaN where no sample was, and their states; both of shape (n_k, n_j, n_i)."""
@@ -275,7 +271,9 @@ class Accumulator:
 
 
 def bytes_per_voxel(splat: Splat, rule: Rule) -> int:
-    """Memory that an `Accumulator` and what it makes take at most, bytes per voxel."""
+    """Memory that voxels on the way and what becomes of them take at most, bytes per voxel."""
+    if rule == "plus":
+        return 8
     if rule == "maximum":
         return 5
     return 16 + 5 + (4 if rule == "latest" else 0)
@@ -289,6 +287,28 @@ def fixed_maps(index_from_sample: FloatArray, splat: Splat, first_plane: int, tu
     fixed[:, :, 2] += int(ahead * 2.0**_POSITION_BITS)
     fixed[:, 2, 2] -= first_plane << _POSITION_BITS
     return np.ascontiguousarray(fixed)
+
+
+def share_out(
+    work: Callable[[IntArray], None],
+    shape: tuple[int, int, int],
+    maps: IntArray,
+    image_shape: tuple[int, ...],
+) -> None:
+    """Call a function with boxes of voxels that make up a block of (n_k, n_j, n_i), several at once.
+
+    Threads share out voxels, not images: what is added to one comes in the same order.
+    """
+    whole = np.array([[0, n] for n in shape[::-1]], dtype=np.int64)
+    axis = _common_axis(maps, image_shape, whole)
+
+    def part(first: int, stop: int) -> None:
+        box = whole.copy()
+        box[axis] = first, stop
+        work(box)
+
+    count = int(whole[axis, 1])
+    in_parallel(part, count, max(_LEAST_BLOCK, -(-count // (_BLOCKS_PER_CORE * cores()))))
 
 
 def _common_axis(maps: IntArray, shape: tuple[int, ...], box: IntArray) -> int:
@@ -324,10 +344,10 @@ def splat_block(
     box = np.array([[0, n_i], [0, n_j], [first, stop]], dtype=np.int64)
     accumulator = None
     packed = countable(placed, splat, rule)
-    for batch in _batches(placed.source, placed.touching(box), _COUNTED if packed else _SUMMED):
+    for batch in batches(placed.source, placed.touching(box), _COUNTED if packed else _SUMMED):
         if accumulator is None:
             accumulator = Accumulator((stop - first, n_j, n_i), batch.images.dtype, splat, rule, packed)
-            spans = _spans(placed.source, placed.mask, batch.turned)
+            spans = spans_of(placed.source, placed.mask, batch.turned)
         maps = fixed_maps(placed.index_from_sample[batch.frames], splat, first, batch.turned)
         weights = _weights_of(placed, batch) if rule == "weighted" else _ones(batch)
         accumulator.add(batch.images, weights, maps, spans, int(batch.frames[0]) + 1)
@@ -353,16 +373,16 @@ def _most_samples(placed: Placed) -> float:
     return float(len(placed.source)) * min(grid.vectors * grid.samples, float(reach) ** 2 / max(area, 1e-12))
 
 
-def _ones(batch: _Batch) -> Float32Array:
+def _ones(batch: Batch) -> Float32Array:
     return _constant(np.ones(len(batch.frames), np.float32), batch)
 
 
-def _constant(weights: Float32Array, batch: _Batch) -> Float32Array:
+def _constant(weights: Float32Array, batch: Batch) -> Float32Array:
     """One weight per frame as images, without memory for them."""
     return np.lib.stride_tricks.as_strided(weights, batch.images.shape, (weights.strides[0], 0, 0))
 
 
-def _weights_of(placed: Placed, batch: _Batch) -> Float32Array:
+def _weights_of(placed: Placed, batch: Batch) -> Float32Array:
     """Weights of the samples of a batch, shape (n, line, sample)."""
     weights = placed.weights
     if weights is None:

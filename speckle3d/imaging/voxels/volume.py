@@ -64,8 +64,11 @@ def compound(
     With "nearest" a sample counts in the voxel it lies in; with "linear" in the eight whose centres are
     around it, by trilinear shares. A voxel becomes the mean of its samples by their shares, their maximum,
     the mean of those of the latest image that has any there, or their mean by weight; with "linear", shares
-    below 1/8 do not count for the maximum and the latest. An empty voxel is then the mean of those that are
-    not in the smallest cube around it that holds any; measured voxels stay as they are.
+    below 1/8 do not count for the maximum and the latest. With "plus" the mean is kept in whole grey levels,
+    as PLUS and 3D Slicer keep it; see `speckle3d.imaging.voxels.whole_levels`.
+
+    An empty voxel is then the mean of those that are not in the smallest cube around it that holds any;
+    measured voxels stay as they are.
 
     Parameters
     ----------
@@ -78,7 +81,8 @@ def compound(
     voxel_grid : VoxelGrid, optional
         Where voxels lie; samples elsewhere are left out.
     splat : {"nearest", "linear"}
-    rule : {"mean", "maximum", "latest", "weighted"}
+    rule : {"mean", "maximum", "latest", "weighted", "plus"}
+        With "plus" images and voxels must be of uint8.
     weights : ndarray of shape (n,), or images of weights, optional
         For the rule "weighted"; samples whose weight is 0 or NaN do not count.
     region : ndarray of bool, shape (vector, sample), optional

@@ -93,20 +93,18 @@ def test_matches_brute_force(seed, splat, rule, kind, turned):
     np.testing.assert_array_equal(volume.state, ~np.isnan(expected))
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", [*RULES, "plus"])
 @pytest.mark.parametrize("splat", SPLATS)
 def test_slabs_and_threads_change_nothing(monkeypatch, splat, rule):
     source, voxel_grid = sweep_of(60, 0.3)
     weights = np.random.default_rng(6).uniform(0.5, 2.0, 60)
-    chosen = CompoundingSettings(splat=splat, rule=rule, voxel_type="float32", fill_radius=2)
+    voxel_type = "uint8" if rule == "plus" else "float32"
+    chosen = CompoundingSettings(splat=splat, rule=rule, voxel_type=voxel_type, fill_radius=2)
     (whole,) = compound_slabs(source, voxel_grid, chosen, weights)
     monkeypatch.setattr(threads, "_pool", None)
     monkeypatch.setattr(threads, "cores", lambda: 5)
-    slabs = list(
-        compound_slabs(
-            source, voxel_grid, replace_memory(chosen, 1.8e-4 if rule == "maximum" else 3.3e-4), weights
-        )
-    )
+    memory = 1.8e-4 if rule in ("maximum", "plus") else 3.3e-4
+    slabs = list(compound_slabs(source, voxel_grid, replace_memory(chosen, memory), weights))
     threads._pool.shutdown()
     assert len(slabs) > 2
     assert [slab.first for slab in slabs] == np.cumsum([0, *(len(s.voxels) for s in slabs[:-1])]).tolist()
