@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -55,6 +55,17 @@ def require_own_place(out: Path, kind: Kind, *inputs: Path | None) -> None:
     words, is_own = _KINDS[kind]
     if target.stat().st_size and not is_own(target):
         raise InvalidInputError(f"{out}: expected a new name or {words} to replace, got another kind of file")
+
+
+def require_own_places(outputs: Mapping[str, Path | None], kind: Kind, *inputs: Path | None) -> None:
+    """Refuse as `require_own_place` for each output, by its option, and if two are one file."""
+    taken: dict[Path, str] = {}
+    for option, out in outputs.items():
+        if out is not None:
+            require_own_place(out, kind, *inputs)
+            other = taken.setdefault(out.resolve(), option)
+            if other != option:
+                raise InvalidInputError(f"{option}: expected another file than {other}, got {out} for both")
 
 
 def _of_format(wanted: str) -> Callable[[Path], bool]:

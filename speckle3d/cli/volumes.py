@@ -29,7 +29,7 @@ from speckle3d.cli.importing import (
     files_of,
     given_settings,
 )
-from speckle3d.cli.outputs import require_own_place
+from speckle3d.cli.outputs import require_own_places
 
 Three = tuple[float, float, float]
 
@@ -106,9 +106,8 @@ def volume(
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
-    for place in (out, state, deviation):
-        if place is not None:
-            require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
+    inputs = (source, sweep_file, like, *files_of(plus_config, calibration))
+    require_own_places({"-o": out, "--state": state, "--deviation": deviation}, "volume", *inputs)
     if levels == "linear" and voxel_type is None:
         voxel_type = "float32"  # most amplitudes are less than one
     settings = compounding_settings(config_file, {**options, "voxel_type": voxel_type})

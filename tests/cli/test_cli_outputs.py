@@ -87,6 +87,15 @@ def test_a_recorded_sweep_is_not_replaced_by_a_simulated_one(refused, bench, cal
         np.testing.assert_array_equal(file["rf"], before)
 
 
+def test_two_outputs_of_one_command_are_two_files(refused, calls, tmp_path):
+    out = tmp_path / "v.nrrd"
+    for option in ("--state", "--deviation"):
+        told = refused(*calls["volume"](out), option, tmp_path / "." / "v.nrrd")
+        assert option in told
+        assert "another file than -o" in told
+    assert not out.exists()
+
+
 def test_a_sequence_of_frames_is_no_volume_to_replace(refused, calls, tmp_path):
     sequence = tmp_path / "sequence.mha"
     sequence.write_bytes(

@@ -42,7 +42,7 @@ def spanned_plane(
     Raises
     ------
     InvalidInputError
-        If a direction is none, or both are one.
+        If a direction has no length, or both are along one line.
     """
     x, y = (np.asarray(each, dtype=float) for each in (right, down))
     lengths = [float(np.linalg.norm(each)) for each in (x, y)]

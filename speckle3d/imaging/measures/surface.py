@@ -42,7 +42,7 @@ def surface_of(
     level : float
         In the volume's own grey levels.
     inside : {"above", "below"}
-        Where the grey level is, inside: above, of what is bright; below, of a cyst or a vessel.
+        Whether the inside is brighter than the level, or darker, as of a cyst or a vessel.
     known : ndarray of bool, optional
         Voxels with a value, in the volume's shape; without it as `known_voxels` has them.
     smooth : int

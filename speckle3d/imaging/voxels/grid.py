@@ -116,7 +116,7 @@ def grid_as_asked(
     shape: tuple[int, int, int] | None = None,
     size_mm: Triple | None = None,
 ) -> VoxelGrid:
-    """Grid whose spacing, orientation, origin and size are as asked for, and what is not holds the images.
+    """Grid with the spacing, orientation, origin and size asked for; those not given hold the images.
 
     Parameters
     ----------

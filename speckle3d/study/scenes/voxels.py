@@ -116,6 +116,8 @@ class VolumeRequest:
     ----------
     path : path
         With a suffix of `speckle3d.io.volume_writer.SUFFIXES`.
+    settings : CompoundingSettings
+    grid : GridRequest
     region : Region, optional
         Of the images; samples outside it do not count.
     state_path : path, optional
