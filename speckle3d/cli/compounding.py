@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import from_options, load_settings
+from speckle3d.cli.common import from_options, load_settings, note
+from speckle3d.cli.importing import given_settings
 
 if TYPE_CHECKING:
     from speckle3d.imaging.voxels.settings import CompoundingSettings
+    from speckle3d.study.posed import PosedSweep
 
 VoxelMm = Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")]
 Splat = Annotated[
@@ -35,3 +37,26 @@ def compounding_settings(config_file: Path | None, options: Mapping[str, Any]) -
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if value is not None}
     return from_options(CompoundingSettings, base | given)
+
+
+def open_sweep_at(modes: Sequence[str | None], source: Path, options: Mapping[str, Any]) -> list[PosedSweep]:
+    """Open a sweep at the poses of each mode, and say on stderr which frames have none.
+
+    Parameters
+    ----------
+    modes : sequence of str or None
+        At least one; None for the usual one.
+    source : path
+    options : mapping of str to object
+        All options of the command.
+    """
+    from speckle3d.study.posed import open_posed
+
+    # The range is that of the volume's levels, and of B-mode that says none of its own.
+    range_db = options["dynamic_range_db"]
+    imported = given_settings(source, {**options, "dynamic_range_db": None})
+    others = options["sweep_file"], imported, options["calibration"] or (), range_db
+    opened = [open_posed(source, mode, *others) for mode in modes]
+    for line in opened[0].notes():
+        note(line)
+    return opened

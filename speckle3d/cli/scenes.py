@@ -18,14 +18,21 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.compounding import FillRadius, LevelRange, Rule, Splat, VoxelMm, compounding_settings
+from speckle3d.cli.compounding import (
+    FillRadius,
+    LevelRange,
+    Rule,
+    Splat,
+    VoxelMm,
+    compounding_settings,
+    open_sweep_at,
+)
 from speckle3d.cli.importing import (
     Importing,
     Number,
     PlusConfig,
     ReferenceTransform,
     files_of,
-    given_settings,
 )
 
 
@@ -56,20 +63,12 @@ def scene(
     config_file: ConfigFile = None,
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames."""
-    from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
 
     options = locals()
     require_scene_place(out, source, sweep_file, *files_of(plus_config, calibration))
     settings = compounding_settings(config_file, options)
-    # The range is that of the volume's levels; a recording's own is said beside it.
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    modes: list[str | None] = list(mode) if mode else [None]
-    posed = [
-        open_posed(source, each, sweep_file, imported, calibration or (), dynamic_range_db) for each in modes
-    ]
-    for line in posed[0].notes():
-        note(line)
+    posed = open_sweep_at(mode or [None], source, options)
     request = SceneRequest(settings, with_images=images, with_deviation=deviation)
     with progress_bar(f"writing {out.name}") as progress:
         reports = write_scene(out, posed, request, progress)

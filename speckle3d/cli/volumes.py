@@ -20,14 +20,21 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.compounding import FillRadius, LevelRange, Rule, Splat, VoxelMm, compounding_settings
+from speckle3d.cli.compounding import (
+    FillRadius,
+    LevelRange,
+    Rule,
+    Splat,
+    VoxelMm,
+    compounding_settings,
+    open_sweep_at,
+)
 from speckle3d.cli.importing import (
     Importing,
     Number,
     PlusConfig,
     ReferenceTransform,
     files_of,
-    given_settings,
 )
 from speckle3d.cli.outputs import require_own_places
 
@@ -102,7 +109,6 @@ def volume(
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
-    from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
@@ -119,11 +125,7 @@ def volume(
         state,
         deviation,
     )
-    # The option is the range of the volume's levels, and of B-mode that says none of its own.
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    posed = open_posed(source, mode, sweep_file, imported, calibration or (), dynamic_range_db)
-    for line in posed.notes():
-        note(line)
+    (posed,) = open_sweep_at([mode], source, options)
     with progress_bar(f"compounding {out.name}") as progress:
         report = write_voxels(posed, request, progress)
     if as_json:
