@@ -13,6 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import FloatArray
+    from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.imaging.measures.measure import Measurement
 
 
@@ -63,9 +64,9 @@ def measure(
     if pick_mm is not None and not 0.0 <= pick_mm < float("inf"):
         raise InvalidInputError(f"--pick-mm: expected zero or more, got {pick_mm}")
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
-    if on is not None:
-        places, mode = _in_world(on, places, mode)
     held = read_reconstruction(source, with_pairs=False)
+    if on is not None:
+        places, mode = _in_world(on, places, mode, held)
     picked = PICKED * held.grid.vector_pitch_mm if pick_mm is None else pick_mm
     found = measure_points(held, places, mode or "image", picked)
     told = f"mode {mode or 'image'}; points picked to {picked:.2g} mm per axis; 95 % in brackets"
@@ -76,11 +77,15 @@ def measure(
         emit("\n".join([*(_line(each) for each in found), told]))
 
 
-def _in_world(picture: Path, places: FloatArray, mode: str | None) -> tuple[FloatArray, str]:
+def _in_world(
+    picture: Path, places: FloatArray, mode: str | None, held: Reconstruction
+) -> tuple[FloatArray, str]:
     """Points of the world that lie under points of a picture, and the mode whose poses it shows."""
-    from speckle3d.study.reslices.cut_geometry import read_plane
+    from speckle3d.scoring.trajectories import poses_of
+    from speckle3d.study.reslices.cut_geometry import read_plane, require_same_poses
 
     shown = read_plane(picture, mode)
+    require_same_poses(shown, poses_of(held, shown.mode), str(picture))
     return shown.cut.world_from_mm(places[:, 0], places[:, 1]), shown.mode
 
 

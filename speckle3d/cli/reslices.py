@@ -138,15 +138,30 @@ def _cut_sweep(
 ) -> None:
     from speckle3d.study.reslices.cuts import cut_posed, open_modes
 
-    opened = open_modes(source, *compared, sweep_file)
     volume, state = made
+    voxels = None if volume is None else _voxels(volume, state)
+    modes, reference = compared
+    if voxels is not None:
+        modes = _modes_of(voxels[0], modes)
+    opened = open_modes(source, modes, reference, sweep_file)
     if volume is not None and len(opened.poses) > 1:
         raise InvalidInputError(f"--mode: expected one beside --volume, got {', '.join(opened.poses)}")
-    voxels = None if volume is None else _voxels(volume, state)
     place = located(opened.reference)
     with progress_bar(f"reslicing {out.name}") as progress:
         picture = cut_posed(opened, place, dynamic_range_db, voxels, progress)
     _write(picture, out)
+
+
+def _modes_of(volume: Volume, modes: tuple[str, ...]) -> tuple[str, ...]:
+    """The mode whose world a volume lies in, if its file says so: cuts must be placed in the same one."""
+    made_at = volume.fields.get("poses")
+    if made_at is None:
+        return modes
+    if modes and modes != (made_at,):
+        raise InvalidInputError(
+            f"--mode: expected {made_at}, at whose poses --volume was made, got {', '.join(modes)}"
+        )
+    return (made_at,)
 
 
 def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> None:

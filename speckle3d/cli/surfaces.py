@@ -73,7 +73,10 @@ def surface(
     if not labels:
         require_own_place(out, "surface", source, reconstruction, state)
     volume = read_volume(source)
-    errors, grid = _errors(reconstruction, mode or volume.fields.get("poses", "image"))
+    made_at = volume.fields.get("poses", mode or "image")
+    if mode is not None and mode != made_at:
+        raise InvalidInputError(f"--mode: expected {made_at}, at whose poses VOLUME was made, got {mode}")
+    errors, grid = _errors(reconstruction, made_at)
     known = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
         found = {str(out): surface_of(volume, level, "below" if below else "above", known)}

@@ -113,10 +113,11 @@ def volume(
 
     options = locals()
     inputs = (source, sweep_file, like, *files_of(plus_config, calibration))
-    require_own_places({"-o": out, "--state": state, "--deviation": deviation}, "volume", *inputs)
-    if levels == "linear" and voxel_type is None:
-        voxel_type = "float32"  # most amplitudes are less than one
-    settings = compounding_settings(config_file, {**options, "voxel_type": voxel_type})
+    require_own_places({"--output": out, "--state": state, "--deviation": deviation}, "volume", *inputs)
+    settings = compounding_settings(config_file, options)
+    if levels == "linear" and voxel_type is None and settings.voxel_type == "uint8":
+        # Amplitudes may be less than one, or thousands.
+        settings = settings.model_copy(update={"voxel_type": "float32"})
     request = VolumeRequest(
         out,
         settings,

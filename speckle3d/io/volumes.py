@@ -197,11 +197,11 @@ def read_states(path: PathLike, volume: Volume) -> ByteArray:
     if states.voxels.dtype != np.uint8 or states.shape != volume.shape:
         wanted = " x ".join(str(n) for n in volume.shape)
         raise InvalidInputError(
-            f"{path}: expected states, uint8, of {wanted} voxels, as the volume has, got "
-            f"{states.voxels.dtype}, {' x '.join(str(n) for n in states.shape)}"
+            f"{path}: expected states on the volume's grid, uint8 of {wanted} voxels, got "
+            f"{states.voxels.dtype} of {' x '.join(str(n) for n in states.shape)}"
         )
     if not np.allclose(states.world_from_index, volume.world_from_index, atol=_SAME_PLACE_MM):
-        raise InvalidInputError(f"{path}: expected states of voxels where the volume's are, got others")
+        raise InvalidInputError(f"{path}: expected states on the volume's grid, got some of another place")
     return states.voxels
 
 

@@ -38,6 +38,7 @@ from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.folder import BlockFiles
 from speckle3d.study.images import Strip, cut_frames, middle_planes
 from speckle3d.study.request import SUBSET, Request, require_possible
+from speckle3d.study.reslices.cut_geometry import anchors_of
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
 from speckle3d.study.reslices.places import view_of
 from speckle3d.study.reslices.reslice_figures import save_reslices
@@ -318,4 +319,6 @@ def _draw_reslices(
     first = next(iter(shown)) if len(shown) > 1 else None
     view = view_of(planes[compared or "image"], shown[compared or "image"])
     where = f"at lateral {strip.left_mm + strip.grid.width_mm / 2:.4g} mm, {view}".removesuffix(", ")
-    return save_reslices(CutPicture(cuts, place=where, reference=compared or first, name=name), path)
+    anchors = {mode: anchors_of(world_from_image) for mode, world_from_image in poses.items()}
+    picture = CutPicture(cuts, place=where, reference=compared or first, name=name, anchors=anchors)
+    return save_reslices(picture, path)

@@ -55,6 +55,16 @@ def test_a_file_of_another_kind_stays_as_it_is(refused, calls, tmp_path, name):
     assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
 
 
+def test_two_outputs_are_two_files(refused, reconstructed, tmp_path):
+    place = tmp_path / "v.nrrd"
+    command = ("volume", reconstructed / "reconstruction.h5", "-o", place, "--voxel-mm", 1)
+    told = refused(*command, "--state", tmp_path / "s.nrrd", "--deviation", tmp_path / "." / "v.nrrd")
+    assert told.count("--deviation: expected another file than --output") == 1
+    told = refused(*command, "--state", tmp_path / "s.nrrd", "--deviation", tmp_path / "s.nrrd")
+    assert "--deviation: expected another file than --state" in told
+    assert not place.exists()
+
+
 @pytest.mark.parametrize(
     "name", ["convert", "imu convert", "imu orient", "volume", "reslice", "export", "curves"]
 )
@@ -85,15 +95,6 @@ def test_a_recorded_sweep_is_not_replaced_by_a_simulated_one(refused, bench, cal
     assert "recorded.h5" in refused(*calls["simulate"](recorded))
     with h5py.File(recorded) as file:
         np.testing.assert_array_equal(file["rf"], before)
-
-
-def test_two_outputs_of_one_command_are_two_files(refused, calls, tmp_path):
-    out = tmp_path / "v.nrrd"
-    for option in ("--state", "--deviation"):
-        told = refused(*calls["volume"](out), option, tmp_path / "." / "v.nrrd")
-        assert option in told
-        assert "another file than -o" in told
-    assert not out.exists()
 
 
 def test_a_sequence_of_frames_is_no_volume_to_replace(refused, calls, tmp_path):

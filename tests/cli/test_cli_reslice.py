@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.volume import Volume
 from speckle3d.io.load import load_sweep
+from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.volumes import read_volume, write_volume
-from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane
+from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane, require_same_poses
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -96,6 +98,17 @@ def test_a_volume_is_cut_at_its_place_and_in_the_terms_of_its_sweep(run, bench, 
     assert code == 0, err
 
 
+def test_a_volume_is_cut_in_the_world_of_its_own_poses(run, refused, reconstructed, tmp_path):
+    path, made = reconstructed / "reconstruction.h5", tmp_path / "v.nrrd"
+    grid = ("--voxel-mm", "0.5")
+    assert run("volume", path, "-o", made, "--mode", "orientation", *grid)[0] == 0
+    code, _, err = run("reslice", path, "-o", tmp_path / "c.png", "--volume", made)
+    assert code == 0, err
+    assert read_plane(tmp_path / "c.png").mode == "orientation"
+    told = refused("reslice", path, "-o", tmp_path / "d.png", "--volume", made, "--mode", "image")
+    assert "--mode: expected orientation, at whose poses" in told
+
+
 def test_empty_voxels_are_not_shown_where_their_states_are_given(run, refused, bench, tmp_path):
     placed = load_sweep(bench / "sweep.h5").truth[0]
     states = np.ones((30, 40, 3), np.uint8)
@@ -126,6 +139,11 @@ def test_the_picture_of_a_reconstruction_says_where_its_cuts_lie(reconstructed, 
     np.testing.assert_allclose(first[:, 1:], [[5.0, 0.0], [15.0, 0.0]], rtol=1e-3, atol=1e-9)
     found = cuts["image"].cut.world_from_mm(0.0, 5.0)
     np.testing.assert_allclose(found[1:], [5.0, 0.0], rtol=1e-3, atol=1e-9)
+    # It may be measured in: its strip of the images hides nothing of whose poses they are.
+    poses = read_reconstruction(reconstructed / "reconstruction.h5", with_pairs=False).poses
+    require_same_poses(cuts["image"], poses["image"], "reslice.png")
+    with pytest.raises(InvalidInputError, match="another reconstruction"):
+        require_same_poses(cuts["image"], poses["pose"], "reslice.png")
 
 
 def test_outlines_are_a_picture(run, reconstructed, tmp_path):
@@ -154,6 +172,9 @@ def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp
     assert "curved" in told("--curve", curve, to=tmp_path / "r.nrrd")
     assert "none.png" in told("--curve", curve, "--on", curve.parent / "none.png")
     assert "inside the image" in told("--depth-mm", "900")
+    assert "angle_deg" in told("--frame", "1", "--angle-deg", "nan")
+    along = ("--right", "1", "0", "0", "--down", "0", "1", "0")
+    assert "finite origin" in told("--origin", "nan", "0", "0", *along)
     far = tmp_path / "far.csv"
     far.write_text("x_mm,y_mm,z_mm\n900,0,0\n910,0,0\n")
     assert "between (" in told("--curve", far)

@@ -15,7 +15,7 @@ from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.surfaces import read_surface
 from speckle3d.io.volumes import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.reslices.cut_geometry import save_cuts
+from speckle3d.study.reslices.cut_geometry import anchors_of, save_cuts
 
 GRID = ImageGrid(51, 51, 0.2, 0.2)
 N = 41
@@ -89,6 +89,21 @@ def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
     assert told["measurements"][0]["by_poses"] == pytest.approx(0.05 * 6.0, rel=1e-3)
 
 
+def test_a_picture_of_other_poses_is_refused(run, refused, rec, tmp_path):
+    picks = ("--point", "0,5", "--point", "6,5")
+    longer = RigidTransform.from_translation(1.01 * POSES.translation)
+    plane = ReslicePlane(POSES[0], 8.0, 10.0, 0.2)
+    for poses, name in ((POSES, "own.png"), (longer, "longer.png"), (POSES[:9], "shorter.png")):
+        figure = Figure()
+        panels = {"image": [figure.add_subplot()]}
+        save_cuts(figure, tmp_path / name, {"image": plane}, panels, anchors={"image": anchors_of(poses)})
+    code, _, err = run("measure", rec, "--on", tmp_path / "own.png", *picks)
+    assert code == 0, err
+    assert "frame 20 lies elsewhere" in refused("measure", rec, "--on", tmp_path / "longer.png", *picks)
+    # The same frames as far as they go: of these poses.
+    assert run("measure", rec, "--on", tmp_path / "shorter.png", *picks)[0] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -139,6 +154,15 @@ def test_labels_and_empty_voxels_and_the_dark_side(run, ball, tmp_path):
     assert "volume" not in text
 
 
+def test_states_of_another_grid_are_refused(refused, ball, tmp_path):
+    moved = RigidTransform.from_translation([0.0, 0.0, STEP_MM])
+    write_volume(tmp_path / "moved.nrrd", Volume(np.ones((41, 41, 41), np.uint8), (STEP_MM,) * 3, moved))
+    told = refused(
+        "surface", ball, "-o", tmp_path / "a.stl", "--level", "128", "--state", tmp_path / "moved.nrrd"
+    )
+    assert "on the volume's grid" in told
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -148,6 +172,7 @@ def test_labels_and_empty_voxels_and_the_dark_side(run, ball, tmp_path):
         (("-o", "a.stl", "--level", "300"), "level: expected a grey level of the volume"),
         (("-o", "a.stl", "--level", "128", "--smooth", "-1"), "--smooth"),
         (("-o", "a.stl", "--labels", "--below"), "no --below"),
+        (("-o", "a.stl", "--level", "128", "--mode", "fused"), "--mode: expected image, at whose poses"),
     ],
 )
 def test_what_has_no_surface_is_said_in_a_line(refused, ball, tmp_path, monkeypatch, arguments, words):

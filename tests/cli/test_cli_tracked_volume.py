@@ -73,6 +73,10 @@ def test_other_levels_need_the_dynamic_range(run, refused, recording, tmp_path):
         tmp_path / "v.nrrd",
     )
     assert "--dynamic-range-db" in refused(*command, "--levels", "linear")
+    # Amplitudes of B-mode end at 1: of whole numbers nothing would be left.
+    assert "--levels: expected voxel type float32" in refused(
+        *command, "--levels", "linear", "--voxel-type", "uint16"
+    )
     code, _, told = run(*command, "--levels", "linear", "--dynamic-range-db", 40)
     assert code == 0, told
     volume = read_volume(tmp_path / "v.nrrd")

@@ -42,8 +42,10 @@ def spanned_plane(
     Raises
     ------
     InvalidInputError
-        If a direction has no length, or both are along one line.
+        If a direction has no length, both are along one line, or the origin is not finite.
     """
+    if not np.isfinite(origin_mm).all():
+        raise InvalidInputError(f"plane: expected a finite origin, got {vector_words(np.asarray(origin_mm))}")
     x, y = (np.asarray(each, dtype=float) for each in (right, down))
     lengths = [float(np.linalg.norm(each)) for each in (x, y)]
     got = f"got directions {vector_words(x)} and {vector_words(y)}"
@@ -61,7 +63,15 @@ def spanned_plane(
 def turned_frame_plane(
     world_from_image: RigidTransform, lateral_mm: float, angle_deg: float
 ) -> RigidTransform:
-    """Place a plane in one frame's depth line, turned about it: at 90 degrees along the sweep."""
+    """Place a plane in one frame's depth line, turned about it: at 90 degrees along the sweep.
+
+    Raises
+    ------
+    InvalidInputError
+        If the angle is not finite.
+    """
+    if not np.isfinite(angle_deg):
+        raise InvalidInputError(f"angle_deg: expected a finite angle, got {angle_deg}")
     line = RigidTransform.from_translation([lateral_mm, 0.0, 0.0])
     # Turned by -y, so that x goes from lateral to elevational.
     turn = RigidTransform.from_rotation(Rotation.from_euler("Y", -angle_deg, degrees=True))

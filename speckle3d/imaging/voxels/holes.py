@@ -118,7 +118,8 @@ def _checked_boxes(radius: int | npt.ArrayLike) -> IntArray:
         )
     boxes = np.asarray(given, dtype=np.int64)
     if given.size > 0 and not 0 <= given.min() <= given.max() <= MAX_RADIUS:
-        raise InvalidInputError(f"radius: expected 0 to {MAX_RADIUS} voxels, got {radius!r}")
+        worst = given.min() if given.min() < 0 else given.max()
+        raise InvalidInputError(f"radius: expected 0 to {MAX_RADIUS} voxels, got {worst}")
     if given.ndim == 0:
         return cubes_within(int(given))
     if (np.diff(boxes, axis=0) < 0).any():

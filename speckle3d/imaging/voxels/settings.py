@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 Splat = Literal["nearest", "linear"]
 Rule = Literal["mean", "maximum", "latest", "weighted", "plus"]
@@ -60,3 +61,22 @@ class CompoundingSettings(BaseModel):
     max_file_gb: float = Field(
         64.0, gt=0, description="Largest volume to make: larger ones are more often due to a wrong unit."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _amplitudes_are_float32(cls, given: Any) -> Any:
+        """Echo amplitudes are no grey levels of one byte: unless a type is given, they are float32."""
+        if isinstance(given, dict) and given.get("levels") == "linear":
+            return {"voxel_type": "float32", **given}
+        return given
+
+    @field_validator("levels")
+    @classmethod
+    def _levels_fit(cls, levels: str, known: ValidationInfo) -> str:
+        """Refuse amplitudes in whole numbers: those of B-mode are below one, and few of RF fit in a byte."""
+        kind = known.data.get("voxel_type", "float32")
+        if levels == "linear" and kind != "float32":
+            raise PydanticCustomError(
+                "levels", "expected voxel type float32 with it, got {kind}", {"kind": kind}
+            )
+        return levels

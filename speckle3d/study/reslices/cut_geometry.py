@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
+from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import transforms_from_matrices
@@ -30,7 +31,12 @@ from speckle3d.study.figures import DOTS_PER_INCH
 KEYWORD = "speckle3d.reslice"
 VERSION = 1
 
+_SAME_POSE = 1e-6
+"""Of the numbers of a matrix, mm: what writing and reading may change in it."""
+
 Box = tuple[float, float, float, float]
+Anchors = Mapping[int, FloatArray]
+"""Poses of some frames by their numbers, matrices from image to world: they tell whose world a cut is in."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +51,14 @@ class PicturedCut:
         Its `world_from_mm` takes what the picture's axes say.
     boxes_px : sequence of tuple of float
         Left, top, right and bottom of every panel that shows it, in pixels of the picture from its top left.
+    anchors : mapping of int to ndarray, shape (4, 4)
+        Poses of some frames; none where no frames were cut.
     """
 
     mode: str
     cut: ReslicePlane | CurvedSheet
     boxes_px: Sequence[Box] = ()
+    anchors: Anchors = field(default_factory=dict)
 
     def mm_from_px(self, points_px: npt.ArrayLike, panel: int = 0) -> FloatArray:
         """What the axes say at points of the picture, by column and row of its pixels: shape (n, 2), mm."""
@@ -59,12 +68,31 @@ class PicturedCut:
         return np.asarray([x_left, y_top] + share * [x_right - x_left, y_bottom - y_top])
 
 
+def anchors_of(world_from_image: RigidTransform, numbers: IntArray | None = None) -> Anchors:
+    """Poses of the first, the middle and the last frame, by their numbers, which count from 0 by default."""
+    count = len(world_from_image)
+    at = sorted({0, count // 2, count - 1})
+    return {int(k if numbers is None else numbers[k]): world_from_image[k].as_matrix() for k in at}
+
+
+def require_same_poses(shown: PicturedCut, world_from_image: RigidTransform, where: str) -> None:
+    """Raise `InvalidInputError` if a picture was cut at other poses than these, of all frames."""
+    for number, pose in shown.anchors.items():
+        known = 0 <= number < len(world_from_image)
+        if not (known and np.abs(world_from_image[number].as_matrix() - pose).max() <= _SAME_POSE):
+            raise InvalidInputError(
+                f"{where}: expected a picture of these poses of mode {shown.mode!r}, got one of another "
+                f"reconstruction, whose frame {number} lies elsewhere: cut this one again (speckle3d reslice)"
+            )
+
+
 def save_cuts(
     figure: Figure,
     path: Path,
     cuts: Mapping[str, ReslicePlane | CurvedSheet],
     panels: Mapping[str, Sequence[Axes]],
     words: Mapping[str, Any] | None = None,
+    anchors: Mapping[str, Anchors] | None = None,
 ) -> Path:
     """Write a picture of cuts as a PNG that says where they lie; it appears whole or not at all.
 
@@ -78,6 +106,8 @@ def save_cuts(
         The panels that show each.
     words : mapping, optional
         What else to keep: names of axes, of the input.
+    anchors : mapping of str to mapping, optional
+        Poses of some frames of each mode, by `anchors_of`.
 
     Raises
     ------
@@ -90,7 +120,12 @@ def save_cuts(
     canvas.draw()  # type: ignore[no-untyped-call]
     height = canvas.get_width_height()[1]
     told = [
-        {"mode": mode, **_as_record(cut), "boxes_px": [_box(each, height) for each in panels[mode]]}
+        {
+            "mode": mode,
+            **_as_record(cut),
+            "boxes_px": [_box(each, height) for each in panels[mode]],
+            "anchors": {number: pose.tolist() for number, pose in (anchors or {}).get(mode, {}).items()},
+        }
         for mode, cut in cuts.items()
     ]
     record = json.dumps({"version": VERSION, **(words or {}), "cuts": told})
@@ -170,4 +205,7 @@ def _pictured(record: Any, where: str) -> PicturedCut:
         (placed,) = transforms_from_matrices([record["world_from_plane"]], where)
         cut = ReslicePlane(placed, float(record["width_mm"]), height, pixel, (first_x, first_y))
     boxes = [(float(a), float(b), float(c), float(d)) for a, b, c, d in record["boxes_px"]]
-    return PicturedCut(str(record["mode"]), cut, boxes)
+    told = {int(number): np.array(pose, dtype=float) for number, pose in record.get("anchors", {}).items()}
+    if any(pose.shape != (4, 4) for pose in told.values()):
+        raise ValueError("anchors: expected matrices of shape (4, 4)")
+    return PicturedCut(str(record["mode"]), cut, boxes, told)

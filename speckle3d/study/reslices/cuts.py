@@ -23,6 +23,7 @@ from speckle3d.io.reconstructions import FORMAT
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
 from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
+from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
 from speckle3d.study.reslices.places import (
     AnyCut,
     Place,
@@ -83,6 +84,8 @@ class CutPicture:
         Of the sweep or the volume.
     numbers : ndarray of int, shape (n,), optional
         Of the frames; by default from 0.
+    anchors : mapping of str to mapping
+        Poses of some frames of each mode; see `cut_geometry.anchors_of`.
     """
 
     cuts: Mapping[str, DrawnCut]
@@ -93,6 +96,7 @@ class CutPicture:
     reference: str | None = None
     name: str = ""
     numbers: IntArray | None = None
+    anchors: Mapping[str, Anchors] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -204,7 +208,8 @@ def cut_posed(
     range_db = (-dynamic_range_db, 0.0) if voxels is None else None
     reference = opened.reference if len(cuts) > 1 else None
     axes, name = place.axes(shown, there), opened.posed.sweep.name
-    return CutPicture(cuts, axes, where, unit, range_db, reference, name, numbers)
+    anchors = {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()}
+    return CutPicture(cuts, axes, where, unit, range_db, reference, name, numbers, anchors)
 
 
 def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:

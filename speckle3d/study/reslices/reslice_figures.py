@@ -57,7 +57,7 @@ def save_reslices(picture: CutPicture, path: Path) -> Path:
     figure, panels = draw_cuts(picture)
     cuts = {mode: drawn.cut for mode, drawn in picture.cuts.items()}
     words = {"axes": picture.axes, "place": picture.place, "name": picture.name}
-    return save_cuts(figure, path, cuts, panels, words)
+    return save_cuts(figure, path, cuts, panels, words, picture.anchors)
 
 
 def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, list[Axes]]]:
