@@ -36,6 +36,8 @@ def compounding_settings(config_file: Path | None, options: Mapping[str, Any]) -
 
     base = load_settings(config_file).volume.model_dump()
     given = {name: value for name, value in options.items() if value is not None}
+    if given.get("levels") == "linear" and base["voxel_type"] == "uint8":
+        given.setdefault("voxel_type", "float32")  # amplitudes may be less than one, or thousands
     return from_options(CompoundingSettings, base | given)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -37,6 +38,7 @@ from speckle3d.cli.importing import (
     files_of,
 )
 from speckle3d.cli.outputs import require_own_places
+from speckle3d.core.errors import InvalidInputError
 
 Three = tuple[float, float, float]
 
@@ -114,10 +116,14 @@ def volume(
     options = locals()
     inputs = (source, sweep_file, like, *files_of(plus_config, calibration))
     require_own_places({"--output": out, "--state": state, "--deviation": deviation}, "volume", *inputs)
+    _require_alone(
+        {"--voxel-mm": voxel_mm}, {"--spacing-mm": spacing_mm, "--within-gb": within_gb, "--like": like}
+    )
+    _require_alone(
+        {"--splat": splat, "--rule": rule, "--fill-radius": fill_radius, "--fill-mm": fill_mm},
+        {"--backward-mm": backward_mm or None},
+    )
     settings = compounding_settings(config_file, options)
-    if levels == "linear" and voxel_type is None and settings.voxel_type == "uint8":
-        # Amplitudes may be less than one, or thousands.
-        settings = settings.model_copy(update={"voxel_type": "float32"})
     request = VolumeRequest(
         out,
         settings,
@@ -132,3 +138,11 @@ def volume(
     if as_json:
         emit_json(report.summary())
     note(report.line)
+
+
+def _require_alone(options: Mapping[str, object], others: Mapping[str, object]) -> None:
+    """Refuse options that would say nothing beside others."""
+    given = [name for name, value in options.items() if value is not None]
+    beside = [name for name, value in others.items() if value is not None]
+    if given and beside:
+        raise InvalidInputError(f"{given[0]}: expected no {beside[0]} beside it, which takes its place")
