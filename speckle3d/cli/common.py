@@ -78,13 +78,12 @@ PosedFile = Annotated[
         help="reconstruction.h5 of a results folder, or a recording with a calibrated tracker or true poses.",
     ),
 ]
-Mode = Annotated[
-    str | None,
-    typer.Option(
-        help="Which poses to use: image (default), orientation, pose, crossed, inertial, fused of a "
-        "reconstruction; tracker, truth of a recording."
-    ),
-]
+_MODE_HELP = (
+    "Which poses to use: image (default), orientation, pose, crossed, inertial, fused of a reconstruction; "
+    "tracker, truth of a recording."
+)
+Mode = Annotated[str | None, typer.Option(help=_MODE_HELP)]
+Modes = Annotated[list[str] | None, typer.Option("--mode", help=f"{_MODE_HELP} May be repeated.")]
 SweepFile = Annotated[
     Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -114,4 +115,4 @@ def _line(found: Measurement) -> str:
 
 
 def _shown(found: Measurement) -> tuple[float, str]:
-    return (1.0, "mm") if found.unit == "mm" else (57.29577951308232, "degrees")
+    return (1.0, "mm") if found.unit == "mm" else (math.degrees(1.0), "degrees")

@@ -23,7 +23,7 @@ Kind = Literal[
 ]
 
 _FIRST_BYTES = 4096
-_PNG, _GZIP = b"\x89PNG\r\n\x1a\n", b"\x1f\x8b"
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def require_own_place(out: Path, kind: Kind, *inputs: Path | None) -> None:
@@ -57,12 +57,15 @@ def require_own_place(out: Path, kind: Kind, *inputs: Path | None) -> None:
         raise InvalidInputError(f"{out}: expected a new name or {words} to replace, got another kind of file")
 
 
-def require_different(outputs: Mapping[str, Path | None]) -> None:
-    """Refuse two outputs, by their options, that are one file: the one would replace the other."""
-    places: dict[Path, str] = {}
-    for option, path in outputs.items():
-        if path is not None and (other := places.setdefault(path.resolve(), option)) != option:
-            raise InvalidInputError(f"{option}: expected another file than {other}, got {path} for both")
+def require_own_places(outputs: Mapping[str, Path | None], kind: Kind, *inputs: Path | None) -> None:
+    """Refuse as `require_own_place` for each output, by its option, and if two are one file."""
+    taken: dict[Path, str] = {}
+    for option, out in outputs.items():
+        if out is not None:
+            require_own_place(out, kind, *inputs)
+            other = taken.setdefault(out.resolve(), option)
+            if other != option:
+                raise InvalidInputError(f"{option}: expected another file than {other}, got {out} for both")
 
 
 def _of_format(wanted: str) -> Callable[[Path], bool]:
@@ -101,13 +104,10 @@ def _is_log(path: Path) -> bool:
     return next(lines, b"").startswith(b"time_s,")
 
 
-def is_volume(path: Path) -> bool:
-    """Whether a file is a NIfTI, MetaImage or NRRD image that is no sequence of frames."""
-    from speckle3d.io.headers import is_metaimage, is_nrrd
+def _is_volume(path: Path) -> bool:
+    from speckle3d.io.volumes import may_be_volume
 
-    start = _start(path)
-    nifti = start[344:347] == b"n+1" or (start.startswith(_GZIP) and path.name.endswith(".nii.gz"))
-    return nifti or ((is_metaimage(start) or is_nrrd(start)) and b"Seq_Frame" not in start)
+    return may_be_volume(path)
 
 
 def _is_sequence(path: Path) -> bool:
@@ -155,5 +155,5 @@ _KINDS: dict[Kind, tuple[str, Callable[[Path], bool]]] = {
     "sweep": ("a sweep file", _of_format("speckle3d.sweep")),
     "trajectory": ("TUM text", _is_trajectory),
     "transform": ("a transform", _is_transform),
-    "volume": ("a volume", is_volume),
+    "volume": ("a volume", _is_volume),
 }

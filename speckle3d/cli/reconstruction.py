@@ -108,6 +108,7 @@ def reconstruct(
         require_own_place(save_curves, "curves", *read)
     if volume is not None:
         require_suffix(volume)
+        # In a folder of results that is still to be made nothing can be in the way.
         if volume.parent.exists() or volume.parent != out:
             require_own_place(volume, "volume", sweep_file, crossing_file, used, *(calibration or ()))
         _require_mode(volume_mode, modes)

@@ -87,6 +87,7 @@ def reslice(
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
     from speckle3d.io.volume_writer import SUFFIXES
+    from speckle3d.io.volumes import may_be_volume
     from speckle3d.study.reslices.places import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)
@@ -117,7 +118,7 @@ def reslice(
     modes = tuple(mode or ())
     if outlines:
         _draw_outlines(source, out, modes, difference_to, sweep_file)
-    elif _is_volume(source):
+    elif source.is_file() and may_be_volume(source):
         _require_no_modes(modes, difference_to, volume)
         _cut_volume(source, state, out, located(None))
     else:
@@ -171,7 +172,7 @@ def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> No
 
 
 def _voxels(path: Path, state: Path | None) -> tuple[Volume, ByteArray | None]:
-    """Read a volume and the states of its voxels, which lie on the same grid."""
+    """Read a volume and, if there is a file of them, the states of its voxels."""
     from speckle3d.io.volumes import read_states, read_volume
 
     volume = read_volume(path)
@@ -204,12 +205,6 @@ def _draw_outlines(
     grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
     outlines = {mode: frame_outlines(grid, poses[0].inv() * poses) for mode, poses in opened.poses.items()}
     save_figure(figure_outlines(outlines, opened.posed.sweep.name), out)
-
-
-def _is_volume(path: Path) -> bool:
-    from speckle3d.cli.outputs import is_volume
-
-    return path.is_file() and is_volume(path)
 
 
 def _require_one_place(given: dict[str, object]) -> None:

@@ -10,14 +10,22 @@ import typer
 from speckle3d.cli.common import (
     CalibrationFiles,
     ConfigFile,
+    Modes,
     PosedFile,
     SweepFile,
     Transform,
     app,
-    from_options,
-    load_settings,
     note,
     progress_bar,
+)
+from speckle3d.cli.compounding import (
+    FillRadius,
+    LevelRange,
+    Rule,
+    Splat,
+    VoxelMm,
+    compounding_settings,
+    open_sweep_at,
 )
 from speckle3d.cli.importing import (
     Importing,
@@ -25,7 +33,6 @@ from speckle3d.cli.importing import (
     PlusConfig,
     ReferenceTransform,
     files_of,
-    given_settings,
 )
 
 
@@ -33,32 +40,18 @@ from speckle3d.cli.importing import (
 def scene(
     source: PosedFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder to write; open its scene.mrml.")],
-    mode: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Which poses to use: image (default), orientation, pose, crossed, inertial, fused of a "
-            "reconstruction; tracker, truth of a recording. May be repeated."
-        ),
-    ] = None,
+    mode: Modes = None,
     images: Annotated[
         bool, typer.Option("--images", help="Also the images, which play as they move through the volume.")
     ] = False,
     deviation: Annotated[
         bool, typer.Option("--deviation", help="Also each voxel's standard deviation of position, mm.")
     ] = False,
-    voxel_mm: Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")] = None,
-    splat: Annotated[
-        str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
-    ] = None,
-    rule: Annotated[
-        str | None, typer.Option(help="Of a voxel's samples: mean, maximum, latest, weighted.")
-    ] = None,
-    fill_radius: Annotated[
-        int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
-    ] = None,
-    dynamic_range_db: Annotated[
-        float | None, typer.Option(help="Range of log-compressed grey levels (60).")
-    ] = None,
+    voxel_mm: VoxelMm = None,
+    splat: Splat = None,
+    rule: Rule = None,
+    fill_radius: FillRadius = None,
+    dynamic_range_db: LevelRange = None,
     sweep_file: SweepFile = None,
     calibration: CalibrationFiles = None,
     plus_config: PlusConfig = None,
@@ -70,23 +63,12 @@ def scene(
     config_file: ConfigFile = None,
 ) -> None:
     """Write a folder that opens in 3D Slicer: volumes, labels of voxels, outlines and poses of frames."""
-    from speckle3d.imaging.voxels.settings import CompoundingSettings
-    from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
 
     options = locals()
     require_scene_place(out, source, sweep_file, *files_of(plus_config, calibration))
-    base = load_settings(config_file).volume.model_dump()
-    given = {name: value for name, value in options.items() if name in base and value is not None}
-    settings = from_options(CompoundingSettings, base | given)
-    # The range is that of the volume's levels; a recording's own is said beside it.
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    modes: list[str | None] = list(mode) if mode else [None]
-    posed = [
-        open_posed(source, each, sweep_file, imported, calibration or (), dynamic_range_db) for each in modes
-    ]
-    for line in posed[0].notes():
-        note(line)
+    settings = compounding_settings(config_file, options)
+    posed = open_sweep_at(mode or [None], source, options)
     request = SceneRequest(settings, with_images=images, with_deviation=deviation)
     with progress_bar(f"writing {out.name}") as progress:
         reports = write_scene(out, posed, request, progress)

@@ -78,14 +78,13 @@ def surface(
         raise InvalidInputError(f"--mode: expected {made_at}, at whose poses VOLUME was made, got {mode}")
     errors, grid = _errors(reconstruction, made_at)
     known = None if state is None else read_states(state, volume) != EMPTY
-    found: dict[str, Surface] = {}
-    if labels:
-        for label, each in surfaces_of_labels(volume).items():
-            found[str(out.with_name(f"{out.stem}-{label}{suffix}"))] = each
+    if level is not None:
+        found = {str(out): surface_of(volume, level, "below" if below else "above", known)}
     else:
-        found[str(out)] = surface_of(volume, level or 0.0, "below" if below else "above", known)
-    for place in found if labels else ():
-        require_own_place(Path(place), "surface", source, reconstruction, state)
+        each_label = surfaces_of_labels(volume).items()
+        found = {str(out.with_name(f"{out.stem}-{label}{suffix}")): each for label, each in each_label}
+        for place in found:
+            require_own_place(Path(place), "surface", source, reconstruction)
     told = []
     for place, each in found.items():
         whole = largest_part(each) if largest else each

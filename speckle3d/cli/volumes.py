@@ -18,10 +18,17 @@ from speckle3d.cli.common import (
     Transform,
     app,
     emit_json,
-    from_options,
-    load_settings,
     note,
     progress_bar,
+)
+from speckle3d.cli.compounding import (
+    FillRadius,
+    LevelRange,
+    Rule,
+    Splat,
+    VoxelMm,
+    compounding_settings,
+    open_sweep_at,
 )
 from speckle3d.cli.importing import (
     Importing,
@@ -29,9 +36,8 @@ from speckle3d.cli.importing import (
     PlusConfig,
     ReferenceTransform,
     files_of,
-    given_settings,
 )
-from speckle3d.cli.outputs import require_different, require_own_place
+from speckle3d.cli.outputs import require_own_places
 from speckle3d.core.errors import InvalidInputError
 
 Three = tuple[float, float, float]
@@ -42,20 +48,10 @@ def volume(
     source: PosedFile,
     out: Annotated[Path, typer.Option("-o", "--output", help="VOLUME.nrrd, .mha, .nii.gz or .nii to write.")],
     mode: Mode = None,
-    voxel_mm: Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")] = None,
-    splat: Annotated[
-        str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
-    ] = None,
-    rule: Annotated[
-        str | None,
-        typer.Option(
-            help="Of a voxel's samples: mean, maximum, latest, weighted; plus: mean kept in whole grey "
-            "levels as PLUS and 3D Slicer keep it, to compare with their volumes."
-        ),
-    ] = None,
-    fill_radius: Annotated[
-        int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")
-    ] = None,
+    voxel_mm: VoxelMm = None,
+    splat: Splat = None,
+    rule: Rule = None,
+    fill_radius: FillRadius = None,
     fill_mm: Annotated[
         float | None, typer.Option(help="Instead, in mm along each axis, whatever the voxels' shape.")
     ] = None,
@@ -65,9 +61,7 @@ def volume(
     levels: Annotated[
         str | None, typer.Option(help="log, linear, or stored (B-mode as it is, which is the default).")
     ] = None,
-    dynamic_range_db: Annotated[
-        float | None, typer.Option(help="Range of log-compressed grey levels (60).")
-    ] = None,
+    dynamic_range_db: LevelRange = None,
     axes: Annotated[
         Literal["sweep", "world", "principal"],
         typer.Option(help="Of the voxels: sweep (mean of the images), world, principal (smallest box)."),
@@ -117,15 +111,11 @@ def volume(
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
-    from speckle3d.imaging.voxels.settings import CompoundingSettings
-    from speckle3d.study.posed import open_posed
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
-    for place in (out, state, deviation):
-        if place is not None:
-            require_own_place(place, "volume", source, sweep_file, like, *files_of(plus_config, calibration))
-    require_different({"--output": out, "--state": state, "--deviation": deviation})
+    inputs = (source, sweep_file, like, *files_of(plus_config, calibration))
+    require_own_places({"--output": out, "--state": state, "--deviation": deviation}, "volume", *inputs)
     _require_alone(
         {"--voxel-mm": voxel_mm}, {"--spacing-mm": spacing_mm, "--within-gb": within_gb, "--like": like}
     )
@@ -133,11 +123,7 @@ def volume(
         {"--splat": splat, "--rule": rule, "--fill-radius": fill_radius, "--fill-mm": fill_mm},
         {"--backward-mm": backward_mm or None},
     )
-    base = load_settings(config_file).volume.model_dump()
-    given = {name: value for name, value in options.items() if name in base and value is not None}
-    if levels == "linear" and voxel_type is None and base["voxel_type"] == "uint8":
-        given["voxel_type"] = "float32"  # amplitudes may be less than one, or thousands
-    settings = from_options(CompoundingSettings, base | given)
+    settings = compounding_settings(config_file, options)
     request = VolumeRequest(
         out,
         settings,
@@ -146,11 +132,7 @@ def volume(
         state,
         deviation,
     )
-    # The option is the range of the volume's levels, and of B-mode that says none of its own.
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    posed = open_posed(source, mode, sweep_file, imported, calibration or (), dynamic_range_db)
-    for line in posed.notes():
-        note(line)
+    (posed,) = open_sweep_at([mode], source, options)
     with progress_bar(f"compounding {out.name}") as progress:
         report = write_voxels(posed, request, progress)
     if as_json:

@@ -83,7 +83,7 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
     InvalidInputError
         If there are no poses.
     """
-    points = _extreme_points(image_corners(grid, world_from_image))
+    points = _extreme_points(image_corners(grid, world_from_image).reshape(-1, 3))
     try:
         lateral_first = sweep_axes(world_from_image)
     except InsufficientDataError:

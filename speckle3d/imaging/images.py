@@ -136,6 +136,6 @@ def require_poses(world_from_image: RigidTransform) -> None:
 
 
 def image_corners(grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
-    """Corners of all images in the world, shape (4 n, 3), mm."""
+    """Corners of all images in the world, clockwise from the top left, shape (n, 4, 3), mm."""
     require_poses(world_from_image)
-    return np.concatenate([world_from_image.apply(corner) for corner in grid.corners_mm])
+    return np.stack([world_from_image.apply(corner) for corner in grid.corners_mm], axis=1)

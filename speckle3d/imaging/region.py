@@ -156,7 +156,7 @@ class Region:
         Raises
         ------
         InvalidInputError
-            If the text is none.
+            If the text is no region.
         """
         return cls(tuple(_shape(part, text) for part in text.split(" and ")))
 

@@ -20,10 +20,11 @@ _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
 _HEADER_LIMIT_BYTES = 2**28
 """A header of a thousand bytes for each of a quarter million frames; beyond it the file is no header."""
 
-_NRRD_NAMES = {
+NRRD_NAMES = {
     "ultrasound image orientation": "UltrasoundImageOrientation",
     "ultrasound image type": "UltrasoundImageType",
 }
+"""PLUS's fields by what it calls them in NRRD."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
             continue
         if ":=" in line:
             name, _, value = line.partition(":=")
-            yield _NRRD_NAMES.get(name.strip(), name.strip()), value.strip()
+            yield NRRD_NAMES.get(name.strip(), name.strip()), value.strip()
         else:
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
             name, _, value = line.partition(":")

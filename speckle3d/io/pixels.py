@@ -61,6 +61,11 @@ def meta_type(dtype: np.dtype[Any]) -> str:
     return next(word for word, kind in _META_TYPES.items() if np.dtype(kind) == dtype.newbyteorder("="))
 
 
+def nrrd_type(dtype: np.dtype[Any]) -> str:
+    """NRRD's word for a type of numbers."""
+    return {"float32": "float", "float64": "double"}.get(dtype.name, dtype.name)
+
+
 def type_of_word(word: str) -> np.dtype[Any]:
     """Type of numbers by MetaImage's word, as MET_SHORT.
 

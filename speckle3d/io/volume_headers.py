@@ -23,17 +23,13 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import VOXEL_TYPES, require_spacing
-from speckle3d.io.pixels import meta_type
+from speckle3d.io.header_text import header_bytes, meta_start
+from speckle3d.io.pixels import meta_type, nrrd_type
 
 PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
 
-SIZE_FIELD = b"CompressedDataSize = "
-SIZE_PLACE = 20
-"""Characters kept in a MetaImage's header for the size of the packed voxels, which is known after them."""
-
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
-_NRRD_WORDS = {"uint8": "uint8", "int16": "int16", "uint16": "uint16", "float32": "float"}
 _FROM = ("RL", "AP", "IS")
 """Side that an axis comes from, by MetaImage's letters, if it leads along a world axis or against it."""
 
@@ -103,10 +99,10 @@ class VolumeHeader:
 def nrrd_header(header: VolumeHeader, encoding: str) -> bytes:
     """Header of an NRRD file with its voxels behind it, packed as `encoding` says."""
     steps = header.axes * np.asarray(header.spacing_mm)[:, None]
-    return _encoded(
+    return header_bytes(
         (
             "NRRD0005",
-            f"type: {_NRRD_WORDS[header.dtype.name]}",
+            f"type: {nrrd_type(header.dtype)}",
             "dimension: 3",
             "space: left-posterior-superior",
             f"sizes: {_texts(header.shape)}",
@@ -123,15 +119,10 @@ def nrrd_header(header: VolumeHeader, encoding: str) -> bytes:
 
 
 def meta_header(header: VolumeHeader, is_packed: bool) -> bytes:
-    """Header of a MetaImage with its voxels behind it; the packed size is to be put in `SIZE_PLACE`."""
-    return _encoded(
+    """Header of a MetaImage with its voxels behind it; `put_packed_size` tells it their size."""
+    return header_bytes(
         (
-            "ObjectType = Image",
-            "NDims = 3",
-            "BinaryData = True",
-            "BinaryDataByteOrderMSB = False",
-            f"CompressedData = {is_packed}",
-            *((SIZE_FIELD.decode() + "0".ljust(SIZE_PLACE),) if is_packed else ()),
+            *meta_start(3, 0 if is_packed else None),
             f"TransformMatrix = {_texts(header.axes.ravel())}",
             f"Offset = {_texts(header.origin_mm)}",
             "CenterOfRotation = 0 0 0",
@@ -188,7 +179,3 @@ def _vector(values: Iterable[float]) -> str:
 
 def _text(value: float) -> str:
     return str(value) if isinstance(value, int) else repr(float(value) + 0.0)
-
-
-def _encoded(lines: Iterable[str]) -> bytes:
-    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")

@@ -20,9 +20,10 @@ from speckle3d.core.labels import Segment, require_segments
 from speckle3d.core.threads import ahead, cores
 from speckle3d.io.deflate import LAST_BLOCK, ZLIB_START, packed_run
 from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.header_text import put_packed_size
 from speckle3d.io.nifti import nifti_header
 from speckle3d.io.segments import segment_fields
-from speckle3d.io.volume_headers import SIZE_FIELD, SIZE_PLACE, VolumeHeader, meta_header, nrrd_header
+from speckle3d.io.volume_headers import VolumeHeader, meta_header, nrrd_header
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
 """Of files that are written; .seg.nrrd is one of them, for labels alone."""
@@ -167,8 +168,7 @@ class VolumeWriter:
             raise MismatchError(f"{self._path}: expected {expected} planes, got {self._planes}")
         size = self._voxels.finish()
         if self._is_meta and self._packs:
-            self._file.seek(self._text.index(SIZE_FIELD) + len(SIZE_FIELD))
-            self._file.write(str(size).encode().ljust(SIZE_PLACE))
+            put_packed_size(self._file, self._text, size)
 
 
 class _Raw:

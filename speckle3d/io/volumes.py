@@ -27,7 +27,10 @@ from speckle3d.io.text import numbers
 from speckle3d.io.volume_headers import own_fields
 from speckle3d.io.volume_writer import VolumeWriter
 
-_SNIFFED_BYTES = 512
+_SNIFFED_BYTES = 4096
+
+_SAME_PLACE_MM = 1e-3
+"""Two grids are one if they differ by less: NIfTI keeps places to single precision."""
 
 _TO_LPS = {"left-anterior-superior": (1, -1, 1), "right-anterior-superior": (-1, -1, 1)}
 """Signs that turn a space of NRRD into the one of MetaImage and this package; others stay as they are."""
@@ -69,11 +72,35 @@ def is_volume(path: PathLike) -> bool:
     FileError, InvalidInputError
         If it cannot be read, or its header does not make sense.
     """
-    with reading(path), open_regular(path) as stream:
-        start = stream.read(_SNIFFED_BYTES)
+    start = _start(path)
     if is_metaimage(start) or is_nrrd(start):
         header = read_header(path)
         return header.is_volume or (header.kinds == 3 * ["domain"] and not header.frames)
+    return _is_nifti_file(path, start)
+
+
+def may_be_volume(path: PathLike) -> bool:
+    """Whether a file is a NIfTI image, or a MetaImage or NRRD one without fields of frames near its start.
+
+    Unlike `is_volume` it takes files of programs that do not say what their axes are.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read.
+    """
+    start = _start(path)
+    if is_metaimage(start) or is_nrrd(start):
+        return b"Seq_Frame" not in start
+    return _is_nifti_file(path, start)
+
+
+def _start(path: PathLike) -> bytes:
+    with reading(path), open_regular(path) as stream:
+        return stream.read(_SNIFFED_BYTES)
+
+
+def _is_nifti_file(path: PathLike, start: bytes) -> bool:
     return is_nifti(start) or (start.startswith(GZIP_SIGNATURE) and str(path).lower().endswith(".nii.gz"))
 
 
@@ -152,21 +179,29 @@ def read_volume(path: PathLike) -> Volume:
 
 
 def read_states(path: PathLike, volume: Volume) -> ByteArray:
-    """Read the states of a volume's voxels, shape (n_i, n_j, n_k).
+    """Read the states of a volume's voxels, as ``speckle3d volume --state`` writes them.
+
+    Returns
+    -------
+    ndarray of uint8, shape (n_i, n_j, n_k)
+        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
 
     Raises
     ------
-    FileError, InvalidInputError
-        As `read_volume`, and if they are not of type uint8 or not on the volume's grid.
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it holds no states, or not those of a volume of this shape and place.
     """
     states = read_volume(path)
-    is_same = states.shape == volume.shape and np.allclose(
-        states.world_from_index, volume.world_from_index, atol=1e-3
-    )
-    if states.voxels.dtype != np.uint8 or not is_same:
+    if states.voxels.dtype != np.uint8 or states.shape != volume.shape:
+        wanted = " x ".join(str(n) for n in volume.shape)
         raise InvalidInputError(
-            f"{path}: expected states of type uint8 on the volume's grid, got another volume"
+            f"{path}: expected states on the volume's grid, uint8 of {wanted} voxels, got "
+            f"{states.voxels.dtype} of {' x '.join(str(n) for n in states.shape)}"
         )
+    if not np.allclose(states.world_from_index, volume.world_from_index, atol=_SAME_PLACE_MM):
+        raise InvalidInputError(f"{path}: expected states on the volume's grid, got some of another place")
     return states.voxels
 
 

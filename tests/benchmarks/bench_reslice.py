@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.cuts.planes import ReslicePlane, along_sweep_plane, surface_plane
+from speckle3d.imaging.cuts.planes import ReslicePlane, depth_line, lateral_line, planes_from_first_frame
 from speckle3d.imaging.cuts.reslice import reslice_frames, reslice_volume
 from speckle3d.imaging.voxels.volume import compound
 
@@ -41,10 +41,10 @@ def seconds(function, *arguments, rounds=3, **keywords):
     return min(times)
 
 
-@pytest.mark.parametrize("make_plane", [along_sweep_plane, surface_plane])
-def test_reslice_against_map_coordinates_on_voxels(benchmark, sweep, make_plane):
+@pytest.mark.parametrize("line_of", [lateral_line, depth_line])
+def test_reslice_against_map_coordinates_on_voxels(benchmark, sweep, line_of):
     images, poses = sweep
-    plane = make_plane(poses, GRID, 15.0, PIXEL_MM)
+    plane = planes_from_first_frame({"image": poses}, line_of(GRID, 15.0), PIXEL_MM)["image"]
     volume = compound(images, GRID, poses, 0.2)
     to_index = np.linalg.solve(volume.world_from_index, plane.world_from_pixel())[:3]
 
@@ -60,7 +60,7 @@ def test_reslice_against_map_coordinates_on_voxels(benchmark, sweep, make_plane)
     )
     mpixel = np.prod(plane.shape) / 1e6
     print(
-        f"\n{make_plane.__name__}: {mpixel:.2f} Mpixel from {FRAMES} frames at {mpixel / ours:.1f} Mpixel/s, "
+        f"\n{line_of.__name__}: {mpixel:.2f} Mpixel from {FRAMES} frames at {mpixel / ours:.1f} Mpixel/s, "
         f"map_coordinates on ready voxels {mpixel / theirs:.1f} Mpixel/s: {theirs / ours:.2f} times its speed"
     )
 

@@ -10,7 +10,7 @@ from scipy.interpolate import make_interp_spline
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, require_pixels
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, outer_borders, require_pixels
 
 _DENSITY = 8
 """Points per pixel along the curve from which equal steps are read off: errors of a hundredth of a pixel."""
@@ -55,9 +55,7 @@ class CurvedSheet:
     @property
     def extent_mm(self) -> tuple[float, float, float, float]:
         """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
-        rows, columns = self.shape
-        left, top = (first - self.pixel_mm / 2 for first in self.first_mm)
-        return left, left + columns * self.pixel_mm, top + rows * self.pixel_mm, top
+        return outer_borders(self.shape, self.first_mm, self.pixel_mm)
 
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm; NaN beyond the ends."""
@@ -123,7 +121,7 @@ def curved_sheet(
     if not (np.isfinite(length) and length > 0):
         raise InvalidInputError(f"curve: expected a direction of its columns, got {axis.tolist()}")
     axis = axis / length
-    flat = points[0] + (points - points[0]) - ((points - points[0]) @ axis)[:, None] * axis
+    flat = points - ((points - points[0]) @ axis)[:, None] * axis
     apart = np.linalg.norm(np.diff(flat, axis=0), axis=1)
     # A point picked twice is one.
     flat = flat[np.concatenate([[True], apart > 1e-9])]

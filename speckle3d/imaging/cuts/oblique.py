@@ -10,7 +10,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
-from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_part
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_around
 
 _LEAST_SINE = 1e-4
 """Of the angle between two directions that span a plane: six thousandths of a degree."""
@@ -42,22 +42,19 @@ def spanned_plane(
     Raises
     ------
     InvalidInputError
-        If a direction is none, both are one, or the origin is not finite.
+        If a direction has no length, both are along one line, or the origin is not finite.
     """
     if not np.isfinite(origin_mm).all():
         raise InvalidInputError(f"plane: expected a finite origin, got {vector_words(np.asarray(origin_mm))}")
     x, y = (np.asarray(each, dtype=float) for each in (right, down))
     lengths = [float(np.linalg.norm(each)) for each in (x, y)]
+    got = f"got directions {vector_words(x)} and {vector_words(y)}"
     if min(lengths) == 0 or not np.isfinite(lengths).all():
-        raise InvalidInputError(
-            f"plane: expected {expected}, got directions {vector_words(x)} and {vector_words(y)}"
-        )
+        raise InvalidInputError(f"plane: expected {expected}, {got}")
     x, y = x / lengths[0], y / lengths[1]
     across = y - (y @ x) * x
     if np.linalg.norm(across) < _LEAST_SINE:
-        raise InvalidInputError(
-            f"plane: expected {expected}, got directions {vector_words(x)} and {vector_words(y)}"
-        )
+        raise InvalidInputError(f"plane: expected {expected}, {got}")
     y = across / np.linalg.norm(across)
     turned = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)]))
     return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), turned)
@@ -117,8 +114,7 @@ def covering_plane(
             f"plane: expected one that meets a frame within {reach_mm:g} mm, got one {away:.1f} mm from the "
             f"nearest; the sweep lies between {vector_words(low)} and {vector_words(high)} mm"
         )
-    low, high = points.min(axis=0), points.max(axis=0)
-    return plane_part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm)
+    return plane_around(placed, points, pixel_mm)
 
 
 def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
@@ -150,8 +146,7 @@ def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float
             f"plane: expected one that meets the volume, which lies between {vector_words(low)} and "
             f"{vector_words(high)} mm, got one {np.abs(there[:, 2]).min():.1f} mm from it"
         )
-    low, high = points.min(axis=0), points.max(axis=0)
-    return plane_part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm)
+    return plane_around(placed, points, pixel_mm)
 
 
 def vector_words(vector: FloatArray) -> str:

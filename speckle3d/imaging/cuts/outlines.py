@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import require_poses
+from speckle3d.imaging.images import image_corners
 
 _ON_PLANE_MM = 1e-6
 
@@ -31,9 +31,7 @@ def frame_outlines(grid: ImageGrid, world_from_image: RigidTransform) -> FloatAr
     >>> frame_outlines(grid, RigidTransform.identity(1))[0, :, :2].tolist()
     [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]]
     """
-    require_poses(world_from_image)
-    corners = grid.corners_mm[[0, 1, 2, 3, 0]]
-    return np.stack([world_from_image.apply(corner) for corner in corners], axis=1)
+    return image_corners(grid, world_from_image)[:, [0, 1, 2, 3, 0]]
 
 
 def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> FloatArray:

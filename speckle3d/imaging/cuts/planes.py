@@ -67,9 +67,7 @@ class ReslicePlane:
     @property
     def extent_mm(self) -> tuple[float, float, float, float]:
         """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
-        rows, columns = self.shape
-        left, top = (first - self.pixel_mm / 2 for first in self.first_mm)
-        return left, left + columns * self.pixel_mm, top + rows * self.pixel_mm, top
+        return outer_borders(self.shape, self.first_mm, self.pixel_mm)
 
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm."""
@@ -111,70 +109,21 @@ def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
         )
 
 
+def outer_borders(
+    shape: tuple[int, int], first_mm: tuple[float, float], pixel_mm: float
+) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of pixels of which the first one's centre is at `first_mm`, mm."""
+    rows, columns = shape
+    left, top = (first - pixel_mm / 2 for first in first_mm)
+    return left, left + columns * pixel_mm, top + rows * pixel_mm, top
+
+
 def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:
     """The plane of one image, as large as the image: what another sweep shows there."""
     top = RigidTransform.from_translation([0.0, grid.first_sample_depth_mm, 0.0])
     height = grid.depth_mm - grid.first_sample_depth_mm
     first = (0.0, grid.first_sample_depth_mm)
     return ReslicePlane(world_from_image * top, grid.width_mm, height, pixel_mm, first)
-
-
-def along_sweep_plane(
-    world_from_image: RigidTransform,
-    grid: ImageGrid,
-    lateral_mm: float,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
-) -> ReslicePlane:
-    """Plane along the sweep and into the depth, in which its length and tilt are seen.
-
-    Columns follow the sweep's mean elevational travel at the lateral position `lateral_mm`, rows the mean
-    axial direction; the plane covers that line of every image. Its axes count from the first frame's line.
-
-    Parameters
-    ----------
-    world_from_image : RigidTransform, length n
-    grid : ImageGrid
-    lateral_mm : float
-        From the first vector, inside the image.
-    pixel_mm : float
-
-    Raises
-    ------
-    InvalidInputError
-        If `lateral_mm` is outside the image, or there are no poses.
-    InsufficientDataError
-        If the poses have no common axial or elevational direction.
-    """
-    return _mean_plane(world_from_image, lateral_line(grid, lateral_mm), pixel_mm)
-
-
-def surface_plane(
-    world_from_image: RigidTransform,
-    grid: ImageGrid,
-    depth_mm: float,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
-) -> ReslicePlane:
-    """Plane along the sweep at one depth, in which its length and yaw are seen.
-
-    Columns follow the sweep's mean elevational travel at the depth `depth_mm`, rows the mean lateral
-    direction; the plane covers that line of every image. Its axes count from the first frame's line.
-
-    Parameters
-    ----------
-    world_from_image : RigidTransform, length n
-    grid : ImageGrid
-    depth_mm : float
-        Inside the image.
-    pixel_mm : float
-
-    Raises
-    ------
-    InvalidInputError
-        If `depth_mm` is outside the image, or there are no poses.
-    InsufficientDataError
-        If the poses have no common lateral or elevational direction.
-    """
-    return _mean_plane(world_from_image, depth_line(grid, depth_mm), pixel_mm)
 
 
 def lateral_line(grid: ImageGrid, lateral_mm: float) -> FloatArray:
@@ -208,22 +157,29 @@ def planes_from_first_frame(
     pixel_mm : float
     largest_mm : tuple of float
         Width and height at most; what lies farthest from the first frame is left out.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are no poses.
+    InsufficientDataError
+        If the poses have no common elevational direction, or none along the line.
     """
-    placed = {mode: _travelled(each, line_mm, first_down=True) for mode, each in poses.items()}
+    placed = {mode: _travelled(each, line_mm) for mode, each in poses.items()}
     low = reduce(np.minimum, [ends.min(axis=0) for _, ends in placed.values()])
     high = reduce(np.maximum, [ends.max(axis=0) for _, ends in placed.values()])
     low, high = np.maximum(low, -np.array(largest_mm)), np.minimum(high, largest_mm)
     size = np.clip(high - low, pixel_mm, largest_mm)
-    return {mode: plane_part(axes, low, size, pixel_mm, line_mm) for mode, (axes, _) in placed.items()}
+    return {mode: _plane_part(axes, low, size, pixel_mm, line_mm) for mode, (axes, _) in placed.items()}
 
 
-def _mean_plane(world_from_image: RigidTransform, line_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
-    axes, ends = _travelled(world_from_image, line_mm)
-    low, high = ends.min(axis=0), ends.max(axis=0)
-    return plane_part(axes, low, np.maximum(high - low, pixel_mm), pixel_mm, line_mm)
+def plane_around(placed: RigidTransform, points_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
+    """Smallest rectangle of a placed plane that holds points of it, shape (n, 2), mm."""
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    return _plane_part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm)
 
 
-def plane_part(
+def _plane_part(
     placed: RigidTransform,
     low: FloatArray,
     size: FloatArray,
@@ -238,13 +194,11 @@ def plane_part(
     return ReslicePlane(placed * start, float(size[0]), float(size[1]), pixel_mm, first)
 
 
-def _travelled(
-    world_from_image: RigidTransform, line_mm: FloatArray, first_down: bool = False
-) -> tuple[RigidTransform, FloatArray]:
+def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[RigidTransform, FloatArray]:
     """Place a plane along the travel of a line, and say where on it the ends of that line are.
 
     It lies in the mean plane of all lines; its origin is in the first frame, as far along it as the line
-    begins. Its y is the lines' mean direction, or the line in which the first frame crosses it.
+    begins. Its y is the line in which the first frame crosses it.
 
     Returns
     -------
@@ -255,17 +209,14 @@ def _travelled(
     along = ends[1] - ends[0]
     down = _unit(along.mean(axis=0), "the line to show")
     travel = _mean_travel(ends.mean(axis=0), world_from_image)
-    across = _unit(travel - (travel @ down) * down, "travel")
-    normal = np.cross(across, down)
+    normal = np.cross(_unit(travel - (travel @ down) * down, "travel"), down)
     beside = np.cross(
         world_from_image[0].rotation.apply([0.0, 0.0, 1.0]), along[0] / np.linalg.norm(along[0])
     )
     # A frame that hardly crosses the plane has its line projected there instead.
     beside = beside if abs(beside @ normal) > _LEAST_CROSSING else normal
-    if first_down:
-        down = _unit(along[0] - (along[0] @ normal) / (beside @ normal) * beside, "the first frame's line")
-        across = np.cross(down, normal)
-    axes = Rotation.from_matrix(np.column_stack([across, down, normal]))
+    down = _unit(along[0] - (along[0] @ normal) / (beside @ normal) * beside, "the first frame's line")
+    axes = Rotation.from_matrix(np.column_stack([np.cross(down, normal), down, normal]))
     away = (ends.reshape(-1, 3).mean(axis=0) - ends[0, 0]) @ normal
     origin = ends[0, 0] + beside * away / (beside @ normal)
     placed = RigidTransform.from_components(origin, axes)

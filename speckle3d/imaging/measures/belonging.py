@@ -20,8 +20,8 @@ def belonging_of(points_mm: FloatArray, grid: ImageGrid, world_from_image: Rigid
     """Find the frame nearest to each point, and its neighbour on the point's other side.
 
     Nearest is the frame with the least distance to its image, the rectangle. The neighbour is the frame
-    before or after it on whose other side the point lies; weights are as the distances to the two planes have
-    it. Past the last frame the nearest counts alone.
+    before or after it on whose other side the point lies; weights go by the distances to both planes. Past
+    the last frame the nearest counts alone.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ def surface_of(
     level : float
         In the volume's own grey levels.
     inside : {"above", "below"}
-        Where the grey level is, inside: above, of what is bright; below, of a cyst or a vessel.
+        Whether the inside is brighter than the level, or darker, as of a cyst or a vessel.
     known : ndarray of bool, optional
         Voxels with a value, in the volume's shape; without it as `known_voxels` has them.
     smooth : int
@@ -80,10 +80,11 @@ def surface_of(
         raise InvalidInputError(
             f"level: expected a grey level of the volume, {low:g} to {high:g}, got {level:g}"
         )
-    return _marched(volume, volume.voxels, level, inside, held, smooth)
+    found = _marched(volume, volume.voxels, level, inside, held)
+    return smoothed(found, smooth) if smooth else found
 
 
-def surfaces_of_labels(volume: Volume, smooth: int = 0) -> dict[int, Surface]:
+def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
     """Surfaces around each label of a label map, by label; 0 is no label.
 
     A label that reaches the border of the grid is open there.
@@ -108,7 +109,7 @@ def surfaces_of_labels(volume: Volume, smooth: int = 0) -> dict[int, Surface]:
     every = np.ones(volume.shape, dtype=bool)
     found = {}
     for label in labels:
-        surface = _marched(volume, (voxels == label).astype(np.float32), 0.5, "above", every, smooth)
+        surface = _marched(volume, (voxels == label).astype(np.float32), 0.5, "above", every)
         found[label] = replace(surface, fields={**surface.fields, "label": str(label)})
     return found
 
@@ -226,9 +227,7 @@ def _sigma(vertices: FloatArray, gradient: FloatArray, errors: PosedErrors, grid
     return float(np.linalg.norm(errors.of_gradient(vertices, gradient, near)))
 
 
-def _marched(
-    volume: Volume, values: FloatArray, level: float, inside: Inside, known: BoolArray, smooth: int
-) -> Surface:
+def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, known: BoolArray) -> Surface:
     """Marching cubes over the cells whose eight voxels are known, in the world."""
     from skimage.measure import marching_cubes
 
@@ -249,8 +248,7 @@ def _marched(
         ) from None
     world = volume.world_from_grid.apply(vertices[:, ::-1].astype(float))
     side = f"{inside} {level:g}"
-    surface = Surface(world, triangles.astype(np.int64), {**volume.fields, "inside": side})
-    return smoothed(surface, smooth) if smooth else surface
+    return Surface(world, triangles.astype(np.int64), {**volume.fields, "inside": side})
 
 
 def _whole_cells(known: BoolArray) -> BoolArray:

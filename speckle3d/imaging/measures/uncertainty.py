@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
@@ -14,8 +12,8 @@ from speckle3d.imaging.voxels.grid import VoxelGrid
 
 COARSE_MM = 0.75
 """Distance of the points at which the deviation is computed; between them it is interpolated linearly."""
-PLANES = 16
 _AT_ONCE = 2**15
+"""Points worked on at a time."""
 
 
 class DeviationField:
@@ -65,15 +63,6 @@ class DeviationField:
         if state is not None:
             found[state == 0] = np.nan
         return found
-
-
-def deviation_slabs(
-    errors: PosedErrors, grid: ImageGrid, voxel_grid: VoxelGrid, planes: int = PLANES
-) -> Iterator[tuple[int, Float32Array]]:
-    """Deviations of a volume's voxels, some planes along k at a time: first plane and values (k, j, i)."""
-    field, stop = DeviationField(errors, grid, voxel_grid), voxel_grid.shape[2]
-    for first in range(0, stop, planes):
-        yield first, field.planes(first, min(first + planes, stop))
 
 
 def deviations(errors: PosedErrors, grid: ImageGrid, points_mm: FloatArray) -> FloatArray:

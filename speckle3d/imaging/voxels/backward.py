@@ -14,7 +14,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.nearest import BATCH, BYTES_PER_POINT, NearestImages
-from speckle3d.imaging.voxels.grid import Slab, VoxelGrid
+from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, even_planes
 
 BYTES_PER_VOXEL = BYTES_PER_POINT + 14
 """Images on either side; voxel, state and a copy of another type; voxel and state of the slab before."""
@@ -114,5 +114,4 @@ def _planes_at_once(source: PosedImages, voxel_grid: VoxelGrid, max_memory_gb: f
             f"volume: expected to work within {max_memory_gb:g} GB of memory, but a plane of {n_i} x {n_j} "
             f"voxels and {BATCH} images take {images_gb + plane_gb:.3g} GB: take larger voxels"
         )
-    # Slabs of nearly one size: none at the end that is worth little.
-    return -(-n_k // -(-n_k // planes))
+    return even_planes(n_k, planes)

@@ -116,7 +116,7 @@ def grid_as_asked(
     shape: tuple[int, int, int] | None = None,
     size_mm: Triple | None = None,
 ) -> VoxelGrid:
-    """Grid whose spacing, orientation, origin and size are as asked for, and what is not holds the images.
+    """Grid with the spacing, orientation, origin and size asked for; those not given hold the images.
 
     Parameters
     ----------
@@ -158,6 +158,11 @@ def grid_as_asked(
     else:
         counts = _counts(low, high, spacing)
     return VoxelGrid(_checked_shape(counts, spacing), spacing, RigidTransform.from_components(origin, axes))
+
+
+def even_planes(n_k: int, most: int) -> int:
+    """Planes of a slab, at most `most` of `n_k`: slabs of nearly one size, none at the end worth little."""
+    return -(-n_k // -(-n_k // most))
 
 
 def grid_like(volume: Volume) -> VoxelGrid:
@@ -217,7 +222,7 @@ def _bounds(
     grid: ImageGrid, world_from_image: RigidTransform, world_from_axes: Rotation
 ) -> tuple[FloatArray, FloatArray]:
     """Least and greatest coordinates along the axes of the images' corners."""
-    along = world_from_axes.inv().apply(image_corners(grid, world_from_image))
+    along = world_from_axes.inv().apply(image_corners(grid, world_from_image).reshape(-1, 3))
     return along.min(axis=0), along.max(axis=0)
 
 

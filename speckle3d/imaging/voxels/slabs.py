@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.backward import BYTES_PER_VOXEL, backward_slabs
-from speckle3d.imaging.voxels.grid import Slab, VoxelGrid
+from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, even_planes
 from speckle3d.imaging.voxels.holes import boxes_within, cubes_within, fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.voxels.splatting import Placed, Weights, batch_gb, bytes_per_voxel, splat_block
@@ -103,8 +103,7 @@ def planes_per_slab(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames
             f"volume: expected to work within {most:g} GB of memory, but a slab of {n_i} x {n_j} voxels "
             f"takes {needed:.3g} GB: take larger voxels, or allow more memory"
         )
-    # Slabs of nearly one size: none at the end that is worth little.
-    return -(-n_k // -(-n_k // planes))
+    return even_planes(n_k, planes)
 
 
 def working_gb(voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float) -> float:

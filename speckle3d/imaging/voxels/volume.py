@@ -67,7 +67,7 @@ def compound(
     below 1/8 do not count for the maximum and the latest. With "plus" the mean is kept in whole grey levels,
     as PLUS and 3D Slicer keep it; see `speckle3d.imaging.voxels.whole_levels`.
 
-    An empty voxel is then the mean of those that are not in the smallest cube around it that holds any;
+    An empty voxel then becomes the mean of the measured ones in the smallest cube around it that holds any;
     measured voxels stay as they are.
 
     Parameters

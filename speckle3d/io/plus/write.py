@@ -25,8 +25,9 @@ from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.headers import read_header
-from speckle3d.io.pixels import meta_type, type_of_word
+from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
+from speckle3d.io.headers import NRRD_NAMES, read_header
+from speckle3d.io.pixels import meta_type, nrrd_type, type_of_word
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.rows import Rows, number_of, rows_of, rows_without_images
 
@@ -41,15 +42,10 @@ _OF_SLICER = ".seq.nrrd"
 _LEVEL = 1
 """Speckle hardly compresses further at higher levels, which cost several times the time."""
 
-_PLACE = 20
-"""Characters kept in a header for the size of the packed pixels, which is known after them."""
+_ZLIB, _GZIP = 15, 31
+"""Windows of deflate, and by them what is around it."""
 
-_NRRD_WORDS = {"u1": "uint8", "i1": "int8", "i2": "int16", "u2": "uint16", "i4": "int32", "u4": "uint32",
-               "i8": "int64", "u8": "uint64", "f4": "float", "f8": "double"}  # fmt: skip
-_NRRD_NAMES = {
-    "UltrasoundImageOrientation": "ultrasound image orientation",
-    "UltrasoundImageType": "ultrasound image type",
-}
+_NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 _META_ONLY = ("NDims", "ElementType", "ElementSpacing")
 
 
@@ -100,33 +96,19 @@ def write_sequence(
         rows.add_transforms(name, matrices)
     images = _Images.of(sweep, rows, progress)
     if suffix == ".mhd":
-        beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
-        _require_own(target, target.with_name(beside))
-        files = FileSet(target.name, (beside,), _left_by(target, beside))
-        with files.replaced(target.parent) as part:
-            try:
-                with (part / beside).open("wb") as file:
-                    size = images.write(file, 15 if compressed else None)
-                header = _meta_header(images, rows, beside, size if compressed else None)
-                (part / target.name).write_bytes(header)
-            except Speckle3DError:
-                raise
-            except OSError as error:
-                raise cannot_write(path, error) from error
-        return rows.left_out
-    with atomic_path(target) as part, part.open("wb") as file:
-        if suffix == ".nrrd":
-            is_slicers = target.name.lower().endswith(_OF_SLICER)
+        _write_two_files(target, images, rows, compressed)
+    elif suffix == ".nrrd":
+        is_slicers = target.name.lower().endswith(_OF_SLICER)
+        with atomic_path(target) as part, part.open("wb") as file:
             file.write(_nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers))
-            images.write(file, 31 if compressed else None)
-            return rows.left_out
+            images.write(file, _GZIP if compressed else None)
+    else:
         head = _meta_header(images, rows, "LOCAL", 0 if compressed else None)
-        file.write(head)
-        size = images.write(file, 15 if compressed else None)
-        if compressed:
-            at = head.index(_SIZE_FIELD) + len(_SIZE_FIELD)
-            file.seek(at)
-            file.write(str(size).encode().ljust(_PLACE))
+        with atomic_path(target) as part, part.open("wb") as file:
+            file.write(head)
+            size = images.write(file, _ZLIB if compressed else None)
+            if compressed:
+                put_packed_size(file, head, size)
     return rows.left_out
 
 
@@ -150,11 +132,7 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     for name, matrices in transforms.items():
         rows.add_transforms(name, matrices)
     lines = [
-        "ObjectType = Image",
-        "NDims = 3",
-        "BinaryData = True",
-        "BinaryDataByteOrderMSB = False",
-        "CompressedData = False",
+        *meta_start(3, None),
         f"DimSize = 0 0 {len(times_s)}",
         "Kinds = domain domain list",
         "ElementSpacing = 1 1 1",
@@ -163,7 +141,23 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
         "ElementDataFile = LOCAL",
     ]
     with atomic_path(path) as part:
-        part.write_bytes(_encoded(lines))
+        part.write_bytes(header_bytes(lines))
+
+
+def _write_two_files(target: Path, images: _Images, rows: Rows, compressed: bool) -> None:
+    """Write a MetaImage's header, and its pixels into a file beside it; both appear, or neither."""
+    beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
+    _require_own(target, target.with_name(beside))
+    with FileSet(target.name, (beside,), _left_by(target, beside)).replaced(target.parent) as part:
+        try:
+            with (part / beside).open("wb") as file:
+                size = images.write(file, _ZLIB if compressed else None)
+            header = _meta_header(images, rows, beside, size if compressed else None)
+            (part / target.name).write_bytes(header)
+        except Speckle3DError:
+            raise
+        except OSError as error:
+            raise cannot_write(target, error) from error
 
 
 def _require_own(header: Path, data: Path) -> None:
@@ -180,9 +174,6 @@ def _left_by(header: Path, beside: str) -> tuple[str, ...]:
         return ()
     names = {f"{header.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
     return tuple(names & {read_header(header).pixels.path.name})
-
-
-_SIZE_FIELD = b"CompressedDataSize = "
 
 
 @dataclass(frozen=True)
@@ -266,12 +257,7 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
     spacing = fields.pop("ElementSpacing")
     fields.pop("ElementType", None)
     lines = [
-        "ObjectType = Image",
-        f"NDims = {2 if rows.is_plane else 3}",
-        "BinaryData = True",
-        "BinaryDataByteOrderMSB = False",
-        f"CompressedData = {packed is not None}",
-        *([] if packed is None else [f"{_SIZE_FIELD.decode()}{str(packed).ljust(_PLACE)}"]),
+        *meta_start(2 if rows.is_plane else 3, packed),
         f"DimSize = {_lengths(images, rows)}",
         f"Kinds = {'domain domain' if rows.is_plane else 'domain domain list'}",
         f"ElementSpacing = {spacing}",
@@ -280,13 +266,13 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
         *_frame_lines(rows, " = "),
         f"ElementDataFile = {data}",
     ]
-    return _encoded(lines)
+    return header_bytes(lines)
 
 
 def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -> bytes:
     lines = [
         "NRRD0004",
-        f"type: {_NRRD_WORDS[images.dtype.str[1:]]}",
+        f"type: {nrrd_type(images.dtype)}",
         *(_slicers_axes if is_slicers else _axes)(images, rows),
         "endian: little",
         f"encoding: {encoding}",
@@ -300,7 +286,7 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -
         *(_slicers_index(rows) if is_slicers else ()),
         "",
     ]
-    return _encoded(lines)
+    return header_bytes(lines)
 
 
 def _axes(images: _Images, rows: Rows) -> Iterator[str]:
@@ -339,8 +325,3 @@ def _slicers_index(rows: Rows) -> Iterator[str]:
     for axis in (3, 0):
         yield f"axis {axis} index type:=numeric"
         yield f"axis {axis} index values:={told}"
-
-
-def _encoded(lines: list[str]) -> bytes:
-    """Text of a header, as bytes that are read back as the same text."""
-    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")

@@ -181,7 +181,7 @@ def cut_posed(
     Raises
     ------
     InvalidInputError
-        If the place is none, or shows nothing; says where the sweep is.
+        If the place is incomplete, or shows nothing; says where the sweep is.
     """
     images, grid = opened.posed.images(dynamic_range_db, progress)
     numbers = opened.posed.frames
@@ -218,7 +218,7 @@ def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | 
     Raises
     ------
     InvalidInputError
-        If the place is none, or misses the volume.
+        If the place is incomplete, or misses the volume.
     """
     cut = place.cut_of_box(volume)
     drawn = DrawnCut(reslice_volume(volume, cut, state), cut)

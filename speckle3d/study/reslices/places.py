@@ -95,7 +95,7 @@ class Place:
         Raises
         ------
         InvalidInputError
-            If the place is none, or not in the sweep.
+            If the place is incomplete, or not in the sweep.
         """
         line = self._line(grid)
         if line is not None:

@@ -116,6 +116,8 @@ class VolumeRequest:
     ----------
     path : path
         With a suffix of `speckle3d.io.volume_writer.SUFFIXES`.
+    settings : CompoundingSettings
+    grid : GridRequest
     region : Region, optional
         Of the images; samples outside it do not count.
     state_path : path, optional
@@ -240,7 +242,7 @@ def _slabs(posed: PosedSweep, source: PosedImages, grid: VoxelGrid, request: Vol
     settings = request.settings
     mask: BoolArray | None = None if request.region is None else request.region.mask(source.grid)
     weighted = settings.rule == "weighted" and settings.backward_mm == 0
-    weights = confidence(posed, settings.voxel_mm) if weighted else None
+    weights = confidence(posed, grid) if weighted else None
     return compound_slabs(source, grid, settings, weights, mask)
 
 
@@ -275,8 +277,10 @@ def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
     return posed_errors_of(posed.reconstruction, posed.mode)
 
 
-def confidence(posed: PosedSweep, voxel_mm: float) -> FloatArray:
-    """Weight of each frame: one over the variance of its place along the sweep and within a voxel.
+def confidence(posed: PosedSweep, grid: VoxelGrid) -> FloatArray:
+    """Weight of each frame, shape (n,): one over the variance of its place along the sweep and in a voxel.
+
+    Along the sweep is the first frame's elevational axis, as of the errors; the largest weight is one.
 
     Raises
     ------
@@ -284,7 +288,9 @@ def confidence(posed: PosedSweep, voxel_mm: float) -> FloatArray:
         If nothing says how well the frames' places are known.
     """
     errors = _errors(posed, "rule weighted").errors
-    place = (errors.factors[:, :, 2] ** 2).sum(axis=0) + voxel_mm**2 / 12
+    along = grid.world_from_grid.rotation.inv().apply(posed.world_from_image[0].rotation.apply([0, 0, 1]))
+    in_voxel = np.square(along * grid.spacing_mm).sum() / 12  # of a place that is anywhere in it
+    place = (errors.factors[:, :, 2] ** 2).sum(axis=0) + in_voxel
     return np.asarray(place.min() / place)
 
 

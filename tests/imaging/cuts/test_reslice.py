@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.cuts.planes import ReslicePlane, along_sweep_plane, surface_plane
+from speckle3d.imaging.cuts.planes import ReslicePlane, depth_line, lateral_line, planes_from_first_frame
 from speckle3d.imaging.cuts.reslice import reslice_frames
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
@@ -24,6 +24,12 @@ def shaky_sweep(rng, frames, step_mm, shake_mm=0.2, shake_deg=3.0, reverse=True)
     shake = rng.normal(0.0, shake_mm, (frames, 3)) * [1, 1, 0]
     turned = Rotation.from_rotvec(rng.normal(0.0, np.deg2rad(shake_deg), (frames, 3)))
     return RigidTransform.from_components(shake + z[:, None] * [0, 0, 1], turned)
+
+
+def plane_along(poses, line_mm, pixel_mm=0.2):
+    """Plane along the sweep at the poses of one mode."""
+    (plane,) = planes_from_first_frame({"image": poses}, line_mm, pixel_mm).values()
+    return plane
 
 
 def pixel_points(plane):
@@ -76,7 +82,7 @@ def test_tilted_bright_plane_appears_where_it_is(seed):
     normal = np.array([0.1, 1.0, 0.35]) / np.linalg.norm([0.1, 1.0, 0.35])
     offset_mm = 10.0 * normal[1]
     sheet = [np.exp(-0.5 * ((image_points(FINE, p) @ normal - offset_mm) / 0.4) ** 2) for p in poses]
-    plane = along_sweep_plane(poses, FINE, lateral_mm=9.0, pixel_mm=0.1)
+    plane = plane_along(poses, lateral_line(FINE, 9.0), 0.1)
     cut = reslice_frames(sheet, FINE, poses, plane, 1.5)  # 3 degrees of shake open gaps of a millimetre
     miss_mm = pixel_points(plane) @ normal - offset_mm
     full = np.isnan(cut).mean(axis=0) < 0.3
@@ -97,14 +103,17 @@ def test_sphere_has_its_centre_and_diameter():
     ball = [
         (np.linalg.norm(image_points(FINE, p) - centre, axis=-1) < radius).astype(np.float32) for p in poses
     ]
-    plane = along_sweep_plane(poses, FINE, lateral_mm=9.0, pixel_mm=0.1)
+    axes = Rotation.from_matrix(np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]).T)
+    first, last = poses.translation[[0, -1], 2]
+    plane = ReslicePlane(
+        RigidTransform.from_components([9.0, 2.0, first], axes), last - first, FINE.depth_mm - 2.0, 0.1
+    )
     inside = np.nan_to_num(reslice_frames(ball, FINE, poses, plane, 0.6)) > 0.5
     points = pixel_points(plane)[inside]
-    off_plane_mm = (centre - points[0]) @ plane.world_from_plane.rotation.apply([0.0, 0.0, 1.0])
     diameter_mm = 2 * np.sqrt(inside.sum() * 0.1**2 / np.pi)
     # A tenth of the 0.3 mm vector pitch for the centre of mass; half the pitch for the threshold's edge.
     np.testing.assert_allclose(points.mean(axis=0)[1:], centre[1:], atol=0.03)
-    assert diameter_mm == pytest.approx(2 * np.sqrt(radius**2 - off_plane_mm**2), abs=0.15)
+    assert diameter_mm == pytest.approx(2 * radius, abs=0.15)
 
 
 def test_linear_scene_is_reproduced_between_parallel_frames():
@@ -123,7 +132,7 @@ def test_linear_scene_is_reproduced_between_parallel_frames():
 def test_order_of_frames_does_not_matter():
     rng = np.random.default_rng(11)
     poses, images = shaky_sweep(rng, 9, 0.4), rng.normal(size=(9, 9, 14)).astype(np.float32)
-    plane = along_sweep_plane(poses, GRID, 2.0)
+    plane = plane_along(poses, lateral_line(GRID, 2.0))
     order = rng.permutation(9)
     there = reslice_frames(images, GRID, poses, plane, 0.5)
     np.testing.assert_array_equal(reslice_frames(images[order], GRID, poses[order], plane, 0.5), there)
@@ -172,7 +181,7 @@ def test_sweep_planes_cover_the_sweep_and_keep_its_length(back_and_forth):
     turned = Rotation.from_euler("ZYX", [0.4, -0.7, 1.0])
     world = RigidTransform.from_components([30.0, -5.0, 12.0], turned)
     poses = world * RigidTransform.from_translation(np.outer(z, [0, 0, 1]))
-    side, top = along_sweep_plane(poses, GRID, 1.5), surface_plane(poses, GRID, 2.0)
+    side, top = plane_along(poses, lateral_line(GRID, 1.5)), plane_along(poses, depth_line(GRID, 2.0))
     assert (side.width_mm, side.height_mm) == pytest.approx((20.0, GRID.depth_mm - 0.7))
     assert (top.width_mm, top.height_mm) == pytest.approx((20.0, GRID.width_mm))
     axes = (world.inv() * side.world_from_plane).rotation.as_matrix()
@@ -181,17 +190,17 @@ def test_sweep_planes_cover_the_sweep_and_keep_its_length(back_and_forth):
     np.testing.assert_allclose(origin, [0.0, 2.0, 0.0], atol=1e-12)
 
 
-def test_surface_plane_is_at_its_depth():
+def test_plane_at_a_depth_is_there():
     poses = shaky_sweep(np.random.default_rng(5), 40, 0.3, shake_mm=0.0, shake_deg=0.0)
     images = [np.broadcast_to(0.7 + 0.3 * np.arange(14), (9, 14)) for _ in range(40)]
-    cut = reslice_frames(images, GRID, poses, surface_plane(poses, GRID, 2.35), 0.6)
+    cut = reslice_frames(images, GRID, poses, plane_along(poses, depth_line(GRID, 2.35)), 0.6)
     np.testing.assert_allclose(cut[~np.isnan(cut)], 2.35, atol=1e-5)
     assert np.isnan(cut).mean() < 0.05
 
 
 def test_travel_follows_a_probe_that_drifts_sideways():
     poses = RigidTransform.from_translation(np.outer(np.arange(20.0), [0.3, 0.0, 1.0]))
-    side = along_sweep_plane(poses, GRID, 1.0)
+    side = plane_along(poses, lateral_line(GRID, 1.0))
     np.testing.assert_allclose(side.world_from_plane.apply([0, 0, 0]), [1.0, 0.7, 0.0], atol=1e-9)
     assert side.width_mm == pytest.approx(19 * np.hypot(1.0, 0.3))
 
@@ -212,7 +221,7 @@ def test_wrong_inputs_say_what_was_expected():
     with pytest.raises(InvalidInputError, match="100000000"):
         ReslicePlane(RigidTransform.identity(), 1e4, 1e4, 0.01)
     with pytest.raises(InvalidInputError, match=r"lateral_mm.* 0 to 4"):
-        along_sweep_plane(one, GRID, 4.5)
+        plane_along(one, lateral_line(GRID, 4.5))
     opposed = RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [0, np.pi, 0]]))
     with pytest.raises(InsufficientDataError, match="elevational"):
-        along_sweep_plane(opposed, GRID, 1.0)
+        plane_along(opposed, lateral_line(GRID, 1.0))
