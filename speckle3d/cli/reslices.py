@@ -16,7 +16,7 @@ from speckle3d.core.errors import InvalidInputError
 if TYPE_CHECKING:
     from speckle3d.core.arrays import ByteArray, FloatArray
     from speckle3d.core.volume import Volume
-    from speckle3d.study.reslices.cuts import CutPicture
+    from speckle3d.study.reslices.cuts import CutPicture, OpenedModes
     from speckle3d.study.reslices.places import Place
 
 Triple = tuple[float, float, float]
@@ -112,8 +112,8 @@ def reslice(
         reach_mm=reach_mm,
     )
 
-    def located(mode: str | None) -> Place:
-        return place if curve is None else replace(place, curve_mm=_curve(curve, on, mode))
+    def located(opened: OpenedModes | None) -> Place:
+        return place if curve is None else replace(place, curve_mm=_curve(curve, on, opened))
 
     modes = tuple(mode or ())
     if outlines:
@@ -130,12 +130,13 @@ def reslice(
 def _cut_sweep(
     source: Path,
     out: Path,
-    located: Callable[[str | None], Place],
+    located: Callable[[OpenedModes | None], Place],
     compared: tuple[tuple[str, ...], str | None],
     made: tuple[Path | None, Path | None],
     sweep_file: Path | None,
     dynamic_range_db: float,
 ) -> None:
+    from speckle3d.study.posed import require_made_at
     from speckle3d.study.reslices.cuts import cut_posed, open_modes
 
     volume, state = made
@@ -146,7 +147,9 @@ def _cut_sweep(
     opened = open_modes(source, modes, reference, sweep_file)
     if volume is not None and len(opened.poses) > 1:
         raise InvalidInputError(f"--mode: expected one beside --volume, got {', '.join(opened.poses)}")
-    place = located(opened.reference)
+    if voxels is not None:
+        require_made_at(voxels[0], opened.poses[opened.reference], str(volume))
+    place = located(opened)
     with progress_bar(f"reslicing {out.name}") as progress:
         picture = cut_posed(opened, place, dynamic_range_db, voxels, progress)
     _write(picture, out)
@@ -239,12 +242,15 @@ def _points(text: str | None) -> FloatArray | None:
     return None if text is None else parse_places(text.split(), option="--points")
 
 
-def _curve(path: Path, picture: Path | None, mode: str | None) -> FloatArray:
-    """Points of a curve in the world, read as such or as points of a picture of the mode."""
+def _curve(path: Path, picture: Path | None, opened: OpenedModes | None) -> FloatArray:
+    """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
     from speckle3d.io.picks import PICTURE, WORLD, read_places
-    from speckle3d.study.reslices.cut_geometry import read_plane
+    from speckle3d.study.reslices.cut_geometry import read_plane, require_same_poses
 
     if picture is None:
         return read_places(path, WORLD)
     x, y = read_places(path, PICTURE).T
-    return read_plane(picture, mode).cut.world_from_mm(x, y)
+    shown = read_plane(picture, None if opened is None else opened.reference)
+    if opened is not None:
+        require_same_poses(shown, opened.poses[opened.reference], str(picture), opened.posed.frames)
+    return shown.cut.world_from_mm(x, y)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from speckle3d.core.pose_errors import PosedErrors
     from speckle3d.core.surface import Surface
     from speckle3d.core.sweep import ImageGrid
+    from speckle3d.core.volume import Volume
 
 
 @app.command()
@@ -76,7 +77,7 @@ def surface(
     made_at = volume.fields.get("poses", mode or "image")
     if mode is not None and mode != made_at:
         raise InvalidInputError(f"--mode: expected {made_at}, at whose poses VOLUME was made, got {mode}")
-    errors, grid = _errors(reconstruction, made_at)
+    errors, grid = _errors(reconstruction, made_at, volume, source)
     known = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
         found = {str(out): surface_of(volume, level, "below" if below else "above", known)}
@@ -97,13 +98,19 @@ def surface(
         emit("\n".join(_line(each) for each in told))
 
 
-def _errors(path: Path | None, mode: str) -> tuple[PosedErrors | None, ImageGrid | None]:
+def _errors(
+    path: Path | None, mode: str, volume: Volume, source: Path
+) -> tuple[PosedErrors | None, ImageGrid | None]:
+    """Errors of the poses that a volume was made at."""
     if path is None:
         return None, None
     from speckle3d.io.reconstructions import read_reconstruction
+    from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import posed_errors_of
+    from speckle3d.study.posed import require_made_at
 
     held = read_reconstruction(path, with_pairs=False)
+    require_made_at(volume, poses_of(held, mode), str(source))
     return posed_errors_of(held, mode), held.grid
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
@@ -122,6 +124,25 @@ class PosedSweep:
                 "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
                 "screen), or take levels stored"
             )
+
+
+MARK = "poses_mark"
+"""Field of a volume's file that says which poses it was made at, by `pose_mark`."""
+
+
+def pose_mark(world_from_image: RigidTransform) -> str:
+    """Mark of poses, the same for the same ones to a millionth of a millimetre."""
+    rounded = np.round(world_from_image.as_matrix(), 6) + 0.0  # no negative zeros
+    return sha256(np.ascontiguousarray(rounded).tobytes()).hexdigest()[:16]
+
+
+def require_made_at(volume: Volume, world_from_image: RigidTransform, where: str) -> None:
+    """Raise `MismatchError` if a volume's file says that it was made at other poses."""
+    if volume.fields.get(MARK, pose_mark(world_from_image)) != pose_mark(world_from_image):
+        raise MismatchError(
+            f"{where}: expected a volume made at these poses, got one of another reconstruction or "
+            "recording: make it again (speckle3d volume)"
+        )
 
 
 def open_posed(

@@ -9,13 +9,14 @@ from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import BModeSettings
+from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import grey_images, usual_levels
-from speckle3d.study.posed import open_posed, posed_by_itself
+from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_by_itself, require_made_at
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
 LEANING = PIXELS.copy()
@@ -132,3 +133,14 @@ def test_a_calibration_of_ours_takes_the_place_of_all_of_it(tmp_path):
     given = ImportSettings(column_pitch_mm=0.3)
     kept = open_posed(tmp_path / "a.mha", settings=given, calibrations=[tmp_path / "c.h5"])
     assert (kept.sweep.grid.vector_pitch_mm, kept.sweep.grid.sample_spacing_mm) == (0.3, 0.21)
+
+
+def test_a_volume_made_at_other_poses_is_told_apart():
+    poses = RigidTransform.from_translation(np.arange(9.0).reshape(3, 3))
+    place = (0.5, 0.5, 0.5), RigidTransform.identity()
+    made = Volume(np.zeros((2, 2, 2), np.uint8), *place, {MARK: pose_mark(poses)})
+    require_made_at(made, poses, "v.nrrd")
+    require_made_at(Volume(np.zeros((2, 2, 2), np.uint8), *place), poses, "of an older file")
+    moved = RigidTransform.from_translation([0.0, 0.0, 0.01]) * poses
+    with pytest.raises(MismatchError, match=r"v\.nrrd: expected a volume made at these poses"):
+        require_made_at(made, moved, "v.nrrd")

@@ -75,11 +75,21 @@ def anchors_of(world_from_image: RigidTransform, numbers: IntArray | None = None
     return {int(k if numbers is None else numbers[k]): world_from_image[k].as_matrix() for k in at}
 
 
-def require_same_poses(shown: PicturedCut, world_from_image: RigidTransform, where: str) -> None:
-    """Raise `InvalidInputError` if a picture was cut at other poses than these, of all frames."""
+def require_same_poses(
+    shown: PicturedCut, world_from_image: RigidTransform, where: str, numbers: IntArray | None = None
+) -> None:
+    """Raise `InvalidInputError` if a picture was cut at other poses than these.
+
+    Parameters
+    ----------
+    numbers : ndarray of int, shape (n,), optional
+        Of the frames, in ascending order; by default they count from 0.
+    """
+    frames = np.arange(len(world_from_image)) if numbers is None else numbers
     for number, pose in shown.anchors.items():
-        known = 0 <= number < len(world_from_image)
-        if not (known and np.abs(world_from_image[number].as_matrix() - pose).max() <= _SAME_POSE):
+        at = np.flatnonzero(frames == number)
+        known = at.size == 1
+        if not (known and np.abs(world_from_image[int(at[0])].as_matrix() - pose).max() <= _SAME_POSE):
             raise InvalidInputError(
                 f"{where}: expected a picture of these poses of mode {shown.mode!r}, got one of another "
                 f"reconstruction, whose frame {number} lies elsewhere: cut this one again (speckle3d reslice)"

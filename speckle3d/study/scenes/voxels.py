@@ -29,7 +29,7 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.volume_writer import VolumeWriter
 from speckle3d.io.volumes import read_volume
 from speckle3d.study.pose_errors import posed_errors_of
-from speckle3d.study.posed import PosedSweep
+from speckle3d.study.posed import MARK, PosedSweep, pose_mark
 
 BEST_FIRST = ("fused", "crossed", "pose", "inertial", "orientation", "image")
 """Modes in the order in which a volume takes its poses: those that set the length first."""
@@ -300,6 +300,7 @@ def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[s
     return {
         "levels": meaning,
         "poses": posed.mode,
+        MARK: pose_mark(posed.world_from_image),
         **_method(settings),
         "recording": posed.sweep.name,
         "made_by": f"speckle3d {version('speckle3d')}",
