@@ -22,6 +22,7 @@ from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.reconstructions import FORMAT
+from speckle3d.matching.quality import describe
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
 from speckle3d.study.images import grey_images, open_reconstruction, usual_levels
@@ -109,12 +110,14 @@ class PosedSweep:
         return 0.0 if tracker is None or self.mode != "tracker" else tracker.image_skew_rad
 
     def notes(self) -> list[str]:
-        """Tell which frames are left out."""
+        """Tell which frames are left out, and which have poses that are guesses."""
         without = len(self.sweep) - len(self.frames)
-        if not without:
-            return []
+        trust = None if self.reconstruction is None else self.reconstruction.trust
+        flagged = [] if trust is None else describe(trust.flags)
+        left_out = f"{without} of {len(self.sweep)} frames have no valid pose and are left out"
         return [
-            f"{self.sweep.name}: {without} of {len(self.sweep)} frames have no valid pose and are left out"
+            *([f"{self.sweep.name}: {left_out}"] if without else []),
+            *(f"{line}: poses there are guesses" for line in flagged),
         ]
 
     def _require_range(self, levels: Levels) -> None:

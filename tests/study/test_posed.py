@@ -10,11 +10,13 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.matching.quality import FrameFlag
 from speckle3d.study.images import grey_images, usual_levels
 from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_by_itself, require_made_at
 
@@ -144,3 +146,18 @@ def test_a_volume_made_at_other_poses_is_told_apart():
     moved = RigidTransform.from_translation([0.0, 0.0, 0.01]) * poses
     with pytest.raises(MismatchError, match=r"v\.nrrd: expected a volume made at these poses"):
         require_made_at(made, moved, "v.nrrd")
+
+
+def test_frames_whose_poses_are_guesses_are_told(tmp_path):
+    posed = open_posed(sequence(tmp_path))
+    n = len(posed.sweep)
+    flags = np.zeros(n, dtype=int)
+    flags[2] = FrameFlag.LIFTED
+    trust = Trust(np.zeros((n, 6, 6)), flags)
+    still = {"image": RigidTransform.identity(n)}
+    made = Reconstruction(
+        posed.sweep.frame_time_s, posed.sweep.grid, still, Provenance("a.mha", "", ""), trust=trust
+    )
+    assert posed.notes() == []
+    told = replace(posed, reconstruction=made).notes()
+    assert told == ["1 frame with the probe lifted: 2: poses there are guesses"]
