@@ -20,10 +20,10 @@ from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.points import PickedPoints, write_points
-from speckle3d.io.polylines import write_polylines
 from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.shapes.polylines import write_polylines
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
-from speckle3d.io.volumes import write_volume
+from speckle3d.io.voxels.volumes import write_volume
 from speckle3d.report.figures import save_both
 from speckle3d.study.figures import new_figure, save_figure
 from speckle3d.study.results import write_texts

@@ -52,8 +52,8 @@ def measure(
     Standard errors are those of the poses of the frames on either side of each point, jointly, and of the
     picking.
     """
-    from speckle3d.io.picks import PICTURE, WORLD, parse_places, read_places
     from speckle3d.io.reconstructions import read_reconstruction
+    from speckle3d.io.shapes.picks import PICTURE, WORLD, parse_places, read_places
     from speckle3d.study.pose_errors import PICKED
     from speckle3d.study.pose_errors import measure as measure_points
 

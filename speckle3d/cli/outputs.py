@@ -105,7 +105,7 @@ def _is_log(path: Path) -> bool:
 
 
 def _is_volume(path: Path) -> bool:
-    from speckle3d.io.volumes import may_be_volume
+    from speckle3d.io.voxels.volumes import may_be_volume
 
     return may_be_volume(path)
 

@@ -87,7 +87,7 @@ def reconstruct(
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
-    from speckle3d.io.volume_writer import require_suffix
+    from speckle3d.io.voxels.volume_writer import require_suffix
     from speckle3d.study.job import run_job
 
     settings = load_settings(config_file).with_choices(

@@ -86,8 +86,8 @@ def reslice(
     dynamic_range_db: DynamicRange = 60.0,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
-    from speckle3d.io.volume_writer import SUFFIXES
-    from speckle3d.io.volumes import may_be_volume
+    from speckle3d.io.voxels.volume_writer import SUFFIXES
+    from speckle3d.io.voxels.volumes import may_be_volume
     from speckle3d.study.reslices.places import Place
 
     as_volume = out.name.lower().endswith(SUFFIXES)
@@ -176,7 +176,7 @@ def _cut_volume(source: Path, state: Path | None, out: Path, place: Place) -> No
 
 def _voxels(path: Path, state: Path | None) -> tuple[Volume, ByteArray | None]:
     """Read a volume and, if there is a file of them, the states of its voxels."""
-    from speckle3d.io.volumes import read_states, read_volume
+    from speckle3d.io.voxels.volumes import read_states, read_volume
 
     volume = read_volume(path)
     return volume, None if state is None else read_states(state, volume)
@@ -184,8 +184,8 @@ def _voxels(path: Path, state: Path | None) -> tuple[Volume, ByteArray | None]:
 
 def _write(picture: CutPicture, out: Path) -> None:
     """Write a cut as a volume of one plane if the name says so, else as a picture."""
-    from speckle3d.io.volume_writer import SUFFIXES
-    from speckle3d.io.volumes import write_volume
+    from speckle3d.io.voxels.volume_writer import SUFFIXES
+    from speckle3d.io.voxels.volumes import write_volume
     from speckle3d.study.reslices.cuts import cut_as_volume
     from speckle3d.study.reslices.reslice_figures import save_reslices
 
@@ -237,14 +237,14 @@ def _vector(values: Triple | None) -> FloatArray | None:
 
 
 def _points(text: str | None) -> FloatArray | None:
-    from speckle3d.io.picks import parse_places
+    from speckle3d.io.shapes.picks import parse_places
 
     return None if text is None else parse_places(text.split(), option="--points")
 
 
 def _curve(path: Path, picture: Path | None, opened: OpenedModes | None) -> FloatArray:
     """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
-    from speckle3d.io.picks import PICTURE, WORLD, read_places
+    from speckle3d.io.shapes.picks import PICTURE, WORLD, read_places
     from speckle3d.study.reslices.cut_geometry import read_plane, require_same_poses
 
     if picture is None:

@@ -61,8 +61,8 @@ def surface(
     """
     from speckle3d.core.labels import EMPTY
     from speckle3d.imaging.measures.surface import largest_part, smoothed, surface_of, surfaces_of_labels
-    from speckle3d.io.surfaces import require_suffix, write_surface
-    from speckle3d.io.volumes import read_states, read_volume
+    from speckle3d.io.shapes.surfaces import require_suffix, write_surface
+    from speckle3d.io.voxels.volumes import read_states, read_volume
 
     if labels == (level is not None):
         raise InvalidInputError("expected --level or --labels, one of them")

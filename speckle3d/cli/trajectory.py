@@ -56,7 +56,7 @@ def export(
 
     Transforms are as 3D Slicer reads them: axes lead left, posterior and superior, mm.
     """
-    from speckle3d.io.transforms import SUFFIXES
+    from speckle3d.io.shapes.transforms import SUFFIXES
     from speckle3d.io.tum import write_tum
     from speckle3d.scoring.trajectories import load_reconstructed
 
@@ -72,7 +72,7 @@ def export(
 
 
 def _export_transforms(reconstruction_file: Path, out: Path, mode: str, frame: str | None) -> None:
-    from speckle3d.io.transforms import transform_paths, write_transform, write_transforms
+    from speckle3d.io.shapes.transforms import transform_paths, write_transform, write_transforms
     from speckle3d.scoring.trajectories import load_reconstructed
 
     if frame is None:

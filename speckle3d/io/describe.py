@@ -27,7 +27,7 @@ from speckle3d.io.import_settings import settings_for
 from speckle3d.io.load import kind_of, read_by
 from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.volumes import is_volume, read_volume
+from speckle3d.io.voxels.volumes import is_volume, read_volume
 
 _UNIT_NAMES = {"mm": "mm", "hz": "Hz", "db": "dB", "m_s": "m/s"}
 

@@ -9,7 +9,7 @@ import SimpleITK
 
 from speckle3d.io.headers import read_header
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.volumes import read_volume
+from speckle3d.io.voxels.volumes import read_volume
 
 DEVIATION_AND_STATE = (("deviation", ".nrrd"), ("state", ".seg.nrrd"))
 

@@ -12,8 +12,8 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.io.surfaces import read_surface
-from speckle3d.io.volumes import write_volume
+from speckle3d.io.shapes.surfaces import read_surface
+from speckle3d.io.voxels.volumes import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
 from speckle3d.study.reslices.cut_geometry import anchors_of, save_cuts
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from image_examples import text_of, write_mha
 
-from speckle3d.io.volumes import read_volume
+from speckle3d.io.voxels.volumes import read_volume
 
 PIXELS = np.array([[0.5, 0.045, 0, 1], [0.0, 0.5, 0, 2], [0, 0, 0.5, 3], [0, 0, 0, 1]])
 """Axes off square by 5.1 degrees."""

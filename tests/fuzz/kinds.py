@@ -22,10 +22,10 @@ from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.io.surfaces import write_surface
+from speckle3d.io.shapes.surfaces import write_surface
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.tum import write_tum
-from speckle3d.io.volumes import write_volume
+from speckle3d.io.voxels.volumes import write_volume
 
 XML = """<PlusConfiguration version="2.1"><CoordinateDefinitions>
 <Transform From="Phantom" To="Reference" Matrix="0 -1 0 10  1 0 0 20  0 0 1 30  0 0 0 1" />
@@ -371,13 +371,13 @@ def kinds():
     from speckle3d.config import load_config
     from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.curves import read_curves
-    from speckle3d.io.picks import read_places
     from speckle3d.io.plus_config import read_wire_phantom
     from speckle3d.io.points import read_points
     from speckle3d.io.reconstructions import read_reconstruction
-    from speckle3d.io.surfaces import read_surface
+    from speckle3d.io.shapes.picks import read_places
+    from speckle3d.io.shapes.surfaces import read_surface
     from speckle3d.io.tum import read_tum
-    from speckle3d.io.volumes import read_volume
+    from speckle3d.io.voxels.volumes import read_volume
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 

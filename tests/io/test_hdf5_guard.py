@@ -299,7 +299,7 @@ def test_what_is_no_file_is_refused_at_once_by_every_reader(tmp_path, name):
     from speckle3d.io.plus_config import read_wire_phantom
     from speckle3d.io.points import read_points
     from speckle3d.io.tum import read_tum
-    from speckle3d.io.volumes import read_volume
+    from speckle3d.io.voxels.volumes import read_volume
     from xsens.logs.read import read_log
 
     os.mkfifo(tmp_path / "pipe")

@@ -14,7 +14,7 @@ from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
 from speckle3d.io.pixels import read_pixels
-from speckle3d.io.volumes import read_volume
+from speckle3d.io.voxels.volumes import read_volume
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 

@@ -14,8 +14,8 @@ from speckle3d.core.labels import STATE_SEGMENTS
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
-from speckle3d.io.polylines import write_polylines
-from speckle3d.io.transforms import write_transform
+from speckle3d.io.shapes.polylines import write_polylines
+from speckle3d.io.shapes.transforms import write_transform
 from speckle3d.scoring.references import REFERENCES
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scenes.mrml import COLOURED, Scene

@@ -26,8 +26,8 @@ from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, grid_as_asked, grid_l
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.slabs import compound_slabs
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.volume_writer import VolumeWriter
-from speckle3d.io.volumes import read_volume
+from speckle3d.io.voxels.volume_writer import VolumeWriter
+from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.pose_errors import posed_errors_of
 from speckle3d.study.posed import MARK, PosedSweep, pose_mark
 
@@ -115,7 +115,7 @@ class VolumeRequest:
     Attributes
     ----------
     path : path
-        With a suffix of `speckle3d.io.volume_writer.SUFFIXES`.
+        With a suffix of `speckle3d.io.voxels.volume_writer.SUFFIXES`.
     settings : CompoundingSettings
     grid : GridRequest
     region : Region, optional

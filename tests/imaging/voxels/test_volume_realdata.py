@@ -24,7 +24,7 @@ from speckle3d.imaging.voxels.splatting import Placed
 from speckle3d.imaging.voxels.volume import compound
 from speckle3d.imaging.voxels.whole_levels import splat_block_whole
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.volumes import read_volume
+from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.posed import open_posed
 
 pytestmark = pytest.mark.realdata

@@ -120,6 +120,7 @@ def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
     np.testing.assert_allclose(inside, [1.0, 2.0, 0.0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_outlines_are_lines_through_the_corners(folder):
     pytest.importorskip("vtkmodules")
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -162,6 +163,7 @@ def test_images_move_through_the_volume(folder):
     assert poses.frames[5]["ImageToWorldTransform"] == header["Seq_Frame0005_ImageToWorldTransform"]
 
 
+@pytest.mark.slow
 def test_the_extension_of_slicer_finds_the_images_by_vtk(tmp_path):
     """SlicerIGSIO reads pixels of .seq.mha by VTK's reader, and transforms from the text before them."""
     readers = pytest.importorskip("vtkmodules.vtkIOImage")

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from sweep_examples import poses
 
 from speckle3d.core.errors import InvalidInputError, NoSpaceError
-from speckle3d.io.transforms import SUFFIXES, transform_paths, write_transform, write_transforms
+from speckle3d.io.shapes.transforms import SUFFIXES, transform_paths, write_transform, write_transforms
 
 POINTS = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [3.0, -20.0, 7.0]])
 

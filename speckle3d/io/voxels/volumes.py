@@ -20,12 +20,12 @@ from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
-from speckle3d.io.nifti import GZIP_SIGNATURE, NiftiImage, is_nifti, read_nifti
 from speckle3d.io.pixels import read_pixels
-from speckle3d.io.segments import is_segmentation, read_segments
 from speckle3d.io.text import numbers
-from speckle3d.io.volume_headers import own_fields
-from speckle3d.io.volume_writer import VolumeWriter
+from speckle3d.io.voxels.nifti import GZIP_SIGNATURE, NiftiImage, is_nifti, read_nifti
+from speckle3d.io.voxels.segments import is_segmentation, read_segments
+from speckle3d.io.voxels.volume_headers import own_fields
+from speckle3d.io.voxels.volume_writer import VolumeWriter
 
 _SNIFFED_BYTES = 4096
 

@@ -21,9 +21,9 @@ from speckle3d.core.threads import ahead, cores
 from speckle3d.io.deflate import LAST_BLOCK, ZLIB_START, packed_run
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.header_text import put_packed_size
-from speckle3d.io.nifti import nifti_header
-from speckle3d.io.segments import segment_fields
-from speckle3d.io.volume_headers import VolumeHeader, meta_header, nrrd_header
+from speckle3d.io.voxels.nifti import nifti_header
+from speckle3d.io.voxels.segments import segment_fields
+from speckle3d.io.voxels.volume_headers import VolumeHeader, meta_header, nrrd_header
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
 """Of files that are written; .seg.nrrd is one of them, for labels alone."""
@@ -73,7 +73,7 @@ class VolumeWriter:
     Examples
     --------
     >>> import tempfile
-    >>> from speckle3d.io.volumes import read_volume
+    >>> from speckle3d.io.voxels.volumes import read_volume
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = f"{folder}/v.nrrd"
     ...     with VolumeWriter(file, (4, 3, 2), (1, 1, 1), RigidTransform.identity(), "uint8") as writer:

@@ -31,7 +31,7 @@ from speckle3d.core.files import open_regular
 from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import one_line, reading
 from speckle3d.io.pixels import Pixels, read_pixels
-from speckle3d.io.volume_headers import VolumeHeader
+from speckle3d.io.voxels.volume_headers import VolumeHeader
 
 GZIP_SIGNATURE = b"\x1f\x8b"
 _HEADER_BYTES = 348

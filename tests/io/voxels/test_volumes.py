@@ -7,8 +7,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.volume import Volume
-from speckle3d.io.volume_writer import SUFFIXES, VolumeWriter
-from speckle3d.io.volumes import read_volume, write_volume
+from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
+from speckle3d.io.voxels.volumes import read_volume, write_volume
 
 
 def example(dtype=np.uint8, seed=0):

@@ -11,7 +11,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.surfaces import SPACE
+from speckle3d.io.shapes.surfaces import SPACE
 
 
 def write_polylines(

@@ -19,8 +19,8 @@ from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io import deflate, volume_writer
 from speckle3d.io.describe import describe
-from speckle3d.io.volume_writer import SUFFIXES, VolumeWriter
-from speckle3d.io.volumes import read_volume, write_volume
+from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
+from speckle3d.io.voxels.volumes import read_volume, write_volume
 
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 # NIfTI keeps its matrix in single precision: 6e-8 of places up to 300 mm, and of 5 voxels of a few mm.
@@ -91,6 +91,7 @@ def test_a_voxel_is_at_the_same_place_in_everybodys_reader(
     np.testing.assert_array_equal(back.voxels, volume.voxels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize(
     ("suffix", "reader"),

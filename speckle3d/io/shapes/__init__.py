@@ -1,0 +1,1 @@
+"""What is placed in space as files: surfaces, lines, transforms, picked points."""

@@ -1,0 +1,1 @@
+"""Volumes as files: NRRD, MetaImage and NIfTI, written plane by plane; labels."""
