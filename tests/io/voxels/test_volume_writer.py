@@ -17,8 +17,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
-from speckle3d.io import deflate, volume_writer
+from speckle3d.io import deflate
 from speckle3d.io.describe import describe
+from speckle3d.io.voxels import volume_writer
 from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
 from speckle3d.io.voxels.volumes import read_volume, write_volume
 
