@@ -184,9 +184,12 @@ def convert(
     from speckle3d.io.load import import_notes, load_sweep
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
+    from speckle3d.io.voxels.volume_writer import LABELS_ALONE
 
     options = locals()
     suffix = out.suffix.lower()
+    if out.name.lower().endswith(LABELS_ALONE):
+        raise InvalidInputError(f"{out}: {LABELS_ALONE} is of labels: take a name ending in .seq.nrrd")
     if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
         known = ", ".join((".h5", ".hdf5", *SUFFIXES))
         raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")

@@ -85,6 +85,7 @@ def test_options_reach_the_sweep(done, tmp_path):
 
 
 def test_places_that_are_taken_are_refused(refused, done, sequence, tmp_path):
+    assert ".seg.nrrd is of labels" in refused("convert", sequence, tmp_path / "s.seg.nrrd")
     assert "is an input" in refused("convert", sequence, sequence, *PIXELS)
     (tmp_path / "x.mha").write_bytes(b"something else")
     assert "another kind of file" in refused("convert", sequence, tmp_path / "x.mha", *PIXELS)
