@@ -87,7 +87,6 @@ Modes = Annotated[list[str] | None, typer.Option("--mode", help=f"{_MODE_HELP} M
 SweepFile = Annotated[
     Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
 ]
-DynamicRange = Annotated[float, typer.Option(help="Range of the log-compressed grey levels.")]
 
 
 @contextmanager

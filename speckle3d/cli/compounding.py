@@ -13,6 +13,7 @@ from speckle3d.cli.importing import given_settings
 
 if TYPE_CHECKING:
     from speckle3d.imaging.voxels.settings import CompoundingSettings
+    from speckle3d.io.import_settings import ImportSettings
     from speckle3d.study.posed import PosedSweep
 
 VoxelMm = Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")]
@@ -54,11 +55,17 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, options: Mapping[st
     """
     from speckle3d.study.posed import open_posed
 
-    # The range is that of the volume's levels, and of B-mode that says none of its own.
-    range_db = options["dynamic_range_db"]
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    others = options["sweep_file"], imported, options["calibration"] or (), range_db
+    others = said_of(source, options)
     opened = [open_posed(source, mode, *others) for mode in modes]
     for line in opened[0].notes():
         note(line)
     return opened
+
+
+def said_of(
+    source: Path, options: Mapping[str, Any]
+) -> tuple[Path | None, ImportSettings, Sequence[Path], float | None]:
+    """What options say of a sweep, as `open_posed` takes it: file, settings, calibrations, range in dB."""
+    # The range is that of the levels that are made, and of B-mode that says none of its own.
+    imported = given_settings(source, {**options, "dynamic_range_db": None})
+    return options["sweep_file"], imported, options["calibration"] or (), options["dynamic_range_db"]

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import DynamicRange, PosedFile, SweepFile, app, progress_bar
+from speckle3d.cli.common import CalibrationFiles, PosedFile, SweepFile, Transform, app, note, progress_bar
+from speckle3d.cli.compounding import LevelRange, said_of
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+)
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -21,8 +29,14 @@ if TYPE_CHECKING:
 
 Triple = tuple[float, float, float]
 
+_OF_SWEEPS = (
+    "calibration", "plus_config", "transform", "reference_transform", "column_pitch_mm", "row_spacing_mm",
+    "frame_rate_hz",
+)  # fmt: skip
+"""Options that say what a recording does not say itself."""
 
-@app.command()
+
+@app.command(cls=Importing)
 def reslice(
     source: PosedFile,
     out: Annotated[
@@ -83,15 +97,26 @@ def reslice(
     pixel_mm: Annotated[float, typer.Option(help="Side of a pixel.")] = 0.2,
     reach_mm: Annotated[float, typer.Option(help="Frames farther from a pixel do not count.")] = 0.5,
     sweep_file: SweepFile = None,
-    dynamic_range_db: DynamicRange = 60.0,
+    dynamic_range_db: LevelRange = None,
+    calibration: CalibrationFiles = None,
+    plus_config: PlusConfig = None,
+    transform: Transform = None,
+    reference_transform: ReferenceTransform = None,
+    column_pitch_mm: Number = None,
+    row_spacing_mm: Number = None,
+    frame_rate_hz: Number = None,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
     from speckle3d.io.voxels.volume_writer import SUFFIXES
     from speckle3d.io.voxels.volumes import may_be_volume
+    from speckle3d.study.posed import USUAL_RANGE_DB
+    from speckle3d.study.reslices.cuts import cut_posed
     from speckle3d.study.reslices.places import Place
 
+    options = locals()
     as_volume = out.name.lower().endswith(SUFFIXES)
-    require_own_place(out, "volume" if as_volume else "picture", source, sweep_file, curve, on, volume, state)
+    read = (source, sweep_file, curve, on, volume, state, *files_of(plus_config, calibration))
+    require_own_place(out, "volume" if as_volume else "picture", *read)
     _require_one_place(
         {"--lateral-mm": lateral_mm if frame is None else None, "--depth-mm": depth_mm, "--frame": frame,
          "--points": points, "--origin": origin, "--curve": curve}
@@ -117,42 +142,44 @@ def reslice(
 
     modes = tuple(mode or ())
     if outlines:
-        _draw_outlines(source, out, modes, difference_to, sweep_file)
+        _draw_outlines(out, _open(source, modes, difference_to, options))
     elif source.is_file() and may_be_volume(source):
-        _require_no_modes(modes, difference_to, volume)
+        others = {name: options[name] for name in (*_OF_SWEEPS, "difference_to", "volume", "sweep_file")}
+        _require_no_sweep({"mode": modes, **others})
         _cut_volume(source, state, out, located(None))
     else:
         _require_together({"--state": state, "--volume": volume})
-        compared, made = (modes, difference_to), (volume, state)
-        _cut_sweep(source, out, located, compared, made, sweep_file, dynamic_range_db)
+        voxels = None if volume is None else _voxels(volume, state)
+        if voxels is not None:
+            modes = _modes_of(voxels[0], modes)
+        opened = _open(source, modes, difference_to, options)
+        if voxels is not None:
+            _require_of_volume(opened, voxels[0], str(volume))
+        with progress_bar(f"reslicing {out.name}") as progress:
+            range_db = dynamic_range_db or USUAL_RANGE_DB
+            picture = cut_posed(opened, located(opened), range_db, voxels, progress)
+        _write(picture, out)
 
 
-def _cut_sweep(
-    source: Path,
-    out: Path,
-    located: Callable[[OpenedModes | None], Place],
-    compared: tuple[tuple[str, ...], str | None],
-    made: tuple[Path | None, Path | None],
-    sweep_file: Path | None,
-    dynamic_range_db: float,
-) -> None:
+def _open(
+    source: Path, modes: tuple[str, ...], reference: str | None, options: Mapping[str, Any]
+) -> OpenedModes:
+    """Open a sweep with what options say of it, and say on stderr which frames have no pose."""
+    from speckle3d.study.reslices.cuts import open_modes
+
+    opened = open_modes(source, modes, reference, *said_of(source, options))
+    for line in opened.posed.notes():
+        note(line)
+    return opened
+
+
+def _require_of_volume(opened: OpenedModes, volume: Volume, where: str) -> None:
+    """Refuse a volume beside several modes, or one made at other poses."""
     from speckle3d.study.posed import require_made_at
-    from speckle3d.study.reslices.cuts import cut_posed, open_modes
 
-    volume, state = made
-    voxels = None if volume is None else _voxels(volume, state)
-    modes, reference = compared
-    if voxels is not None:
-        modes = _modes_of(voxels[0], modes)
-    opened = open_modes(source, modes, reference, sweep_file)
-    if volume is not None and len(opened.poses) > 1:
+    if len(opened.poses) > 1:
         raise InvalidInputError(f"--mode: expected one beside --volume, got {', '.join(opened.poses)}")
-    if voxels is not None:
-        require_made_at(voxels[0], opened.poses[opened.reference], str(volume))
-    place = located(opened)
-    with progress_bar(f"reslicing {out.name}") as progress:
-        picture = cut_posed(opened, place, dynamic_range_db, voxels, progress)
-    _write(picture, out)
+    require_made_at(volume, opened.poses[opened.reference], where)
 
 
 def _modes_of(volume: Volume, modes: tuple[str, ...]) -> tuple[str, ...]:
@@ -195,16 +222,12 @@ def _write(picture: CutPicture, out: Path) -> None:
         save_reslices(picture, out)
 
 
-def _draw_outlines(
-    source: Path, out: Path, modes: tuple[str, ...], difference_to: str | None, sweep_file: Path | None
-) -> None:
+def _draw_outlines(out: Path, opened: OpenedModes) -> None:
     from speckle3d.imaging.cuts.outlines import frame_outlines
     from speckle3d.matching.intensity import IntensityExtractor
     from speckle3d.study.figures import save_figure
-    from speckle3d.study.reslices.cuts import open_modes
     from speckle3d.study.reslices.reslice_figures import figure_outlines
 
-    opened = open_modes(source, modes, difference_to, sweep_file)
     grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
     outlines = {mode: frame_outlines(grid, poses[0].inv() * poses) for mode, poses in opened.poses.items()}
     save_figure(figure_outlines(outlines, opened.posed.sweep.name), out)
@@ -224,10 +247,13 @@ def _require_together(*pairs: dict[str, object]) -> None:
             raise InvalidInputError(f"{name}: expected {other} with it, got none")
 
 
-def _require_no_modes(modes: tuple[str, ...], difference_to: str | None, volume: Path | None) -> None:
-    for name, value in (("--mode", modes), ("--difference-to", difference_to), ("--volume", volume)):
+def _require_no_sweep(given: dict[str, object]) -> None:
+    for name, value in given.items():
         if value:
-            raise InvalidInputError(f"{name}: expected a reconstruction or a recording with it, got a volume")
+            option = "--" + ("sweep" if name == "sweep_file" else name.replace("_", "-"))
+            raise InvalidInputError(
+                f"{option}: expected a reconstruction or a recording with it, got a volume"
+            )
 
 
 def _vector(values: Triple | None) -> FloatArray | None:

@@ -106,3 +106,20 @@ def test_whole_grey_levels_are_kept_of_bytes_as_stored_alone(run, refused, recor
     code, _, told = run(*command)
     assert code == 0, told
     assert read_volume(out).fields["rule"] == "plus"
+
+
+def test_a_cut_takes_the_same_options_and_shows_levels_where_decibels_are_not_known(run, recording, tmp_path):
+    path, pixels = recording
+    options = "--plus-config", tmp_path / "set.xml", "--frame", 2, "--pixel-mm", 0.5
+    code, _, told = run("reslice", path, *options, "-o", tmp_path / "c.nrrd")
+    assert code == 0, told
+    assert "1 of 6 frames have no valid pose" in told
+    cut = read_volume(tmp_path / "c.nrrd")
+    assert cut.fields["levels"].startswith("grey levels of the B-mode")
+    # As stored, but for one level that all frames are raised by; 0 where nothing was seen.
+    seen = cut.voxels[cut.voxels > 0].astype(float)
+    assert np.ptp(seen) == pytest.approx(np.ptp(pixels[2].astype(float)), abs=4)
+    other = tmp_path / "c.nrrd", "--plus-config", tmp_path / "set.xml", "-o", tmp_path / "d.png"
+    code, _, told = run("reslice", *other)
+    assert code == 2
+    assert "--plus-config: expected a reconstruction or a recording with it, got a volume" in told

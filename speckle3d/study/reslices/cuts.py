@@ -14,10 +14,12 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
 from speckle3d.scoring.references import REFERENCES, find_reference
@@ -118,13 +120,19 @@ class OpenedModes:
 
 
 def open_modes(
-    path: Path, modes: Sequence[str] = (), reference: str | None = None, sweep_file: Path | None = None
+    path: Path,
+    modes: Sequence[str] = (),
+    reference: str | None = None,
+    sweep_file: Path | None = None,
+    settings: ImportSettings | None = None,
+    calibrations: Sequence[PathLike] = (),
+    dynamic_range_db: float | None = None,
 ) -> OpenedModes:
     """Open a reconstruction at several modes, or a recording at its own poses.
 
     Parameters
     ----------
-    path : path
+    path, sweep_file, settings, calibrations, dynamic_range_db
         As for `open_posed`.
     modes : sequence of str
         Modes of the reconstruction, "tracker" or "truth"; by default as for `open_posed`.
@@ -139,7 +147,8 @@ def open_modes(
     """
     is_reconstruction = kind_of(path) == FORMAT
     own = [mode for mode in modes if mode not in REFERENCES or not is_reconstruction]
-    first = open_posed(path, own[0] if own else None, sweep_file)
+    others = sweep_file, settings, calibrations, dynamic_range_db
+    first = open_posed(path, own[0] if own else None, *others)
     asked = list(dict.fromkeys(modes)) or [first.mode]
     reference = reference or _known_reference(first.sweep, asked)
     every = {mode: _posed(first, mode) for mode in dict.fromkeys([*asked, reference])}
@@ -189,7 +198,10 @@ def cut_posed(
     if voxels is None:
         pairs = [(opened.poses[mode], cut) for mode, cut in placed.items()]
         levels = reslice_at(images, grid, pairs, place.reach_mm)
-        found = [((each / 255 - 1) * dynamic_range_db).astype(np.float32) for each in levels]
+        # B-mode that does not say its range stays in grey levels.
+        step_db = dynamic_range_db / 255 if opened.posed.range_is_known else 1.0
+        white = 255 if opened.posed.range_is_known else 0
+        found = [((each - white) * step_db).astype(np.float32) for each in levels]
     else:
         found = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
     there = opened.poses[opened.reference]
@@ -204,12 +216,13 @@ def cut_posed(
     }
     shown = placed[opened.reference]
     where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
-    unit = "dB" if voxels is None else _unit_of(voxels[0])
-    range_db = (-dynamic_range_db, 0.0) if voxels is None else None
+    unit, limits = _unit_of_images(opened.posed, dynamic_range_db)
+    shown_range = limits if voxels is None else None
+    unit = unit if voxels is None else _unit_of(voxels[0])
     reference = opened.reference if len(cuts) > 1 else None
     axes, name = place.axes(shown, there), opened.posed.sweep.name
     anchors = {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()}
-    return CutPicture(cuts, axes, where, unit, range_db, reference, name, numbers, anchors)
+    return CutPicture(cuts, axes, where, unit, shown_range, reference, name, numbers, anchors)
 
 
 def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
@@ -224,6 +237,11 @@ def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | 
     drawn = DrawnCut(reslice_volume(volume, cut, state), cut)
     names = ("i", "j") if place.is_along_sweep else ("in the cut", "in the cut")
     return CutPicture({"volume": drawn}, names, place.words(), _unit_of(volume), name=name)
+
+
+def _unit_of_images(posed: PosedSweep, dynamic_range_db: float) -> tuple[str, tuple[float, float]]:
+    """Unit of a sweep's images, and the values that are shown black and white."""
+    return ("dB", (-dynamic_range_db, 0.0)) if posed.range_is_known else ("level", (0.0, 255.0))
 
 
 def _unit_of(volume: Volume) -> str:
@@ -254,6 +272,7 @@ def cut_as_volume(picture: CutPicture) -> Volume:
         # From 1 up, so that 0 means nothing was seen.
         level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
         voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
-        fields["levels"] = f"log-compressed, {high - low:g} dB from 1 to 255; 0 where nothing was seen"
+        what = f"log-compressed, {high - low:g} dB" if picture.unit == "dB" else "grey levels of the B-mode"
+        fields["levels"] = f"{what} from 1 to 255; 0 where nothing was seen"
     step = drawn.cut.pixel_mm
     return Volume(voxels[None].T, (step, step, step), drawn.cut.world_from_plane, fields)
