@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, ReconstructionFile, app, emit, emit_json
+from speckle3d.cli.common import Json, ReconstructionFile, app, emit, emit_json, note
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def measure(
     """
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.io.shapes.picks import PICTURE, WORLD, parse_places, read_places
-    from speckle3d.study.pose_errors import PICKED
+    from speckle3d.study.pose_errors import PICKED, caution
     from speckle3d.study.pose_errors import measure as measure_points
 
     columns = WORLD if on is None else PICTURE
@@ -75,6 +75,8 @@ def measure(
         emit_json({"mode": mode or "image", "pick_mm": picked, "measurements": rows})
     else:
         emit("\n".join([*(_line(each) for each in found), told]))
+    if (words := caution(held, mode or "image")) is not None:
+        note(words)
 
 
 def _in_world(

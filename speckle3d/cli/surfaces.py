@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, app, emit, emit_json
+from speckle3d.cli.common import Json, app, emit, emit_json, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -106,11 +106,13 @@ def _errors(
         return None, None
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.pose_errors import posed_errors_of
+    from speckle3d.study.pose_errors import caution, posed_errors_of
     from speckle3d.study.posed import require_made_at
 
     held = read_reconstruction(path, with_pairs=False)
     require_made_at(volume, poses_of(held, mode), str(source))
+    if (words := caution(held, mode)) is not None:
+        note(words)
     return posed_errors_of(held, mode), held.grid
 
 

@@ -111,6 +111,7 @@ def volume(
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself."""
     from speckle3d.imaging.region import Region
+    from speckle3d.study.pose_errors import caution
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     options = locals()
@@ -137,6 +138,9 @@ def volume(
         report = write_voxels(posed, request, progress)
     if as_json:
         emit_json(report.summary())
+    made = posed.reconstruction
+    if deviation is not None and made is not None and (words := caution(made, posed.mode)) is not None:
+        note(words)
     note(report.line)
 
 

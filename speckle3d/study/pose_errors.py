@@ -55,6 +55,17 @@ def measure(
     return measured(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)
 
 
+def caution(reconstruction: Reconstruction, mode: str) -> str | None:
+    """What to say beside errors of a mode that claims none of its own; None if it does.
+
+    The images' errors are taken then: too large along the sweep of a good tracker, too small across it.
+    """
+    trust = reconstruction.trust
+    if mode in ("image", "orientation") or (trust is not None and mode in trust.modes):
+        return None
+    return f"mode {mode} claims no errors of its own: those of the images are taken"
+
+
 def posed_errors_of(reconstruction: Reconstruction, mode: str = "image") -> PosedErrors:
     """Errors of a mode's poses, with these poses; as `errors_of`."""
     errors = errors_of(reconstruction, mode)

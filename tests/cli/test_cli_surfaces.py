@@ -63,6 +63,9 @@ def test_a_distance_along_the_sweep_is_as_sure_as_its_scale(run, rec):
     code, out, err = run("measure", rec, *points, "--pick-mm", "0.05")
     assert out.splitlines()[0].startswith("distance 1 2: 8.00 +- 0.41 mm [7.20, 8.80]")
     assert out.splitlines()[-1] == "mode image; points picked to 0.05 mm per axis; 95 % in brackets"
+    assert "claims no errors" not in err
+    _, _, err = run("measure", rec, *points, "--mode", "fused")
+    assert "mode fused claims no errors of its own: those of the images are taken" in err
 
 
 def test_points_may_come_from_a_file(run, rec, tmp_path):

@@ -210,6 +210,9 @@ def test_ours_by_default_beside_plus(case, by_default):
     assert np.corrcoef(levels[both], case.reference[both])[0, 1] > 0.997
     expected = 0.610 if case.splat == "linear" else 0.686
     assert share_within(2, levels, case.reference, both) == pytest.approx(expected, abs=0.01)
+    if case.splat == "nearest":
+        lit = both & (levels > 0) & (case.reference > 0)
+        assert share_within(2, levels, case.reference, lit) == pytest.approx(0.341, abs=0.01)
 
 
 @pytest.mark.slow
