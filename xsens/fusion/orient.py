@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
-from xsens.fusion.increments import Samples
 from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.logs.samples import ImuLog
 
 if TYPE_CHECKING:
-    from xsens.fusion.smoothing import FilterSteps, Smoothed
+    from xsens.fusion.stretch import Estimate
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -57,16 +57,6 @@ class Orientation:
 
     def __len__(self) -> int:
         return len(self.rotations)
-
-
-class _Result(NamedTuple):
-    """Orientation of one stretch, a row per sample; quaternions scalar last."""
-
-    xyzw: FloatArray
-    sd_rad: FloatArray
-    bias_rad_s: FloatArray
-    disturbed: BoolArray
-    resting: BoolArray
 
 
 def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = True) -> Orientation:
@@ -115,7 +105,7 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, smooth)
-    joined = _Result(*map(np.concatenate, zip(*results, strict=True)))
+    joined = _joined(results)
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
@@ -137,11 +127,11 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
 
 def _stretches(
     samples: Samples, breaks: IntArray, settings: FusionSettings, smoothing: bool
-) -> list[_Result]:
-    from xsens.fusion.smoothing import forward, fresh_filter, smooth, within_steps  # which loads numba
+) -> list[Estimate]:
+    from xsens.fusion.stretch import StretchFilter, smoothed  # which loads numba
 
-    results: list[_Result] = []
-    kept = fresh_filter(settings)
+    results: list[Estimate] = []
+    kept = StretchFilter(settings)
     step_s = float(np.median(samples.step_s))
     edges = [0, *breaks.tolist(), len(samples)]
     for first, last in pairwise(edges):
@@ -151,33 +141,11 @@ def _stretches(
         pause_s = float(stretch.step_s[0])
         if first:
             stretch = replace(stretch, step_s=np.concatenate([[step_s], stretch.step_s[1:]]))
-        if smoothing and stretch.step_s.sum() > _SHORTEST_S:
-            steps, found = smooth(stretch, settings)
-            nodes, biases = found.matrices, found.bias_rad_s
-            within = within_steps(steps, nodes[:-1], biases[:-1], nodes[1:])
-            results.append(_from_smoother(steps, found, within))
-        else:
-            steps = forward(stretch, settings, kept, pause_s)
-            results.append(_from_filter(steps, within_steps(steps, steps.start, steps.start_bias)))
+        smoothes = smoothing and stretch.step_s.sum() > _SHORTEST_S
+        results.append(smoothed(stretch, settings) if smoothes else kept.run(stretch, pause_s))
     return results
 
 
-def _from_filter(steps: FilterSteps, xyzw: FloatArray) -> _Result:
-    return _each_sample(steps, xyzw, steps.sd_rad, steps.bias, steps.disturbed, steps.resting)
-
-
-def _from_smoother(steps: FilterSteps, found: Smoothed, xyzw: FloatArray) -> _Result:
-    return _each_sample(steps, xyzw, found.sd_rad[1:], found.bias_rad_s[1:], found.disturbed, found.resting)
-
-
-def _each_sample(
-    steps: FilterSteps,
-    xyzw: FloatArray,
-    sd_rad: FloatArray,
-    bias_rad_s: FloatArray,
-    disturbed: BoolArray,
-    resting: BoolArray,
-) -> _Result:
-    """Give every sample what was found for its step."""
-    each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
-    return _Result(xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
+def _joined(results: list[Estimate]) -> Estimate:
+    columns = zip(*(vars(each).values() for each in results), strict=True)
+    return type(results[0])(*map(np.concatenate, columns))
