@@ -6,18 +6,21 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from xsens.fusion.online import OnlineFilter
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
 from xsens.logs.samples import ImuLog
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Framer, encode
+
+if TYPE_CHECKING:
+    from xsens.fusion.online import OnlineFilter
 
 RATE_OVER_S = 2.0
 """Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
@@ -195,12 +198,18 @@ class Monitor:
         return before
 
 
+def _fresh_filter() -> OnlineFilter:
+    from xsens.fusion.online import OnlineFilter  # which loads numba
+
+    return OnlineFilter()
+
+
 class _Attitude:
     """Latest orientation: the sensor's own if it sends one, else the filter's."""
 
     def __init__(self, rate_hz: float = float("nan")) -> None:
         self.latest: Rotation | None = None
-        self._filter = OnlineFilter()
+        self._filter = _fresh_filter()
         self._step_s = 1.0 / rate_hz if rate_hz > 0 else float("nan")
 
     def follow(self, log: ImuLog, lost_before: int) -> Rotation | None:
@@ -226,7 +235,7 @@ class _Attitude:
                 [first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
             )
         except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts
-            self._filter = OnlineFilter()
+            self._filter = _fresh_filter()
         state = self._filter.state
         self.latest = None if state is None else state.world_from_sensor
 
