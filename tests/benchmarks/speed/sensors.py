@@ -90,11 +90,11 @@ def filtering(runs: int) -> list[Row]:
         VQF(1.0 / RATE_HZ).updateBatch(*vectors)
 
     rows = []
-    for what, smooth in (("orientation filter", False), ("orientation smoother", True)):
-        ours = timed(lambda smooth=smooth: orient(log, smooth=smooth), runs).seconds
+    for method in ("filter", "smoother"):
+        ours = timed(lambda method=method: orient(log, method=method), runs).seconds
         theirs = timed(forward, runs).seconds
         rates = (len(log) / ours, "samples/s", "VQF, forward", len(log) / theirs)
-        rows.append(Row(f"{what}, {RATE_HZ:g} Hz", *rates, target=FILTERED))
+        rows.append(Row(f"orientation {method}, {RATE_HZ:g} Hz", *rates, target=FILTERED))
     return rows
 
 

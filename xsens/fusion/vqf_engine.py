@@ -1,0 +1,222 @@
+"""VQF (Laidig and Seel, Information Fusion 91, 2023) as an engine beside the filter of this package.
+
+VQF wants an even clock, a field at every sample, and gives no standard deviation of the orientation. Here its
+samples are brought to an even clock where the log's is not, missing fields are carried by the orientation of
+this package's own engine, and what that engine claims, and how far VQF is from it, become VQF's deviation.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation, Slerp
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
+from xsens.fusion.increments import Samples
+from xsens.fusion.methods import Found
+from xsens.fusion.settings import BRIDGED_S
+from xsens.logs.parts import nwu_from
+
+if TYPE_CHECKING:
+    from vqf import VQF
+
+_EVEN = 0.05
+"""Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
+and 100 samples/s it is 0.15 degrees, and does not add up."""
+
+_COMPARED_S = 1.0 / 32.0
+"""How often VQF is compared with the other engine: as often as that one corrects itself."""
+
+_AVERAGED_S = 5.0
+"""Time over which their squared distance is averaged, so that it is not zero where the two cross."""
+
+
+class _Even(NamedTuple):
+    """Samples on an even clock, and where the log's own samples lie on it, in steps."""
+
+    samples: Samples
+    step_s: float
+    place: FloatArray | None
+
+
+class VqfEngine:
+    """VQF over the stretches of a log, in order.
+
+    On line, the gyroscope's bias and the reference of the magnetic field are kept from stretch to stretch.
+
+    Parameters
+    ----------
+    step_s : float
+        The log's usual step.
+    magnetic : bool
+        Let the magnetic field tell the heading.
+
+    Raises
+    ------
+    InvalidInputError
+        If VQF is not installed.
+    """
+
+    def __init__(self, step_s: float, magnetic: bool) -> None:
+        try:
+            import vqf
+        except ImportError as error:
+            raise InvalidInputError(
+                "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
+                "which may need a C++ compiler, or choose smoother or filter"
+            ) from error
+        self._vqf = vqf
+        self._step_s = step_s
+        self._magnetic = magnetic
+        self._last: VQF | None = None
+        self._uneven = 0
+
+    @property
+    def notes(self) -> list[str]:
+        """What was done to the samples, for those who see the orientation."""
+        if not self._uneven:
+            return []
+        return [f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"]
+
+    def run(self, stretch: Samples, own: Found, offline: bool, pause_s: float = 0.0) -> Found:
+        """Find the orientation of a stretch.
+
+        Parameters
+        ----------
+        stretch : Samples
+        own : Found
+            The same by this package's engine: its variances, plus the squared distance of VQF from it about
+            each of the world's axes, averaged over some seconds, are VQF's variances.
+        offline : bool
+            Use later readings as well.
+        pause_s : float
+            Time since the stretch before.
+        """
+        ours = Rotation.from_quat(own.xyzw)
+        magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
+        filled = _field_carried(stretch, ours, offline) if magnetic else stretch.field_au
+        even = _even_clock(stretch, filled, self._step_s)
+        self._uneven += 0 if even.place is None else len(stretch)
+        vectors = [even.samples.rate_rad_s, even.samples.force_m_s2, even.samples.field_au]
+        vectors = [np.ascontiguousarray(values, dtype=float) for values in vectors[: 2 + magnetic]]
+        found = (
+            self._offline(vectors, even.step_s) if offline else self._online(vectors, even.step_s, pause_s)
+        )
+        turns = Rotation.from_quat(found["quat9D" if magnetic else "quat6D"], scalar_first=True)
+        at = _nearest(even.place, len(stretch))
+        if even.place is not None:
+            turns = Slerp(np.arange(len(turns)), turns)(even.place)
+        turns = nwu_from("ENU") * turns if magnetic else _heading_of(ours[0] * turns[0].inv()) * turns
+        apart = _apart_variance(turns, ours, float(np.mean(stretch.step_s)), offline)
+        none = np.zeros(len(stretch), dtype=bool)
+        return Found(
+            turns.as_quat(),
+            np.sqrt(own.sd_rad**2 + apart),
+            found["bias"][at],
+            found["magDistDetected"][at] if magnetic else none,
+            found["restDetected"][at],
+        )
+
+    def _offline(self, vectors: list[FloatArray], step_s: float) -> dict[str, Any]:
+        field = vectors[2] if len(vectors) == 3 else None
+        return dict(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s))
+
+    def _online(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
+        now, before = self._vqf.VQF(step_s), self._last
+        if before is not None:
+            _hand_over(before, now, pause_s)
+        self._last = now
+        return dict(now.updateBatch(*vectors))
+
+
+def _hand_over(before: VQF, now: VQF, pause_s: float) -> None:
+    """Keep bias and field, the bias as certain as VQF takes it to be after a pause."""
+    bias, sd = before.getBiasEstimate()
+    lost = np.deg2rad(0.1) ** 2 * pause_s / before.params["biasForgettingTime"]
+    now.setBiasEstimate(bias, min(float(np.sqrt(sd**2 + lost)), np.deg2rad(before.params["biasSigmaInit"])))
+    now.setMagRef(before.getMagRefNorm(), before.getMagRefDip())
+
+
+def _heading_of(turn: Rotation) -> Rotation:
+    """The part of a rotation that is about up."""
+    _, _, z, w = turn.as_quat()
+    return Rotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(z, w)])
+
+
+# -- what VQF wants
+
+
+def _field_carried(stretch: Samples, turns: Rotation, offline: bool) -> FloatArray:
+    """The field with its holes filled, shape (m, 3); zero, which VQF skips, where nothing tells it.
+
+    Off line it goes in the world from the reading before a hole to the one after; on line the last reading
+    stays in the world for as long as a pause is bridged, so that a slower magnetometer counts in full.
+    """
+    there = np.isfinite(stretch.field_au).all(axis=1)
+    if there.all():
+        return stretch.field_au
+    time_s = np.cumsum(stretch.step_s)
+    known, holes = np.flatnonzero(there), np.flatnonzero(~there)
+    world = turns[known].apply(stretch.field_au[known])
+    if offline:
+        carried = np.column_stack([np.interp(time_s[holes], time_s[known], axis) for axis in world.T])
+    else:
+        last = np.searchsorted(known, holes) - 1
+        late = (last < 0) | (time_s[holes] - time_s[known[last]] > BRIDGED_S)
+        carried = np.where(late[:, None], 0.0, world[last])
+    field = stretch.field_au.copy()
+    field[holes] = turns[holes].inv().apply(carried)
+    return field
+
+
+def _even_clock(stretch: Samples, field_au: FloatArray, usual_s: float) -> _Even:
+    """Samples of a stretch on an even clock: unchanged if theirs is one.
+
+    A gyroscope's reading is the mean rate since the sample before; on the new clock, too, so that the turn
+    from end to end stays what it was. Accelerometer and field are interpolated.
+    """
+    samples = Samples(stretch.step_s, stretch.rate_rad_s, stretch.force_m_s2, field_au)
+    time_s = np.cumsum(stretch.step_s) - stretch.step_s[0]
+    if len(time_s) < 2:
+        return _Even(samples, usual_s, None)
+    step_s = float(time_s[-1]) / (len(time_s) - 1)
+    if np.abs(time_s / step_s - np.arange(len(time_s))).max() < _EVEN:
+        return _Even(samples, step_s, None)
+    # A clock of bursts has a median step far below the mean: no more than two samples for one.
+    fine_s = max(float(np.median(stretch.step_s)), 0.5 * step_s)
+    count = max(1, round(float(time_s[-1]) / fine_s))
+    step_s = float(time_s[-1]) / count
+    grid_s = step_s * np.arange(count + 1.0)
+    angle = np.cumsum(stretch.rate_rad_s[1:] * stretch.step_s[1:, None], axis=0)
+    angle = _at(grid_s, time_s, np.vstack([np.zeros(3), angle]))
+    rate = np.vstack([stretch.rate_rad_s[:1], np.diff(angle, axis=0) / step_s])
+    force, field = (_at(grid_s, time_s, values) for values in (stretch.force_m_s2, field_au))
+    return _Even(Samples(np.full(count + 1, step_s), rate, force, field), step_s, time_s / step_s)
+
+
+def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArray:
+    return np.column_stack([np.interp(grid_s, time_s, axis) for axis in values.T])
+
+
+def _nearest(place: FloatArray | None, count: int) -> IntArray | slice:
+    return slice(0, count) if place is None else np.rint(place).astype(np.int64)
+
+
+# -- uncertainty
+
+
+def _apart_variance(one: Rotation, other: Rotation, step_s: float, offline: bool) -> FloatArray:
+    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3)."""
+    stride = max(1, round(_COMPARED_S / step_s))
+    square = (one[::stride] * other[::stride].inv()).as_rotvec() ** 2
+    averaged = _AVERAGED_S / (stride * step_s)
+    if offline:
+        mean = uniform_filter1d(square, max(1, round(averaged)), axis=0, mode="nearest")
+    else:
+        keep = float(np.exp(-1.0 / averaged))
+        mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
+    return np.asarray(np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(one)])
