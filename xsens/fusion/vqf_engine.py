@@ -7,6 +7,7 @@ this package's own engine, and what that engine claims, and how far VQF is from 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,10 @@ _AVERAGED_S = 5.0
 """Time over which their squared distance is averaged, so that it is not zero where the two cross."""
 
 
+_WANDERS_DEG_S = 0.1
+"""By so much a bias wanders in 100 s, as VQF has it; at the start it is 0.5."""
+
+
 class _Even(NamedTuple):
     """Samples on an even clock, and where the log's own samples lie on it, in steps."""
 
@@ -43,10 +48,22 @@ class _Even(NamedTuple):
     place: FloatArray | None
 
 
+class _Bias(NamedTuple):
+    """A gyroscope's bias at the end of a stretch, and its standard deviation."""
+
+    rad_s: FloatArray
+    sd_rad_s: float
+
+    def sd_after(self, pause_s: float) -> float:
+        """Standard deviation after a pause, as VQF lets it grow to what it takes it for at first."""
+        grown = math.hypot(self.sd_rad_s, math.radians(_WANDERS_DEG_S) * math.sqrt(pause_s / 100.0))
+        return min(grown, math.radians(0.5))
+
+
 class VqfEngine:
     """VQF over the stretches of a log, in order.
 
-    On line, the gyroscope's bias and the reference of the magnetic field are kept from stretch to stretch.
+    The gyroscope's bias and, on line, the reference of the magnetic field are kept from stretch to stretch.
 
     Parameters
     ----------
@@ -73,6 +90,7 @@ class VqfEngine:
         self._step_s = step_s
         self._magnetic = magnetic
         self._last: VQF | None = None
+        self._bias: _Bias | None = None
         self._uneven = 0
 
     @property
@@ -103,9 +121,8 @@ class VqfEngine:
         self._uneven += 0 if even.place is None else len(stretch)
         vectors = [even.samples.rate_rad_s, even.samples.force_m_s2, even.samples.field_au]
         vectors = [np.ascontiguousarray(values, dtype=float) for values in vectors[: 2 + magnetic]]
-        found = (
-            self._offline(vectors, even.step_s) if offline else self._online(vectors, even.step_s, pause_s)
-        )
+        find = self._offline if offline else self._online
+        found = find(vectors, even.step_s, pause_s)
         turns = Rotation.from_quat(found["quat9D" if magnetic else "quat6D"], scalar_first=True)
         at = _nearest(even.place, len(stretch))
         if even.place is not None:
@@ -121,24 +138,29 @@ class VqfEngine:
             found["restDetected"][at],
         )
 
-    def _offline(self, vectors: list[FloatArray], step_s: float) -> dict[str, Any]:
+    def _offline(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
+        """A prior of the bias cannot be given: what is known is taken off the rate and put back after."""
+        params = {}
+        if self._bias is not None:
+            vectors = [vectors[0] - self._bias.rad_s, *vectors[1:]]
+            # VQF never takes the bias for less certain than at the start: leave it room to wander.
+            params["biasSigmaInit"] = max(np.rad2deg(self._bias.sd_after(pause_s)), _WANDERS_DEG_S)
         field = vectors[2] if len(vectors) == 3 else None
-        return dict(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s))
+        found = dict(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s, params))
+        if self._bias is not None:
+            found["bias"] += self._bias.rad_s
+        self._bias = _Bias(found["bias"][-1].copy(), float(found["biasSigma"][-1]))
+        return found
 
     def _online(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
         now, before = self._vqf.VQF(step_s), self._last
+        if self._bias is not None:
+            now.setBiasEstimate(self._bias.rad_s, self._bias.sd_after(pause_s))
         if before is not None:
-            _hand_over(before, now, pause_s)
-        self._last = now
-        return dict(now.updateBatch(*vectors))
-
-
-def _hand_over(before: VQF, now: VQF, pause_s: float) -> None:
-    """Keep bias and field, the bias as certain as VQF takes it to be after a pause."""
-    bias, sd = before.getBiasEstimate()
-    lost = np.deg2rad(0.1) ** 2 * pause_s / before.params["biasForgettingTime"]
-    now.setBiasEstimate(bias, min(float(np.sqrt(sd**2 + lost)), np.deg2rad(before.params["biasSigmaInit"])))
-    now.setMagRef(before.getMagRefNorm(), before.getMagRefDip())
+            now.setMagRef(before.getMagRefNorm(), before.getMagRefDip())
+        found = dict(now.updateBatch(*vectors))
+        self._last, self._bias = now, _Bias(*now.getBiasEstimate())
+        return found
 
 
 def _heading_of(turn: Rotation) -> Rotation:
@@ -195,7 +217,8 @@ def _even_clock(stretch: Samples, field_au: FloatArray, usual_s: float) -> _Even
     angle = _at(grid_s, time_s, np.vstack([np.zeros(3), angle]))
     rate = np.vstack([stretch.rate_rad_s[:1], np.diff(angle, axis=0) / step_s])
     force, field = (_at(grid_s, time_s, values) for values in (stretch.force_m_s2, field_au))
-    return _Even(Samples(np.full(count + 1, step_s), rate, force, field), step_s, time_s / step_s)
+    place = np.minimum(time_s / step_s, count)
+    return _Even(Samples(np.full(count + 1, step_s), rate, force, field), step_s, place)
 
 
 def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArray:
