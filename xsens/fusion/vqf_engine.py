@@ -92,13 +92,22 @@ class VqfEngine:
         self._last: VQF | None = None
         self._bias: _Bias | None = None
         self._uneven = 0
+        self._fields: list[bool] = []
 
     @property
     def notes(self) -> list[str]:
-        """What was done to the samples, for those who see the orientation."""
-        if not self._uneven:
-            return []
-        return [f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"]
+        """What VQF made of the log, for those who see the orientation."""
+        notes = []
+        if self._uneven:
+            notes.append(
+                f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"
+            )
+        if self._fields and not any(self._fields):
+            notes.append(
+                "VQF came to know no magnetic field, for which it wants 5 s of turning by over 20 deg/s: it "
+                "takes all of it for disturbed"
+            )
+        return notes
 
     def run(self, stretch: Samples, own: Found, offline: bool, pause_s: float = 0.0) -> Found:
         """Find the orientation of a stretch.
@@ -123,18 +132,21 @@ class VqfEngine:
         vectors = [np.ascontiguousarray(values, dtype=float) for values in vectors[: 2 + magnetic]]
         find = self._offline if offline else self._online
         found = find(vectors, even.step_s, pause_s)
-        turns = Rotation.from_quat(found["quat9D" if magnetic else "quat6D"], scalar_first=True)
-        at = _nearest(even.place, len(stretch))
+        wxyz = found["quat9D" if magnetic else "quat6D"]
+        first = Rotation.from_quat(wxyz[0], scalar_first=True)
+        xyzw = _turned_about_up(wxyz, nwu_from("ENU") if magnetic else ours[0] * first.inv())
         if even.place is not None:
-            turns = Slerp(np.arange(len(turns)), turns)(even.place)
-        turns = nwu_from("ENU") * turns if magnetic else _heading_of(ours[0] * turns[0].inv()) * turns
-        apart = _apart_variance(turns, ours, float(np.mean(stretch.step_s)), offline)
-        none = np.zeros(len(stretch), dtype=bool)
+            xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(even.place).as_quat()
+        at = _nearest(even.place, len(stretch))
+        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)), offline)
+        disturbed = found["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
+        if magnetic:
+            self._fields.append(not disturbed.all())
         return Found(
-            turns.as_quat(),
-            np.sqrt(own.sd_rad**2 + apart),
+            xyzw,
+            np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi),
             found["bias"][at],
-            found["magDistDetected"][at] if magnetic else none,
+            disturbed,
             found["restDetected"][at],
         )
 
@@ -163,10 +175,12 @@ class VqfEngine:
         return found
 
 
-def _heading_of(turn: Rotation) -> Rotation:
-    """The part of a rotation that is about up."""
-    _, _, z, w = turn.as_quat()
-    return Rotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(z, w)])
+def _turned_about_up(wxyz: FloatArray, turn: Rotation) -> FloatArray:
+    """Quaternions, shape (m, 4), scalar last, turned by that part of a rotation that is about up."""
+    half = np.arctan2(*turn.as_quat()[2:])
+    s, c = np.sin(half), np.cos(half)
+    w, x, y, z = wxyz.T
+    return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
 
 
 # -- what VQF wants
@@ -232,14 +246,15 @@ def _nearest(place: FloatArray | None, count: int) -> IntArray | slice:
 # -- uncertainty
 
 
-def _apart_variance(one: Rotation, other: Rotation, step_s: float, offline: bool) -> FloatArray:
+def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline: bool) -> FloatArray:
     """Squared distance of two orientations about the world's axes, averaged, shape (m, 3)."""
     stride = max(1, round(_COMPARED_S / step_s))
-    square = (one[::stride] * other[::stride].inv()).as_rotvec() ** 2
+    one, two = (Rotation.from_quat(each[::stride]) for each in (xyzw, other))
+    square = (one * two.inv()).as_rotvec() ** 2
     averaged = _AVERAGED_S / (stride * step_s)
     if offline:
         mean = uniform_filter1d(square, max(1, round(averaged)), axis=0, mode="nearest")
     else:
-        keep = float(np.exp(-1.0 / averaged))
+        keep = math.exp(-1.0 / averaged)
         mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
-    return np.asarray(np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(one)])
+    return np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(xyzw)]
