@@ -117,7 +117,7 @@ def orient(
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, method, notes)
-    joined = Found(*map(np.concatenate, zip(*results, strict=True)))
+    joined = results[0] if len(results) == 1 else Found(*map(np.concatenate, zip(*results, strict=True)))
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")

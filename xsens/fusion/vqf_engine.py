@@ -220,11 +220,13 @@ def _even_clock(stretch: Samples, field_au: FloatArray, usual_s: float) -> _Even
     if len(time_s) < 2:
         return _Even(samples, usual_s, None)
     step_s = float(time_s[-1]) / (len(time_s) - 1)
-    if np.abs(time_s / step_s - np.arange(len(time_s))).max() < _EVEN:
+    off = np.abs(time_s / step_s - np.arange(len(time_s))).max()
+    if off < _EVEN:
         return _Even(samples, step_s, None)
-    # A clock of bursts has a median step far below the mean: no more than two samples for one.
-    fine_s = max(float(np.median(stretch.step_s)), 0.5 * step_s)
-    count = max(1, round(float(time_s[-1]) / fine_s))
+    count = len(time_s) - 1
+    if off > 0.5:
+        # Samples were lost. A clock of bursts has a median step far below the mean: at most two for one.
+        count = max(1, round(float(time_s[-1]) / max(float(np.median(stretch.step_s)), 0.5 * step_s)))
     step_s = float(time_s[-1]) / count
     grid_s = step_s * np.arange(count + 1.0)
     angle = np.cumsum(stretch.rate_rad_s[1:] * stretch.step_s[1:, None], axis=0)
