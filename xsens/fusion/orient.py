@@ -142,11 +142,14 @@ def _stretches(
 ) -> list[Found]:
     """Each stretch by the method asked for, or by its on-line twin if it is short."""
     from xsens.fusion.smoothing import fresh_filter  # which loads numba
-    from xsens.fusion.vqf_engine import VqfEngine
 
     step_s = float(np.median(samples.step_s))
     kept = fresh_filter(settings)
-    engine = VqfEngine(step_s, settings.use_magnetometer) if method.is_vqf else None
+    engine = None
+    if method.is_vqf:
+        from xsens.fusion.vqf_engine import VqfEngine
+
+        engine = VqfEngine(settings.use_magnetometer)
     results: list[Found] = []
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
         if first == last:

@@ -35,15 +35,14 @@ _COMPARED_S = 1.0 / 32.0
 _AVERAGED_S = 5.0
 """Time over which their squared distance is averaged, so that it is not zero where the two cross."""
 
-
 _WANDERS_DEG_S = 0.1
 """By so much a bias wanders in 100 s, as VQF has it; at the start it is 0.5."""
 
 
 class _Even(NamedTuple):
-    """Samples on an even clock, and where the log's own samples lie on it, in steps."""
+    """Rate, force and field on an even clock; if it is another, where the samples lie on it, in steps."""
 
-    samples: Samples
+    vectors: list[FloatArray]
     step_s: float
     place: FloatArray | None
 
@@ -67,8 +66,6 @@ class VqfEngine:
 
     Parameters
     ----------
-    step_s : float
-        The log's usual step.
     magnetic : bool
         Let the magnetic field tell the heading.
 
@@ -78,7 +75,7 @@ class VqfEngine:
         If VQF is not installed.
     """
 
-    def __init__(self, step_s: float, magnetic: bool) -> None:
+    def __init__(self, magnetic: bool) -> None:
         try:
             import vqf
         except ImportError as error:
@@ -87,7 +84,6 @@ class VqfEngine:
                 "which may need a C++ compiler, or choose smoother or filter"
             ) from error
         self._vqf = vqf
-        self._step_s = step_s
         self._magnetic = magnetic
         self._last: VQF | None = None
         self._bias: _Bias | None = None
@@ -125,11 +121,10 @@ class VqfEngine:
         """
         ours = Rotation.from_quat(own.xyzw)
         magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
-        filled = _field_carried(stretch, ours, offline) if magnetic else stretch.field_au
-        even = _even_clock(stretch, filled, self._step_s)
+        field = [_field_carried(stretch, ours, offline)] if magnetic else []
+        even = _even_clock([stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s)
         self._uneven += 0 if even.place is None else len(stretch)
-        vectors = [even.samples.rate_rad_s, even.samples.force_m_s2, even.samples.field_au]
-        vectors = [np.ascontiguousarray(values, dtype=float) for values in vectors[: 2 + magnetic]]
+        vectors = [np.ascontiguousarray(values, dtype=float) for values in even.vectors]
         find = self._offline if offline else self._online
         found = find(vectors, even.step_s, pause_s)
         wxyz = found["quat9D" if magnetic else "quat6D"]
@@ -209,32 +204,29 @@ def _field_carried(stretch: Samples, turns: Rotation, offline: bool) -> FloatArr
     return field
 
 
-def _even_clock(stretch: Samples, field_au: FloatArray, usual_s: float) -> _Even:
-    """Samples of a stretch on an even clock: unchanged if theirs is one.
+def _even_clock(vectors: list[FloatArray], steps_s: FloatArray) -> _Even:
+    """Rate, force and perhaps field of a stretch on an even clock: unchanged if theirs is one.
 
     A gyroscope's reading is the mean rate since the sample before; on the new clock, too, so that the turn
     from end to end stays what it was. Accelerometer and field are interpolated.
     """
-    samples = Samples(stretch.step_s, stretch.rate_rad_s, stretch.force_m_s2, field_au)
-    time_s = np.cumsum(stretch.step_s) - stretch.step_s[0]
-    if len(time_s) < 2:
-        return _Even(samples, usual_s, None)
-    step_s = float(time_s[-1]) / (len(time_s) - 1)
-    off = np.abs(time_s / step_s - np.arange(len(time_s))).max()
+    time_s, last = np.cumsum(steps_s) - steps_s[0], len(steps_s) - 1
+    if last == 0:
+        return _Even(vectors, float(steps_s[0]), None)
+    step_s = float(time_s[-1]) / last
+    off = np.abs(time_s / step_s - np.arange(last + 1)).max()
     if off < _EVEN:
-        return _Even(samples, step_s, None)
-    count = len(time_s) - 1
+        return _Even(vectors, step_s, None)
     if off > 0.5:
         # Samples were lost. A clock of bursts has a median step far below the mean: at most two for one.
-        count = max(1, round(float(time_s[-1]) / max(float(np.median(stretch.step_s)), 0.5 * step_s)))
-    step_s = float(time_s[-1]) / count
-    grid_s = step_s * np.arange(count + 1.0)
-    angle = np.cumsum(stretch.rate_rad_s[1:] * stretch.step_s[1:, None], axis=0)
-    angle = _at(grid_s, time_s, np.vstack([np.zeros(3), angle]))
-    rate = np.vstack([stretch.rate_rad_s[:1], np.diff(angle, axis=0) / step_s])
-    force, field = (_at(grid_s, time_s, values) for values in (stretch.force_m_s2, field_au))
-    place = np.minimum(time_s / step_s, count)
-    return _Even(Samples(np.full(count + 1, step_s), rate, force, field), step_s, place)
+        last = max(1, round(float(time_s[-1]) / max(float(np.median(steps_s)), 0.5 * step_s)))
+        step_s = float(time_s[-1]) / last
+    grid_s = step_s * np.arange(last + 1.0)
+    rate = vectors[0]
+    angle = np.vstack([np.zeros(3), np.cumsum(rate[1:] * steps_s[1:, None], axis=0)])
+    mean = np.vstack([rate[:1], np.diff(_at(grid_s, time_s, angle), axis=0) / step_s])
+    others = [_at(grid_s, time_s, values) for values in vectors[1:]]
+    return _Even([mean, *others], step_s, np.minimum(time_s / step_s, last))
 
 
 def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArray:
