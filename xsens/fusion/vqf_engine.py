@@ -119,17 +119,19 @@ class VqfEngine:
         pause_s : float
             Time since the stretch before.
         """
-        ours = Rotation.from_quat(own.xyzw)
         magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
-        field = [_field_carried(stretch, ours, offline)] if magnetic else []
+        field = [_field_carried(stretch, own.xyzw, offline)] if magnetic else []
         even = _even_clock([stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s)
         self._uneven += 0 if even.place is None else len(stretch)
         vectors = [np.ascontiguousarray(values, dtype=float) for values in even.vectors]
         find = self._offline if offline else self._online
         found = find(vectors, even.step_s, pause_s)
         wxyz = found["quat9D" if magnetic else "quat6D"]
+        found = {name: found[name] for name in ("bias", "restDetected", "magDistDetected") if name in found}
         first = Rotation.from_quat(wxyz[0], scalar_first=True)
-        xyzw = _turned_about_up(wxyz, nwu_from("ENU") if magnetic else ours[0] * first.inv())
+        start = Rotation.from_quat(own.xyzw[0]) * first.inv()
+        xyzw = _turned_about_up(wxyz, nwu_from("ENU") if magnetic else start)
+        del wxyz
         if even.place is not None:
             xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(even.place).as_quat()
         at = _nearest(even.place, len(stretch))
@@ -181,7 +183,7 @@ def _turned_about_up(wxyz: FloatArray, turn: Rotation) -> FloatArray:
 # -- what VQF wants
 
 
-def _field_carried(stretch: Samples, turns: Rotation, offline: bool) -> FloatArray:
+def _field_carried(stretch: Samples, xyzw: FloatArray, offline: bool) -> FloatArray:
     """The field with its holes filled, shape (m, 3); zero, which VQF skips, where nothing tells it.
 
     Off line it goes in the world from the reading before a hole to the one after; on line the last reading
@@ -192,7 +194,7 @@ def _field_carried(stretch: Samples, turns: Rotation, offline: bool) -> FloatArr
         return stretch.field_au
     time_s = np.cumsum(stretch.step_s)
     known, holes = np.flatnonzero(there), np.flatnonzero(~there)
-    world = turns[known].apply(stretch.field_au[known])
+    world = Rotation.from_quat(xyzw[known]).apply(stretch.field_au[known])
     if offline:
         carried = np.column_stack([np.interp(time_s[holes], time_s[known], axis) for axis in world.T])
     else:
@@ -200,7 +202,7 @@ def _field_carried(stretch: Samples, turns: Rotation, offline: bool) -> FloatArr
         late = (last < 0) | (time_s[holes] - time_s[known[last]] > BRIDGED_S)
         carried = np.where(late[:, None], 0.0, world[last])
     field = stretch.field_au.copy()
-    field[holes] = turns[holes].inv().apply(carried)
+    field[holes] = Rotation.from_quat(xyzw[holes]).inv().apply(carried)
     return field
 
 
