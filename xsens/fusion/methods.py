@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from speckle3d.core.arrays import BoolArray, FloatArray
 
 
 class Method(StrEnum):
