@@ -8,7 +8,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from xsens.fusion.increments import Samples
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S
 from xsens.logs.samples import ImuLog
 
