@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from xsens.fusion.online import OnlineFilter
-from xsens.fusion.settings import FusionSettings
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
@@ -22,6 +21,10 @@ from xsens.messages.framing import Framer, encode
 
 RATE_OVER_S = 2.0
 """Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
+
+NORM_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
+"""A field that differs by more from the first second's is disturbed; defaults of VQF (Laidig and Seel,
+Information Fusion 91, 2023)."""
 
 REFERENCE_S = 1.0
 """Time at the start over which the reference field is averaged."""
@@ -75,9 +78,8 @@ class LiveState:
         """Whether the field differs from that at the start; None if there is none."""
         if not np.isfinite(self.field):
             return None
-        limits = FusionSettings()
-        norm_off = abs(self.field - 1.0) > limits.norm_tolerance
-        return bool(norm_off or abs(self.dip_change_rad) > limits.dip_tolerance_rad)
+        norm_off = abs(self.field - 1.0) > NORM_TOLERANCE
+        return bool(norm_off or abs(self.dip_change_rad) > DIP_TOLERANCE_RAD)
 
     def line(self) -> str:
         """The state in one line of text."""
