@@ -27,12 +27,11 @@ def main():
         theirs = peer.updateBatch(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)["quat9D"]
         print(f"{name}: total, heading, inclination, degrees; the same without a constant heading")
         print(f"  VQF       {both_ways(theirs, true, moving)}")
-        for smooth in (False, True):
+        for method in ("filter", "smoother"):
             start = time.process_time()
-            found = east_first(orient(log, smooth=smooth).rotations.world_from_sensor)
+            found = east_first(orient(log, method=method).rotations.world_from_sensor)
             pace = log.duration_s / (time.process_time() - start)
-            label = "smoother" if smooth else "filter"
-            print(f"  {label:9} {both_ways(found, true, moving)}, {pace:.0f} times real time")
+            print(f"  {method:9} {both_ways(found, true, moving)}, {pace:.0f} times real time")
 
 
 def both_ways(found, true, moving):
@@ -56,8 +55,8 @@ def row(label, settings, trials):
     cells = []
     for log, true, moving in trials:
         both = []
-        for smooth in (False, True):
-            found = east_first(orient(log, settings, smooth).rotations.world_from_sensor)
+        for method in ("filter", "smoother"):
+            found = east_first(orient(log, settings, method).rotations.world_from_sensor)
             both.append(errors_deg(found, true, moving, steady=True)[0])
         cells.append(f"{both[0]:5.2f} | {both[1]:5.2f}")
     print(f"{label:32} " + " ".join(cells), flush=True)
