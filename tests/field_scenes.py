@@ -1,0 +1,316 @@
+"""Recordings in invented magnetic fields, whose true orientation is known.
+
+The gyroscope and the accelerometer are those of a BROAD trial, errors and all; the magnetometer is computed
+from the optical orientation. `tune` scenes may guide the choice of settings, `judge` scenes, of other trials
+and seeds, only tell how good the choice was.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from broad import read_trial, trials_in
+from scipy.spatial.transform import Rotation, Slerp
+
+from xsens.logs.samples import ImuLog
+
+EARTH_UT = np.array([0.0, 18.0, -45.0])
+"""Central Europe's: 48 uT, dipping by 68 degrees; x east, y north, z up as in BROAD."""
+
+NOISE_UT = 0.3
+"""Standard deviation of a reading: a common magnetometer's at 100 Hz."""
+
+BRIDGED_S = 0.1
+"""In longer gaps of the optical orientation, it is not interpolated, and the magnetometer is missing."""
+
+PLAN = {
+    "attached": (2.0, 5.0, 12.0, 30.0, 60.0),  # uT, a magnet that turns with the sensor, 3 % of soft iron
+    "walk": (0.1, 0.2, 0.2, 0.4),  # RMS departure from the earth's field, a fraction of it
+    "linger": (0.1, 0.2, 0.4),  # the same, with 20 to 60 s beside one piece of iron
+    "passing": (30.0, 200.0),  # uT at the nearest, a few seconds each
+    "start": (5.0, 20.0, 60.0),  # uT until 5 s after the first movement
+    "drift": (10.0, 30.0),  # degrees of heading over the recording
+    "missing": (40.0,),  # s
+    "saturated": (40.0,),  # uT
+    "frozen": (30.0,),  # s
+    "spikes": (100.0,),  # uT, one reading in a hundred
+    "bias": (0.5, 2.0),  # deg/s, of the gyroscope
+    "scale": (0.01,),  # of the gyroscope
+    "noise": (3.0,),  # times the gyroscope's own
+    "rate": (50.0, 100.0),  # Hz
+}
+"""Kinds of scene, and how strong; the last four leave the magnetometer as recorded."""
+
+
+class Scene(NamedTuple):
+    """A recording and its truth: quaternions, world x east, NaN where the cameras saw nothing."""
+
+    name: str
+    log: ImuLog
+    true_wxyz: np.ndarray
+    moving: np.ndarray
+
+
+class Motion(NamedTuple):
+    """A recording from the first camera image to the last; `turns` is true wherever `known`."""
+
+    log: ImuLog
+    true_wxyz: np.ndarray
+    moving: np.ndarray
+    turns: Rotation
+    known: np.ndarray
+
+
+def scenes(folder, split, kinds=tuple(PLAN)):
+    """Scenes of a split, `tune` or `judge`, one after the other, of a folder of BROAD trials."""
+    half = ("tune", "judge").index(split)
+    names = trials_in(folder)[half::2]
+    plan = [(kind, amount) for kind in PLAN for amount in PLAN[kind]]
+    for k, (kind, amount) in enumerate(plan):
+        if kind in kinds:
+            name = names[k % len(names)]
+            yield scene(recorded(folder, name), kind, amount, np.random.default_rng([half, k]), name[:2])
+
+
+def scene(motion, kind, amount, rng, label=""):
+    """A recording as it would be in such a field or of such a sensor."""
+    name = f"{kind} {amount:g} {label}".rstrip()
+    if kind in SENSORS:
+        return Scene(name, *SENSORS[kind](motion, amount, rng))
+    readings = FIELDS[kind](motion, amount, rng)
+    readings = readings + NOISE_UT * rng.standard_normal(readings.shape)
+    if kind in FAULTS:
+        readings = FAULTS[kind](motion, readings, amount, rng)
+    log = with_readings(motion.log, magnetometer_au=np.where(motion.known[:, None], readings, np.nan))
+    return Scene(name, log, motion.true_wxyz, motion.moving)
+
+
+def with_readings(log, **changed):
+    kept = {name: getattr(log, name) for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")}
+    return ImuLog(log.time_s, source=log.source, **(kept | changed))
+
+
+# -- motions
+
+
+def recorded(folder, name):
+    """The motion of a BROAD trial."""
+    log, true, moving = read_trial(folder, name)
+    seen = np.flatnonzero(np.isfinite(true).all(axis=1))
+    part = slice(seen[0], seen[-1] + 1)
+    log = ImuLog(
+        log.time_s[part] - log.time_s[seen[0]],
+        *(each[part] for each in (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)),
+        source=name,
+    )
+    true, seen = true[part], seen - seen[0]
+    turns = Slerp(log.time_s[seen], Rotation.from_quat(true[seen], scalar_first=True))(log.time_s)
+    after = np.clip(np.searchsorted(seen, np.arange(len(log))), 1, len(seen) - 1)
+    known = log.time_s[seen[after]] - log.time_s[seen[after - 1]] < BRIDGED_S
+    return Motion(log, true, moving[part], turns, known)
+
+
+def simulated(rng, seconds, rate_hz=100.0):
+    """The motion of a hand: at rest for 3 s, then turning and shifting in all directions."""
+    time_s = np.arange(0.0, seconds, 1.0 / rate_hz)
+    fade = np.clip((time_s - 3.0) / 1.0, 0.0, 1.0)[:, None]
+    turns = Rotation.from_euler("ZYX", fade * wandering(time_s, rng, [0.9, 0.5, 0.5], 1.0))
+    shift_m = fade * wandering(time_s, rng, 0.1, 1.0)
+    pushed = np.gradient(np.gradient(shift_m, time_s, axis=0), time_s, axis=0)
+    force = turns.inv().apply(pushed + np.array([0.0, 0.0, 9.81]))
+    rate = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate_hz
+    rate = np.vstack([rate[:1], rate]) + np.deg2rad(rng.normal(0.0, 0.3, 3))
+    log = ImuLog(
+        time_s,
+        force + 0.03 * rng.standard_normal(force.shape),
+        rate + np.deg2rad(0.3) * rng.standard_normal(rate.shape),
+        turns.inv().apply(EARTH_UT) + NOISE_UT * rng.standard_normal(rate.shape),
+        source="simulated",
+    )
+    every = np.ones(len(log), dtype=bool)
+    return Motion(log, turns.as_quat(scalar_first=True), time_s > 3.0, turns, every)
+
+
+def wandering(time_s, rng, sd, period_s):
+    """Three smooth random functions of time, of given standard deviation and least period."""
+    periods = period_s * np.array([1.0, 1.6, 2.7, 4.4])
+    phases = rng.uniform(0.0, 2 * np.pi, (4, 3))
+    waves = np.sin(2 * np.pi * time_s[:, None, None] / periods[:, None] + phases)
+    return np.asarray(sd) * np.sqrt(2.0 / 4.0) * waves.sum(axis=1)
+
+
+# -- fields, as the sensor reads them, uT
+
+
+def seen_by(motion, field_ut):
+    return motion.turns.inv().apply(field_ut)
+
+
+def earth(motion, amount=None, rng=None):
+    return seen_by(motion, np.tile(EARTH_UT, (len(motion.log), 1)))
+
+
+def attached(motion, amount, rng):
+    """Iron and a magnet that turn with the sensor."""
+    soft = np.eye(3) + 0.03 * rng.standard_normal((3, 3))
+    return earth(motion) @ soft.T + amount * direction(rng)
+
+
+def direction(rng, shape=()):
+    aim = rng.standard_normal((*shape, 3))
+    return aim / np.linalg.norm(aim, axis=-1, keepdims=True)
+
+
+IRON_M = 0.5
+"""Size of a desk's or a column's iron: nearer than that, the field does not grow any more."""
+
+
+def dipoles(position_m, place_m, moment_a_m2):
+    """Field of magnets, shape (k, 3) each, at positions of shape (n, 3), uT."""
+    out = np.zeros_like(position_m)
+    for place, moment in zip(place_m, moment_a_m2, strict=True):
+        apart = position_m - place
+        square = (apart**2).sum(axis=1, keepdims=True) + IRON_M**2
+        along = apart @ moment
+        out += 0.1 * (3.0 * apart * along[:, None] / square**2.5 - moment / square**1.5)
+    return out
+
+
+def walk(motion, amount, rng, stays=False):
+    """Indoors among desks, columns and a lift at walking pace, wherever the sensor moves at all."""
+    place_m = rng.uniform([0.0, 0.0, -1.2], [20.0, 10.0, 0.3], (60, 3))
+    moment = direction(rng, (60,)) * rng.lognormal(0.0, 0.8, (60, 1))
+    corners = rng.uniform([0.0, 0.0, 0.0], [20.0, 10.0, 0.0], (80, 3))
+    pause_s = np.zeros(80)
+    if stays:
+        pause_s[1::3] = rng.uniform(20.0, 60.0, 27)
+        beside = direction(rng, (27,)) * [0.5, 0.5, 0.0]
+        corners[1::3] = place_m[rng.permutation(60)[:27]] * [1.0, 1.0, 0.0] + beside
+    lasting_s = np.linalg.norm(np.diff(corners, axis=0), axis=1) / rng.uniform(0.8, 1.4, 79)
+    arrive_s = np.concatenate([[0.0], np.cumsum(lasting_s + pause_s[:-1])])
+    at_s = np.column_stack([arrive_s, arrive_s + pause_s + 1e-6]).ravel()
+    walked_s = np.cumsum(motion.moving) / motion.log.rate_hz
+    path = np.column_stack([np.interp(walked_s, at_s, np.repeat(c, 2)) for c in corners.T])
+    path = path + 0.05 * wandering(walked_s, rng, 1.0, 1.5)
+    iron = dipoles(path, place_m, moment)
+    strength = np.sqrt((iron[motion.moving] ** 2).sum(axis=1).mean())
+    return seen_by(motion, EARTH_UT + iron * (amount * np.linalg.norm(EARTH_UT) / strength))
+
+
+def linger(motion, amount, rng):
+    return walk(motion, amount, rng, stays=True)
+
+
+def passing(motion, amount, rng):
+    """A magnet goes by six times, each for two to eight seconds."""
+    time_s, field = motion.log.time_s, np.tile(EARTH_UT, (len(motion.log), 1))
+    for middle_s in rng.uniform(0.15, 0.95, 6) * time_s[-1]:
+        nearness = 1.0 / (1.0 + ((time_s - middle_s) / rng.uniform(0.5, 2.0)) ** 2) ** 1.5
+        turning = np.outer(np.cos(time_s - middle_s), direction(rng))
+        field += amount * nearness[:, None] * (turning + 0.5 * direction(rng)) / 1.5
+    return seen_by(motion, field)
+
+
+def start(motion, amount, rng):
+    """Beside iron until five seconds after the first movement, free two seconds later."""
+    begin_s = motion.log.time_s[np.flatnonzero(motion.moving)[0]] + 5.0
+    near = np.clip(1.0 - (motion.log.time_s - begin_s) / 2.0, 0.0, 1.0) ** 3
+    return seen_by(motion, EARTH_UT + np.outer(near, amount * direction(rng) * [1.0, 1.0, 0.5]))
+
+
+def drift(motion, amount, rng):
+    """The field's heading, norm and dip go away slowly."""
+    part = motion.log.time_s / motion.log.time_s[-1]
+    turned = Rotation.from_rotvec(np.outer(np.deg2rad(amount) * part, [0, 0, rng.choice([-1, 1])]))
+    return seen_by(
+        motion, turned.apply(EARTH_UT) + np.outer(part, 0.05 * np.linalg.norm(EARTH_UT) * direction(rng))
+    )
+
+
+FIELDS = {
+    "attached": attached,
+    "walk": walk,
+    "linger": linger,
+    "passing": passing,
+    "start": start,
+    "drift": drift,
+    **dict.fromkeys(("missing", "saturated", "frozen", "spikes"), earth),
+}
+
+
+# -- faults of the magnetometer
+
+
+def during(motion, seconds, rng):
+    """A stretch of the recording while the sensor moves, as many seconds long."""
+    middle_s = rng.uniform(0.35, 0.65) * motion.log.time_s[-1]
+    return np.abs(motion.log.time_s - middle_s) < 0.5 * seconds
+
+
+def missing(motion, readings, amount, rng):
+    return np.where(during(motion, amount, rng)[:, None], np.nan, readings)
+
+
+def saturated(motion, readings, amount, rng):
+    return np.clip(readings, -amount, amount)
+
+
+def frozen(motion, readings, amount, rng):
+    stuck = during(motion, amount, rng)
+    return np.where(stuck[:, None], readings[np.flatnonzero(stuck)[0]], readings)
+
+
+def spikes(motion, readings, amount, rng):
+    hit = rng.random(len(readings)) < 0.01
+    return readings + np.where(hit[:, None], amount * rng.standard_normal(readings.shape), 0.0)
+
+
+FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes": spikes}
+
+
+# -- other gyroscopes: log, truth, where it moves
+
+
+def worse_gyroscope(motion, rate):
+    return with_readings(motion.log, gyroscope_rad_s=rate), motion.true_wxyz, motion.moving
+
+
+def bias(motion, amount, rng):
+    """Another bias, a fifth of which comes in the course of the recording."""
+    part = 0.8 + 0.2 * motion.log.time_s / motion.log.time_s[-1]
+    return worse_gyroscope(
+        motion, motion.log.gyroscope_rad_s + np.outer(part, np.deg2rad(amount) * direction(rng))
+    )
+
+
+def scale(motion, amount, rng):
+    """Wrong scales and axes that are not square."""
+    wrong = np.eye(3) + amount * rng.uniform(-1.0, 1.0, (3, 3))
+    return worse_gyroscope(motion, motion.log.gyroscope_rad_s @ wrong.T)
+
+
+def noise(motion, amount, rng):
+    still = motion.log.gyroscope_rad_s[~motion.moving]
+    own = np.median(np.abs(np.diff(still, axis=0))) / 0.6745 / np.sqrt(2.0)
+    more = max(own, np.deg2rad(0.1)) * np.sqrt(amount**2 - 1.0)
+    rate = motion.log.gyroscope_rad_s
+    return worse_gyroscope(motion, rate + more * rng.standard_normal(rate.shape))
+
+
+def slower(motion, amount, rng):
+    """Means over longer intervals: of the rate, up to the time of the sample; of the others, around it."""
+    step_s = 1.0 / amount
+    ends_s = np.arange(2.0 * step_s, motion.log.time_s[-1] - step_s, step_s)
+    last = np.searchsorted(motion.log.time_s, ends_s)
+    means = []
+    for name, later in (("accelerometer_m_s2", 0.5), ("gyroscope_rad_s", 0.0), ("magnetometer_au", 0.5)):
+        sums = np.cumsum(getattr(motion.log, name), axis=0) / motion.log.rate_hz
+        edges_s = np.append(step_s, ends_s) + later * step_s
+        at_edges = [np.interp(edges_s, motion.log.time_s, column) for column in sums.T]
+        means.append(np.diff(np.column_stack(at_edges), axis=0) / step_s)
+    log = ImuLog(ends_s, *means, source=motion.log.source)
+    seen = np.isfinite(motion.true_wxyz).all(axis=1)
+    turns = Slerp(motion.log.time_s, motion.turns)(ends_s).as_quat(scalar_first=True)
+    return log, np.where((seen[last] & seen[last - 1])[:, None], turns, np.nan), motion.moving[last]
+
+
+SENSORS = {"bias": bias, "scale": scale, "noise": noise, "rate": slower}
