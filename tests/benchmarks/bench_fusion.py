@@ -12,12 +12,12 @@ off-line; a star marks where ours is more than 15 % worse than VQF.
 --sensitivity        each setting halved and doubled
 """
 
+import subprocess
 import sys
 import time
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 
@@ -36,11 +36,16 @@ from broad import (
     trials_in,
 )
 from field_scenes import scenes
+from vqf import VQF
 
+from xsens.fusion.online import OnlineFilter
 from xsens.fusion.settings import FusionSettings
 
 METHODS = ONLINE + OFFLINE
 WORSE = 1.15
+
+SINGLY = 5000
+"""Samples that are given one by one."""
 
 GRID = {
     "field_sd_rad": (0.5, 2.0),
@@ -55,7 +60,9 @@ GRID = {
 
 def main():
     folder, options = Path(sys.argv[1]), sys.argv[2:]
-    if "--coverage" in options:
+    if "--first" in options:
+        print(timed(estimate, read_trial(folder, trials_in(folder)[0])[0], options[1]))
+    elif "--coverage" in options:
         claims(folder)
     elif "--scenes" in options:
         in_fields(folder, options[options.index("--scenes") + 1])
@@ -86,7 +93,7 @@ def table(folder, kind):
         print(f"{name:42}" + row(cells[name]), flush=True)
     for label, part in parts(names).items():
         print(f"{f'mean of {len(part)} {label}':42}" + row(np.mean([cells[n] for n in part], axis=0)))
-    speeds(*read_trial(folder, names[0])[:1])
+    speeds(folder)
 
 
 def parts(names):
@@ -110,20 +117,40 @@ def star(theirs, ours):
     return "*" if (np.asarray(ours) > WORSE * np.asarray(theirs)).any() else " "
 
 
-def speeds(log, runs=5):
-    """Samples per second of processor time, median of a few runs taken in turn."""
-    took = {method: [] for method in METHODS}
-    for _ in range(runs + 1):
-        for method in METHODS:
-            begin = time.thread_time()
-            estimate(log, method)
-            took[method].append(time.thread_time() - begin)
-    pace = {method: len(log) / median(each[1:]) for method, each in took.items()}  # the first one compiles
+# -- speed
+
+
+def speeds(folder, runs=5):
+    """Samples per second of processor time: median of runs in turn, the first in a process, one by one."""
+    log, _, _ = read_trial(folder, trials_in(folder)[0])
+    took = [[timed(estimate, log, method) for method in METHODS] for _ in range(runs + 1)][1:]
+    pace = dict(zip(METHODS, len(log) / np.median(took, axis=0), strict=True))
+    print(f"{'samples/s':14}{'a log':>12}{'first log':>12}{'one by one':>12}")
+    for method in METHODS:
+        again = [sys.executable, __file__, str(folder), "--first", method]
+        first = len(log) / float(subprocess.run(again, capture_output=True, check=True, text=True).stdout)
+        singly = f"{SINGLY / timed(one_by_one, log, method):12,.0f}" if method in ONLINE else ""
+        print(f"{method:14}{pace[method]:12,.0f}{first:12,.0f}{singly}")
     for theirs, ours in (ONLINE, OFFLINE):
-        ratio = pace[theirs] / pace[ours]
-        print(
-            f"{ours}: {pace[ours]:,.0f} samples/s; {theirs}: {pace[theirs]:,.0f}, {ratio:.1f} times as many"
-        )
+        print(f"{theirs} is {pace[theirs] / pace[ours]:.1f} times as fast as {ours}")
+
+
+def timed(work, *arguments):
+    begin = time.thread_time()
+    work(*arguments)
+    return time.thread_time() - begin
+
+
+def one_by_one(log, method):
+    rows = list(zip(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au, strict=True))[:SINGLY]
+    if method == "filter":
+        live = OnlineFilter()
+        for gyroscope, force, field in rows:
+            live.push(1.0 / log.rate_hz, gyroscope, force, field)
+    else:
+        peer = VQF(1.0 / log.rate_hz)
+        for gyroscope, force, field in rows:
+            peer.update(gyroscope, force, field)
 
 
 # -- claimed sigmas

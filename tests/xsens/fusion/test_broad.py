@@ -12,7 +12,7 @@ GAIN = 0.9
 """Mean error over VQF's: a tenth less than the best there is."""
 
 WORSE = 1.15
-"""Error in one trial over VQF's: 15 % is within what differs between trials of one kind."""
+"""Error in any one trial over VQF's: none pays for the mean of the others."""
 
 SHARES = (0.60, 0.76)
 """Of errors within one sigma; 0.68 of a normal distribution, which a dozen trials tell to 0.08."""
