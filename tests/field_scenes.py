@@ -19,11 +19,21 @@ EARTH_UT = np.array([0.0, 18.0, -45.0])
 NOISE_UT = 0.3
 """Standard deviation of a reading: a common magnetometer's at 100 Hz."""
 
+RESIDUAL = 0.01
+"""Of the earth's field, what a calibration leaves of the sensor's own iron; half of it already is good."""
+
+ROOM = 0.02
+"""Of the earth's field, what a room without iron near adds here and there."""
+
+TURNING_RAD = 0.7
+"""RMS turn from the mean attitude of a sensor that turns: BROAD's rotations have 1.0 and more."""
+
 BRIDGED_S = 0.1
 """In longer gaps of the optical orientation, it is not interpolated, and the magnetometer is missing."""
 
 PLAN = {
-    "attached": (2.0, 5.0, 12.0, 30.0, 60.0),  # uT, a magnet that turns with the sensor, 3 % of soft iron
+    "attached": (2.0, 5.0, 12.0, 30.0, 60.0),  # uT, a magnet on the sensor, with 3 % of soft iron
+    "attached, level": (5.0, 30.0),  # the same on a sensor that keeps its attitude, where only sigma can tell
     "walk": (0.1, 0.2, 0.2, 0.4),  # RMS departure from the earth's field, a fraction of it
     "linger": (0.1, 0.2, 0.4),  # the same, with 20 to 60 s beside one piece of iron
     "passing": (30.0, 200.0),  # uT at the nearest, a few seconds each
@@ -34,11 +44,12 @@ PLAN = {
     "frozen": (30.0,),  # s
     "spikes": (100.0,),  # uT, one reading in a hundred
     "bias": (0.5, 2.0),  # deg/s, of the gyroscope
+    "truncated": (0.12, 0.25),  # deg/s, the gyroscope's step, cut toward zero as BROAD's own
     "scale": (0.01,),  # of the gyroscope
     "noise": (3.0,),  # times the gyroscope's own
     "rate": (50.0, 100.0),  # Hz
 }
-"""Kinds of scene, and how strong; the last four leave the magnetometer as recorded."""
+"""Kinds of scene, and how strong; the last five leave the magnetometer as recorded."""
 
 
 class Scene(NamedTuple):
@@ -65,10 +76,19 @@ def scenes(folder, split, kinds=tuple(PLAN)):
     half = ("tune", "judge").index(split)
     names = trials_in(folder)[half::2]
     plan = [(kind, amount) for kind in PLAN for amount in PLAN[kind]]
+    motions = {name: recorded(folder, name) for name in names}
     for k, (kind, amount) in enumerate(plan):
         if kind in kinds:
-            name = names[k % len(names)]
-            yield scene(recorded(folder, name), kind, amount, np.random.default_rng([half, k]), name[:2])
+            fit = [name for name in names if fits(kind, motions[name])]
+            name = fit[k % len(fit)]
+            yield scene(motions[name], kind, amount, np.random.default_rng([half, k]), name[:2])
+
+
+def fits(kind, motion):
+    """True for motion that turns, if the kind is of a magnet on the sensor; and for the rest of its kind."""
+    turns = motion.turns[motion.moving]
+    turning = np.sqrt(((turns * turns.mean().inv()).magnitude() ** 2).mean()) > TURNING_RAD
+    return {"attached": turning, "attached, level": not turning}.get(kind, True)
 
 
 def scene(motion, kind, amount, rng, label=""):
@@ -77,6 +97,8 @@ def scene(motion, kind, amount, rng, label=""):
     if kind in SENSORS:
         return Scene(name, *SENSORS[kind](motion, amount, rng))
     readings = FIELDS[kind](motion, amount, rng)
+    residual = np.eye(3) + RESIDUAL * rng.standard_normal((3, 3))
+    readings = readings @ residual.T + RESIDUAL * np.linalg.norm(EARTH_UT) * rng.standard_normal(3)
     readings = readings + NOISE_UT * rng.standard_normal(readings.shape)
     if kind in FAULTS:
         readings = FAULTS[kind](motion, readings, amount, rng)
@@ -145,14 +167,20 @@ def seen_by(motion, field_ut):
     return motion.turns.inv().apply(field_ut)
 
 
-def earth(motion, amount=None, rng=None):
-    return seen_by(motion, np.tile(EARTH_UT, (len(motion.log), 1)))
+def room(motion, amount, rng):
+    """The earth's field in a room: a little different from place to place."""
+    return seen_by(motion, room_ut(motion, rng))
+
+
+def room_ut(motion, rng):
+    walked_s = np.cumsum(motion.moving) / motion.log.rate_hz
+    return EARTH_UT + wandering(walked_s, rng, ROOM * np.linalg.norm(EARTH_UT), 7.0)
 
 
 def attached(motion, amount, rng):
     """Iron and a magnet that turn with the sensor."""
     soft = np.eye(3) + 0.03 * rng.standard_normal((3, 3))
-    return earth(motion) @ soft.T + amount * direction(rng)
+    return room(motion, amount, rng) @ soft.T + amount * direction(rng)
 
 
 def direction(rng, shape=()):
@@ -202,7 +230,7 @@ def linger(motion, amount, rng):
 
 def passing(motion, amount, rng):
     """A magnet goes by six times, each for two to eight seconds."""
-    time_s, field = motion.log.time_s, np.tile(EARTH_UT, (len(motion.log), 1))
+    time_s, field = motion.log.time_s, room_ut(motion, rng)
     for middle_s in rng.uniform(0.15, 0.95, 6) * time_s[-1]:
         nearness = 1.0 / (1.0 + ((time_s - middle_s) / rng.uniform(0.5, 2.0)) ** 2) ** 1.5
         turning = np.outer(np.cos(time_s - middle_s), direction(rng))
@@ -214,7 +242,7 @@ def start(motion, amount, rng):
     """Beside iron until five seconds after the first movement, free two seconds later."""
     begin_s = motion.log.time_s[np.flatnonzero(motion.moving)[0]] + 5.0
     near = np.clip(1.0 - (motion.log.time_s - begin_s) / 2.0, 0.0, 1.0) ** 3
-    return seen_by(motion, EARTH_UT + np.outer(near, amount * direction(rng) * [1.0, 1.0, 0.5]))
+    return seen_by(motion, room_ut(motion, rng) + np.outer(near, amount * direction(rng) * [1.0, 1.0, 0.5]))
 
 
 def drift(motion, amount, rng):
@@ -222,18 +250,20 @@ def drift(motion, amount, rng):
     part = motion.log.time_s / motion.log.time_s[-1]
     turned = Rotation.from_rotvec(np.outer(np.deg2rad(amount) * part, [0, 0, rng.choice([-1, 1])]))
     return seen_by(
-        motion, turned.apply(EARTH_UT) + np.outer(part, 0.05 * np.linalg.norm(EARTH_UT) * direction(rng))
+        motion,
+        turned.apply(room_ut(motion, rng)) + np.outer(part, 0.05 * np.linalg.norm(EARTH_UT) * direction(rng)),
     )
 
 
 FIELDS = {
     "attached": attached,
+    "attached, level": attached,
     "walk": walk,
     "linger": linger,
     "passing": passing,
     "start": start,
     "drift": drift,
-    **dict.fromkeys(("missing", "saturated", "frozen", "spikes"), earth),
+    **dict.fromkeys(("missing", "saturated", "frozen", "spikes"), room),
 }
 
 
@@ -288,6 +318,13 @@ def scale(motion, amount, rng):
     return worse_gyroscope(motion, motion.log.gyroscope_rad_s @ wrong.T)
 
 
+def truncated(motion, amount, rng):
+    """Coarser steps, cut toward zero, about another bias: at rest it differs from that in motion."""
+    step = np.deg2rad(amount)
+    rate = motion.log.gyroscope_rad_s + rng.uniform(-0.5, 0.5, 3) * step
+    return worse_gyroscope(motion, np.trunc(rate / step) * step)
+
+
 def noise(motion, amount, rng):
     still = motion.log.gyroscope_rad_s[~motion.moving]
     own = np.median(np.abs(np.diff(still, axis=0))) / 0.6745 / np.sqrt(2.0)
@@ -313,4 +350,4 @@ def slower(motion, amount, rng):
     return log, np.where((seen[last] & seen[last - 1])[:, None], turns, np.nan), motion.moving[last]
 
 
-SENSORS = {"bias": bias, "scale": scale, "noise": noise, "rate": slower}
+SENSORS = {"bias": bias, "truncated": truncated, "scale": scale, "noise": noise, "rate": slower}
