@@ -131,12 +131,12 @@ def recorded(folder, name):
     return Motion(log, true, moving[part], turns, known)
 
 
-def simulated(rng, seconds, rate_hz=100.0):
-    """The motion of a hand: at rest for 3 s, then turning and shifting in all directions."""
+def simulated(rng, seconds, rate_hz=100.0, period_s=2.0):
+    """The motion of a hand, in waves of a period and longer: at rest for 3 s, then turning and shifting."""
     time_s = np.arange(0.0, seconds, 1.0 / rate_hz)
     fade = np.clip((time_s - 3.0) / 1.0, 0.0, 1.0)[:, None]
-    turns = Rotation.from_euler("ZYX", fade * wandering(time_s, rng, [0.9, 0.5, 0.5], 1.0))
-    shift_m = fade * wandering(time_s, rng, 0.1, 1.0)
+    turns = Rotation.from_euler("ZYX", fade * wandering(time_s, rng, [0.9, 0.5, 0.5], period_s))
+    shift_m = fade * wandering(time_s, rng, 0.1, period_s)
     pushed = np.gradient(np.gradient(shift_m, time_s, axis=0), time_s, axis=0)
     force = turns.inv().apply(pushed + np.array([0.0, 0.0, 9.81]))
     rate = (turns[:-1].inv() * turns[1:]).as_rotvec() * rate_hz
