@@ -12,9 +12,15 @@ from xsens.fusion.orient import orient
 from xsens.logs.parts import nwu_from
 from xsens.logs.samples import ImuLog
 
+TAKES_METHOD = "method" in inspect.signature(orient).parameters
+
 ONLINE = ("VQF on-line", "filter")
 OFFLINE = ("VQF off-line", "smoother")
 """VQF itself, as its authors publish it, and ours."""
+
+
+CLAIMING = (ONLINE[1], OFFLINE[1], *(("vqf-online", "vqf") if TAKES_METHOD else ()))
+"""Methods that claim errors: ours, and VQF as an engine here."""
 
 
 class Estimate(NamedTuple):
@@ -29,10 +35,6 @@ def trials_in(folder):
     return sorted(path.stem for path in folder.glob("*.mat"))
 
 
-def disturbed(name):
-    return "_disturbed_" in name
-
-
 def read_trial(folder, name):
     """The log, the optical orientation (NaN where unseen), and where the sensor moved."""
     held = scipy.io.loadmat(folder / f"{name}.mat")
@@ -42,10 +44,10 @@ def read_trial(folder, name):
 
 
 def estimate(log, method, settings=None):
-    """Orientation by a method of `ONLINE` or `OFFLINE`."""
+    """Orientation by a method of `ONLINE`, `OFFLINE` or `CLAIMING`."""
     if method.startswith("VQF"):
         return Estimate(by_vqf(log, method), np.full((len(log), 3), np.nan))
-    if "method" in inspect.signature(orient).parameters:
+    if TAKES_METHOD:
         found = orient(log, settings, method=method)
     else:
         found = orient(log, settings, smooth=method == "smoother")

@@ -17,6 +17,7 @@ import sys
 import time
 from dataclasses import fields, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from broad import (
+    CLAIMING,
     OFFLINE,
     ONLINE,
     counting,
     coverage,
-    disturbed,
     errors_deg,
     estimate,
     read_trial,
@@ -48,14 +49,22 @@ SINGLY = 5000
 """Samples that are given one by one."""
 
 GRID = {
-    "field_sd_rad": (0.5, 2.0),
-    "field_place_s": (0.5, 2.0),
-    "field_noise_rad_sqrt_s": (0.5, 2.0),
-    "bias_walk_rad_s_sqrt_s": (0.5, 2.0),
-    "norm_tolerance": (0.5,),
-    "field_memory_s": (0.5, 2.0),
+    "field_sd_rad": (0.5, 1.0, 2.0),
+    "field_place_s": (0.5, 1.0, 2.0),
+    "field_noise_rad_sqrt_s": (1.0, 2.0),
 }
-"""Candidates of --leave-one-out: the settings as they are, and each of these times each factor."""
+"""Candidates of --leave-one-out: the settings with each of these fields times each factor."""
+
+GROUPS = {
+    "undisturbed": ("_undisturbed_",),
+    "disturbed": ("_disturbed_",),
+    "slow": ("_slow_",),
+    "fast": ("_fast_",),
+    "tapped or shaken": ("_tapping_", "_vibration_"),
+    "beside magnets or iron": ("_magnet_", "_office_", "_mixed"),
+    "all": ("",),
+}
+"""What the names of a group's trials have in them."""
 
 
 def main():
@@ -91,19 +100,11 @@ def table(folder, kind):
     cells = {name: np.array([scores(folder, name, m)[:, kind] for m in METHODS]) for name in names}
     for name in names:
         print(f"{name:42}" + row(cells[name]), flush=True)
-    for label, part in parts(names).items():
-        print(f"{f'mean of {len(part)} {label}':42}" + row(np.mean([cells[n] for n in part], axis=0)))
+    for label, marks in GROUPS.items():
+        part = [name for name in names if any(mark in name for mark in marks)]
+        if part:
+            print(f"{f'mean of {len(part)} {label}':42}" + row(np.mean([cells[n] for n in part], axis=0)))
     speeds(folder)
-
-
-def parts(names):
-    """Names by whether they are disturbed, and all."""
-    found = {
-        "undisturbed": [n for n in names if not disturbed(n)],
-        "disturbed": [n for n in names if disturbed(n)],
-        "all": names,
-    }
-    return {label: part for label, part in found.items() if part}
 
 
 def row(cells):
@@ -160,7 +161,7 @@ def claims(folder):
     """Coverage of heading, as BROAD counts it and without a constant, and of inclination."""
     print("share of errors within one claimed sigma, and RMS error / RMS claimed sigma")
     print("heading: as BROAD counts it (cameras' north against magnetic north), and without a constant")
-    for method in (ONLINE[1], OFFLINE[1]):
+    for method in CLAIMING:
         print(f"{method:34}{'heading':>14}{'less constant':>16}{'inclination':>14}")
         found = []
         for name in trials_in(folder):
@@ -219,11 +220,12 @@ def candidates(method):
     if method.startswith("VQF"):
         return {method: None}
     default = FusionSettings()
-    found = {method: default}
-    for name, factors in GRID.items():
-        for factor in factors:
-            changed = replace(default, **{name: factor * getattr(default, name)})
-            found[f"{method}, {name} x {factor:g}"] = changed
+    found = {}
+    for factors in product(*GRID.values()):
+        chosen = dict(zip(GRID, factors, strict=True))
+        changes = {name: factor * getattr(default, name) for name, factor in chosen.items()}
+        label = ", ".join(f"{name} x {factor:g}" for name, factor in chosen.items() if factor != 1.0)
+        found[f"{method}: {label or 'as it is'}"] = replace(default, **changes)
     return found
 
 
@@ -237,13 +239,13 @@ def leave_one_out(folder):
             for label, settings in candidates(m).items()
         ]
         for label, score in options:
-            print(f"{label:44}{pair(score.mean(axis=0))}", flush=True)
+            print(f"{label:86}{pair(score.mean(axis=0))}", flush=True)
         held = []
         for k, name in enumerate(names):
             rest = [np.delete(score, k, axis=0).mean() for _, score in options]
             label, score = options[int(np.argmin(rest))]
             held.append(score[k])
-            print(f"without {name:44}{pair(score[k])}  {label}")
+            print(f"without {name:46}{pair(score[k])}  {label}")
         peer = options[0][1].mean(axis=0)
         gain = 100.0 * (1.0 - np.mean(held, axis=0) / peer)
         print(f"held out: {pair(np.mean(held, axis=0))}, {theirs}: {pair(peer)}, better by {pair(gain)} %")
