@@ -33,6 +33,7 @@ BRIDGED_S = 0.1
 
 PLAN = {
     "attached": (2.0, 5.0, 12.0, 30.0, 60.0),  # uT, a magnet on the sensor, with 3 % of soft iron
+    "attached, below": (5.0, 15.0),  # the same under the board; BROAD's at 4 cm adds 4.8 uT along z
     "attached, level": (5.0, 30.0),  # the same on a sensor that keeps its attitude, where only sigma can tell
     "walk": (0.1, 0.2, 0.2, 0.4),  # RMS departure from the earth's field, a fraction of it
     "linger": (0.1, 0.2, 0.4),  # the same, with 20 to 60 s beside one piece of iron
@@ -85,10 +86,10 @@ def scenes(folder, split, kinds=tuple(PLAN)):
 
 
 def fits(kind, motion):
-    """True for motion that turns, if the kind is of a magnet on the sensor; and for the rest of its kind."""
+    """True for any motion, but under a magnet on the sensor it must turn, or, if the kind says so, must not."""
     turns = motion.turns[motion.moving]
     turning = np.sqrt(((turns * turns.mean().inv()).magnitude() ** 2).mean()) > TURNING_RAD
-    return {"attached": turning, "attached, level": not turning}.get(kind, True)
+    return not kind.startswith("attached") or turning != kind.endswith("level")
 
 
 def scene(motion, kind, amount, rng, label=""):
@@ -179,8 +180,16 @@ def room_ut(motion, rng):
 
 def attached(motion, amount, rng):
     """Iron and a magnet that turn with the sensor."""
+    return fixed(motion, amount * direction(rng), rng)
+
+
+def attached_below(motion, amount, rng):
+    return fixed(motion, np.array([0.0, 0.0, -amount]), rng)
+
+
+def fixed(motion, magnet_ut, rng):
     soft = np.eye(3) + 0.03 * rng.standard_normal((3, 3))
-    return room(motion, amount, rng) @ soft.T + amount * direction(rng)
+    return room(motion, None, rng) @ soft.T + magnet_ut
 
 
 def direction(rng, shape=()):
@@ -257,6 +266,7 @@ def drift(motion, amount, rng):
 
 FIELDS = {
     "attached": attached,
+    "attached, below": attached_below,
     "attached, level": attached,
     "walk": walk,
     "linger": linger,

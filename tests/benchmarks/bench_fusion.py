@@ -104,7 +104,8 @@ def table(folder, kind):
         part = [name for name in names if any(mark in name for mark in marks)]
         if part:
             print(f"{f'mean of {len(part)} {label}':42}" + row(np.mean([cells[n] for n in part], axis=0)))
-    speeds(folder)
+    if not kind:
+        speeds(folder)
 
 
 def row(cells):
@@ -186,7 +187,7 @@ def shares(cells):
 def in_fields(folder, split):
     """Errors of all methods; of ours, heading's error and claimed sigma, `!` where beyond twice."""
     heads = "".join(f"{m:^16}" for m in METHODS)
-    print(f"{f'{split}: RMS, degrees':20}{heads}  heading, sigma of filter | smoother")
+    print(f"{f'{split}: RMS, degrees':24}{heads}  heading, sigma of filter | smoother")
     every, wrong = [], 0
     for scene in scenes(folder, split):
         found = [estimate(scene.log, method) for method in METHODS]
@@ -197,9 +198,9 @@ def in_fields(folder, split):
         every.append(cells)
         told = " | ".join(claim(each, scene) for each in (found[1], found[3]))
         wrong += told.count("!")
-        print(f"{scene.name:20}{row(np.array(cells))}  {told}", flush=True)
-    print(f"{'mean':20}{row(np.mean(every, axis=0))}")
-    print(f"{'median':20}{row(np.median(every, axis=0))}")
+        print(f"{scene.name:24}{row(np.array(cells))}  {told}", flush=True)
+    print(f"{'mean':24}{row(np.mean(every, axis=0))}")
+    print(f"{'median':24}{row(np.median(every, axis=0))}")
     ratio = np.exp(np.log(np.array(every)[:, 1::2] / np.array(every)[:, ::2]).mean(axis=0))
     print(f"geometric mean of ours / VQF's: on-line {pair(ratio[0])}, off-line {pair(ratio[1])}")
     print(f"headings off by more than twice their claimed sigma: {wrong} of {2 * len(every)}")

@@ -16,6 +16,7 @@ SIGMAS = 2.0
 KINDS = [
     ("attached", 5.0),
     ("attached", 30.0),
+    ("attached, below", 10.0),
     ("walk", 0.1),
     ("walk", 0.3),
     ("linger", 0.2),
