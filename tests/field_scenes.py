@@ -76,17 +76,17 @@ def scenes(folder, split, kinds=tuple(PLAN)):
     """Scenes of a split, `tune` or `judge`, one after the other, of a folder of BROAD trials."""
     half = ("tune", "judge").index(split)
     names = trials_in(folder)[half::2]
-    plan = [(kind, amount) for kind in PLAN for amount in PLAN[kind]]
     motions = {name: recorded(folder, name) for name in names}
-    for k, (kind, amount) in enumerate(plan):
-        if kind in kinds:
-            fit = [name for name in names if fits(kind, motions[name])]
-            name = fit[k % len(fit)]
-            yield scene(motions[name], kind, amount, np.random.default_rng([half, k]), name[:2])
+    for kind in kinds:
+        fit = [name for name in names if fits(kind, motions[name])]
+        for i, amount in enumerate(PLAN[kind]):
+            name = fit[(len(kind) + i) % len(fit)]
+            rng = np.random.default_rng([half, i, *kind.encode()])  # the same whatever else the plan holds
+            yield scene(motions[name], kind, amount, rng, name[:2])
 
 
 def fits(kind, motion):
-    """True for any motion, but under a magnet on the sensor it must turn, or, if the kind says so, must not."""
+    """True for any motion; if a magnet is attached, for motion that turns or, if so named, that does not."""
     turns = motion.turns[motion.moving]
     turning = np.sqrt(((turns * turns.mean().inv()).magnitude() ** 2).mean()) > TURNING_RAD
     return not kind.startswith("attached") or turning != kind.endswith("level")
