@@ -28,6 +28,9 @@ ROOM = 0.02
 TURNING_RAD = 0.7
 """RMS turn from the mean attitude of a sensor that turns: BROAD's rotations have 1.0 and more."""
 
+SLOW_RAD_S = 2.2
+"""Highest mean rate of slow turning: BROAD has 1 to 2 in slow rotations, 4 and more in fast ones."""
+
 BRIDGED_S = 0.1
 """In longer gaps of the optical orientation, it is not interpolated, and the magnetometer is missing."""
 
@@ -46,11 +49,12 @@ PLAN = {
     "spikes": (100.0,),  # uT, one reading in a hundred
     "bias": (0.5, 2.0),  # deg/s, of the gyroscope
     "truncated": (0.12, 0.25),  # deg/s, the gyroscope's step, cut toward zero as BROAD's own
+    "truncated, slow": (0.12, 0.25),  # the same in slow turning
     "scale": (0.01,),  # of the gyroscope
     "noise": (3.0,),  # times the gyroscope's own
     "rate": (50.0, 100.0),  # Hz
 }
-"""Kinds of scene, and how strong; the last five leave the magnetometer as recorded."""
+"""Kinds of scene, and how strong; the last six leave the magnetometer as recorded."""
 
 
 class Scene(NamedTuple):
@@ -86,10 +90,17 @@ def scenes(folder, split, kinds=tuple(PLAN)):
 
 
 def fits(kind, motion):
-    """True for any motion; if a magnet is attached, for motion that turns or, if so named, that does not."""
+    """True for motion that turns, slowly, or keeps its attitude, if the kind asks for it."""
     turns = motion.turns[motion.moving]
     turning = np.sqrt(((turns * turns.mean().inv()).magnitude() ** 2).mean()) > TURNING_RAD
-    return not kind.startswith("attached") or turning != kind.endswith("level")
+    slow = np.linalg.norm(motion.log.gyroscope_rad_s[motion.moving], axis=1).mean() < SLOW_RAD_S
+    asked = {
+        "attached": turning,
+        "attached, below": turning,
+        "attached, level": not turning,
+        "truncated, slow": turning and slow,
+    }
+    return asked.get(kind, True)
 
 
 def scene(motion, kind, amount, rng, label=""):
@@ -360,4 +371,11 @@ def slower(motion, amount, rng):
     return log, np.where((seen[last] & seen[last - 1])[:, None], turns, np.nan), motion.moving[last]
 
 
-SENSORS = {"bias": bias, "truncated": truncated, "scale": scale, "noise": noise, "rate": slower}
+SENSORS = {
+    "bias": bias,
+    "truncated": truncated,
+    "truncated, slow": truncated,
+    "scale": scale,
+    "noise": noise,
+    "rate": slower,
+}

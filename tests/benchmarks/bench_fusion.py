@@ -69,6 +69,8 @@ GROUPS = {
 
 def main():
     folder, options = Path(sys.argv[1]), sys.argv[2:]
+    if not trials_in(folder):
+        sys.exit(f"expected a folder of .mat files, got {folder}")
     if "--first" in options:
         print(timed(estimate, read_trial(folder, trials_in(folder)[0])[0], options[1]))
     elif "--coverage" in options:
