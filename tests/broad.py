@@ -1,6 +1,5 @@
 """BROAD trials and their score (Laidig et al. 2021, section 4), for our methods and for VQF itself."""
 
-import inspect
 from typing import NamedTuple
 
 import numpy as np
@@ -12,15 +11,9 @@ from xsens.fusion.orient import orient
 from xsens.logs.parts import nwu_from
 from xsens.logs.samples import ImuLog
 
-TAKES_METHOD = "method" in inspect.signature(orient).parameters
-
 ONLINE = ("VQF on-line", "filter")
 OFFLINE = ("VQF off-line", "smoother")
 """VQF itself, as its authors publish it, and ours."""
-
-
-CLAIMING = (ONLINE[1], OFFLINE[1], *(("vqf-online", "vqf") if TAKES_METHOD else ()))
-"""Methods that claim errors: ours, and VQF as an engine here."""
 
 
 class Estimate(NamedTuple):
@@ -44,13 +37,10 @@ def read_trial(folder, name):
 
 
 def estimate(log, method, settings=None):
-    """Orientation by a method of `ONLINE`, `OFFLINE` or `CLAIMING`."""
+    """Orientation by a method of `ONLINE` or `OFFLINE`, or any that `orient` knows."""
     if method.startswith("VQF"):
         return Estimate(by_vqf(log, method), np.full((len(log), 3), np.nan))
-    if TAKES_METHOD:
-        found = orient(log, settings, method=method)
-    else:
-        found = orient(log, settings, smooth=method == "smoother")
+    found = orient(log, settings, method)
     north, west, up = found.standard_deviation_rad.T
     return Estimate(east_first(found.rotations.world_from_sensor), np.column_stack([west, north, up]))
 

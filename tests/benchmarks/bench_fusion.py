@@ -25,7 +25,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from broad import (
-    CLAIMING,
     OFFLINE,
     ONLINE,
     counting,
@@ -39,6 +38,7 @@ from broad import (
 from field_scenes import scenes
 from vqf import VQF
 
+from xsens.fusion.methods import Method
 from xsens.fusion.online import OnlineFilter
 from xsens.fusion.settings import FusionSettings
 
@@ -127,10 +127,11 @@ def star(theirs, ours):
 def speeds(folder, runs=5):
     """Samples per second of processor time: median of runs in turn, the first in a process, one by one."""
     log, _, _ = read_trial(folder, trials_in(folder)[0])
-    took = [[timed(estimate, log, method) for method in METHODS] for _ in range(runs + 1)][1:]
-    pace = dict(zip(METHODS, len(log) / np.median(took, axis=0), strict=True))
+    methods = (*METHODS, Method.vqf_online, Method.vqf)
+    took = [[timed(estimate, log, method) for method in methods] for _ in range(runs + 1)][1:]
+    pace = dict(zip(methods, len(log) / np.median(took, axis=0), strict=True))
     print(f"{'samples/s':14}{'a log':>12}{'first log':>12}{'one by one':>12}")
-    for method in METHODS:
+    for method in methods:
         again = [sys.executable, __file__, str(folder), "--first", method]
         first = len(log) / float(subprocess.run(again, capture_output=True, check=True, text=True).stdout)
         singly = f"{SINGLY / timed(one_by_one, log, method):12,.0f}" if method in ONLINE else ""
@@ -164,7 +165,7 @@ def claims(folder):
     """Coverage of heading, as BROAD counts it and without a constant, and of inclination."""
     print("share of errors within one claimed sigma, and RMS error / RMS claimed sigma")
     print("heading: as BROAD counts it (cameras' north against magnetic north), and without a constant")
-    for method in CLAIMING:
+    for method in Method:
         print(f"{method:34}{'heading':>14}{'less constant':>16}{'inclination':>14}")
         found = []
         for name in trials_in(folder):

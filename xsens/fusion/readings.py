@@ -59,17 +59,18 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
         raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {_lacking(log)}")
     used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
-    force = log.accelerometer_m_s2[used]
+    part = slice(None) if used.size == len(log) else used
+    rate, force = (_plain(values[part]) for values in (log.gyroscope_rad_s, log.accelerometer_m_s2))
     there = np.isfinite(force).all(axis=1)
     if used.size < 2 or there.sum() < 2:
         raise InsufficientDataError(
             f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
         )
-    time_s, notes = log.time_s[used], []
+    time_s, notes = log.time_s[part], []
     steps = np.diff(time_s)
     _require_seconds(steps, source)
-    require_metres(force[there], source)
-    _require_radians(log.gyroscope_rad_s[used], source)
+    require_metres(force if there.all() else force[there], source)
+    _require_radians(rate, source)
     if used.size < len(log):
         notes.append(f"{len(log) - used.size} samples without gyroscope left out")
     if not there.all():
@@ -77,14 +78,19 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
     field = np.full((used.size, 3), np.nan)
     if log.magnetometer_au is not None:
-        field, zeros = real_field(log.magnetometer_au[used])
+        field, zeros = real_field(_plain(log.magnetometer_au[part]))
         if zeros:
             notes.append(f"magnetometer reads zero in {zeros} of {used.size} samples: left out")
-    against = _contradiction(time_s, log.gyroscope_rad_s[used], force)
+    against = _contradiction(time_s, rate, force)
     if against is not None:
         notes.append(against)
     step_s = np.concatenate([[np.median(steps)], steps])
-    return used, Samples(step_s, log.gyroscope_rad_s[used], force, field), notes
+    return used, Samples(step_s, rate, force, field), notes
+
+
+def _plain(values: FloatArray) -> FloatArray:
+    """Values as kernels are compiled for, without a copy if they are so."""
+    return np.require(values, dtype=float, requirements=["C", "W"])
 
 
 def _lacking(log: ImuLog) -> str:
@@ -127,7 +133,7 @@ def real_field(field_au: FloatArray) -> tuple[FloatArray, int]:
     """The field, shape (m, 3), NaN where zero or not finite, and how many readings were exactly zero."""
     zero = (field_au == 0.0).all(axis=1)
     none = zero | ~np.isfinite(field_au).all(axis=1)
-    return np.where(none[:, None], np.nan, field_au), int(zero.sum())
+    return np.where(none[:, None], np.nan, field_au) if none.any() else field_au, int(zero.sum())
 
 
 def _contradiction(time_s: FloatArray, rate_rad_s: FloatArray, force_m_s2: FloatArray) -> str | None:

@@ -46,7 +46,7 @@ def apart_deg(one, other):
 
 def test_ends_where_the_filter_over_the_whole_log_ends():
     truth, log = moving()
-    whole = orient(log, smooth=False)
+    whole = orient(log, method="filter")
     state = pushed(log, len(log))
     # The log's filter sums two seconds with one bias and corrects to first order; that is all the difference.
     assert apart_deg(state.world_from_sensor, whole.rotations.world_from_sensor[-1]) < 0.02
