@@ -47,6 +47,7 @@ PLAN = {
     "saturated": (40.0,),  # uT
     "frozen": (30.0,),  # s
     "spikes": (100.0,),  # uT, one reading in a hundred
+    "late": (0.02, 0.05),  # s behind the gyroscope, each reading repeated as long
     "bias": (0.5, 2.0),  # deg/s, of the gyroscope
     "truncated": (0.12, 0.25),  # deg/s, the gyroscope's step, cut toward zero as BROAD's own
     "truncated, slow": (0.12, 0.25),  # the same in slow turning
@@ -284,7 +285,7 @@ FIELDS = {
     "passing": passing,
     "start": start,
     "drift": drift,
-    **dict.fromkeys(("missing", "saturated", "frozen", "spikes"), room),
+    **dict.fromkeys(("missing", "saturated", "frozen", "spikes", "late"), room),
 }
 
 
@@ -315,7 +316,14 @@ def spikes(motion, readings, amount, rng):
     return readings + np.where(hit[:, None], amount * rng.standard_normal(readings.shape), 0.0)
 
 
-FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes": spikes}
+def late(motion, readings, amount, rng):
+    """Late by as much on average, each reading repeated until the next."""
+    time_s = motion.log.time_s
+    taken_s = np.floor(time_s / amount) * amount - 0.5 * amount
+    return np.column_stack([np.interp(taken_s, time_s, column) for column in readings.T])
+
+
+FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes": spikes, "late": late}
 
 
 # -- other gyroscopes: log, truth, where it moves

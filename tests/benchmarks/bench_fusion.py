@@ -8,6 +8,7 @@ off-line; a star marks where ours is more than 15 % worse than VQF.
 --inclination        the errors of inclination instead
 --coverage           how often errors are within one claimed sigma
 --scenes tune|judge  the trials' motion in invented magnetic fields, or with a worse gyroscope
+--north              where magnetic north is for the cameras, at first, at last and in movement
 --leave-one-out      engine and settings as chosen on all trials but one, scored on that one
 --sensitivity        each setting halved and doubled
 """
@@ -35,7 +36,7 @@ from broad import (
     rms_deg,
     trials_in,
 )
-from field_scenes import scenes
+from field_scenes import recorded, scenes
 from vqf import VQF
 
 from xsens.fusion.methods import Method
@@ -75,6 +76,8 @@ def main():
         print(timed(estimate, read_trial(folder, trials_in(folder)[0])[0], options[1]))
     elif "--coverage" in options:
         claims(folder)
+    elif "--north" in options:
+        norths(folder)
     elif "--scenes" in options:
         in_fields(folder, options[options.index("--scenes") + 1])
     elif "--leave-one-out" in options:
@@ -182,6 +185,21 @@ def claims(folder):
 
 def shares(cells):
     return "".join(f"{100 * s:8.0f} %{r:5.2f}" for s, r in zip(cells[::2], cells[1::2], strict=True))
+
+
+# -- north
+
+
+def norths(folder):
+    """Mean heading of the field's horizontal part in the cameras' world: what no compass can know better."""
+    print(f"{'magnetic north, degrees':42}{'first rest':>12}{'movement':>12}{'last rest':>12}")
+    for name in trials_in(folder):
+        motion = recorded(folder, name)
+        east, north, _ = motion.turns[motion.known].apply(motion.log.magnetometer_au[motion.known]).T
+        moved = np.flatnonzero(motion.moving[motion.known])
+        parts = (slice(0, moved[0]), moved, slice(moved[-1], None))
+        means = [np.rad2deg(np.arctan2(-east[part].mean(), north[part].mean())) for part in parts]
+        print(f"{name:42}" + "".join(f"{mean:12.2f}" for mean in means))
 
 
 # -- invented fields
