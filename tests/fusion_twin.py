@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
-
-from speckle3d.core.arrays import FloatArray
 from xsens.fusion.detectors import FieldMonitor, FieldReading
 from xsens.fusion.errorstate import ANGLE, BIAS, HEADING, SPEED, ErrorStateFilter
 from xsens.fusion.increments import Increment, Samples, increments_of, turn_matrix
-from xsens.fusion.settings import FusionSettings
 from xsens.fusion.smoothing import Smoothed
+
+from speckle3d.core.arrays import FloatArray
+from xsens.fusion.settings import FusionSettings
 
 _CHUNK = 64
 """Blocks summed with one bias, about two seconds; its later change is corrected to first order."""

@@ -1,14 +1,10 @@
-"""The engines that find an orientation, by name, and what each gives."""
+"""The engines that find an orientation, by name."""
 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, NamedTuple
 
 from speckle3d.core.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from speckle3d.core.arrays import BoolArray, FloatArray
 
 
 class Method(StrEnum):
@@ -40,24 +36,3 @@ def method_of(name: Method | str) -> Method:
         return Method(name)
     except ValueError:
         raise InvalidInputError(f"method: expected {', '.join(Method)}, got {name!r}") from None
-
-
-class Found(NamedTuple):
-    """Orientation of m samples of one stretch.
-
-    Attributes
-    ----------
-    xyzw : ndarray, shape (m, 4)
-        World from sensor, scalar last; x magnetic north, y west, z up.
-    sd_rad : ndarray, shape (m, 3)
-        Standard deviation about the world's axes.
-    bias_rad_s : ndarray, shape (m, 3)
-        Of the gyroscope.
-    disturbed, resting : ndarray of bool, shape (m,)
-    """
-
-    xyzw: FloatArray
-    sd_rad: FloatArray
-    bias_rad_s: FloatArray
-    disturbed: BoolArray
-    resting: BoolArray

@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
-from xsens.fusion.increments import Samples
-from xsens.fusion.methods import DEFAULT_METHOD, Found, Method, method_of
+from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
 from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.logs.samples import ImuLog
 
 if TYPE_CHECKING:
-    from xsens.fusion.smoothing import FilterState, FilterSteps
+    from xsens.fusion.stretch import Estimate
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -117,7 +117,7 @@ def orient(
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, method, notes)
-    joined = results[0] if len(results) == 1 else Found(*map(np.concatenate, zip(*results, strict=True)))
+    joined = _joined(results)
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
@@ -139,18 +139,18 @@ def orient(
 
 def _stretches(
     samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method, notes: list[str]
-) -> list[Found]:
+) -> list[Estimate]:
     """Each stretch by the method asked for, or by its on-line twin if it is short."""
-    from xsens.fusion.smoothing import fresh_filter  # which loads numba
+    from xsens.fusion.stretch import StretchFilter, smoothed  # which loads numba
 
-    step_s = float(np.median(samples.step_s))
-    kept = fresh_filter(settings)
     engine = None
     if method.is_vqf:
         from xsens.fusion.vqf_engine import VqfEngine
 
         engine = VqfEngine(settings.use_magnetometer)
-    results: list[Found] = []
+    results: list[Estimate] = []
+    kept = StretchFilter(settings)
+    step_s = float(np.median(samples.step_s))
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
         if first == last:
             continue
@@ -159,38 +159,15 @@ def _stretches(
         if first:
             stretch = replace(stretch, step_s=np.concatenate([[step_s], stretch.step_s[1:]]))
         offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
-        own = _smoothed(stretch, settings) if offline else _filtered(stretch, settings, kept, pause_s)
+        own = smoothed(stretch, settings) if offline else kept.run(stretch, pause_s)
         results.append(own if engine is None else engine.run(stretch, own, offline, pause_s))
     if engine is not None:
         notes += engine.notes
     return results
 
 
-def _filtered(stretch: Samples, settings: FusionSettings, kept: FilterState, pause_s: float) -> Found:
-    from xsens.fusion.smoothing import forward, within_steps
-
-    steps = forward(stretch, settings, kept, pause_s)
-    xyzw = within_steps(steps, steps.start, steps.start_bias)
-    return _each_sample(steps, xyzw, steps.sd_rad, steps.bias, steps.disturbed, steps.resting)
-
-
-def _smoothed(stretch: Samples, settings: FusionSettings) -> Found:
-    from xsens.fusion.smoothing import smooth, within_steps
-
-    steps, found = smooth(stretch, settings)
-    nodes, biases = found.matrices, found.bias_rad_s
-    xyzw = within_steps(steps, nodes[:-1], biases[:-1], nodes[1:])
-    return _each_sample(steps, xyzw, found.sd_rad[1:], biases[1:], found.disturbed, found.resting)
-
-
-def _each_sample(
-    steps: FilterSteps,
-    xyzw: FloatArray,
-    sd_rad: FloatArray,
-    bias_rad_s: FloatArray,
-    disturbed: BoolArray,
-    resting: BoolArray,
-) -> Found:
-    """Give every sample what was found for its step."""
-    each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
-    return Found(xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
+def _joined(results: list[Estimate]) -> Estimate:
+    if len(results) == 1:
+        return results[0]
+    columns = zip(*(vars(each).values() for each in results), strict=True)
+    return type(results[0])(*map(np.concatenate, columns))

@@ -8,7 +8,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from xsens.fusion.increments import Samples
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S
 from xsens.logs.samples import ImuLog
 
@@ -31,6 +31,9 @@ _TURNING_RAD_S = 0.2
 _FOLLOWED = 0.3
 """Smallest fraction of the gyroscope's turn that gravity must show: it shows 1 if the unit is rad/s, 1/57 if
 it is deg/s, 0 if the two do not belong together."""
+
+_LOST = 1.5
+"""A step longer than so many usual ones holds lost samples."""
 
 _NEAR_REST_M_S2 = 1.0
 _FEWEST = 20
@@ -85,7 +88,22 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if against is not None:
         notes.append(against)
     step_s = np.concatenate([[np.median(steps)], steps])
-    return used, Samples(step_s, rate, force, field), notes
+    return used, Samples(step_s, _bridging(rate, step_s), force, field), notes
+
+
+def _bridging(rate_rad_s: FloatArray, step_s: FloatArray) -> FloatArray:
+    """Mean rate since the sample before, shape (m, 3), where samples between the two were lost.
+
+    A reading tells the last usual step alone; before that the rate is taken for the mean of the two readings.
+    """
+    usual = float(np.median(step_s))
+    late = np.flatnonzero((step_s > _LOST * usual) & (step_s <= BRIDGED_S))
+    if not late.size:
+        return rate_rad_s
+    told = (usual / step_s[late])[:, None]
+    rates = rate_rad_s.copy()
+    rates[late] = 0.5 * ((1.0 + told) * rate_rad_s[late] + (1.0 - told) * rate_rad_s[late - 1])
+    return rates
 
 
 def _plain(values: FloatArray) -> FloatArray:

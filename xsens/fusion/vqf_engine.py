@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.fusion.increments import Samples
-from xsens.fusion.methods import Found
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S
+from xsens.fusion.stretch import Estimate
 from xsens.logs.parts import nwu_from
 
 if TYPE_CHECKING:
@@ -105,13 +105,13 @@ class VqfEngine:
             )
         return notes
 
-    def run(self, stretch: Samples, own: Found, offline: bool, pause_s: float = 0.0) -> Found:
+    def run(self, stretch: Samples, own: Estimate, offline: bool, pause_s: float = 0.0) -> Estimate:
         """Find the orientation of a stretch.
 
         Parameters
         ----------
         stretch : Samples
-        own : Found
+        own : Estimate
             The same by this package's engine: its variances, plus the squared distance of VQF from it about
             each of the world's axes, averaged over some seconds, are VQF's variances.
         offline : bool
@@ -139,7 +139,7 @@ class VqfEngine:
         disturbed = found["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
         if magnetic:
             self._fields.append(not disturbed.all())
-        return Found(
+        return Estimate(
             xyzw,
             np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi),
             found["bias"][at],

@@ -79,22 +79,34 @@ def test_vqf_is_given_the_log_as_it_is():
         )
 
 
+def only(log, kept):
+    """The log without the samples that were lost."""
+    vectors = (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)
+    return ImuLog(log.time_s[kept], *(values[kept] for values in vectors))
+
+
+@pytest.mark.parametrize("method", Method)
+def test_lost_samples_cost_little(method):
+    truth, log = swung(even())
+    kept = (np.arange(len(log)) + 12) % 25 >= 8  # holes of 0.09 s
+    found = orient(only(log, kept), method=method)
+    assert len(found) == kept.sum()
+    assert all("even clock" in note for note in found.notes)
+    # Measured 0.4 to 0.7; 1.9 to 2.4 where the reading after a hole is taken for all of it.
+    assert error_deg(truth[kept], found).max() < 1.2
+
+
 @pytest.mark.parametrize("method", VQFS)
-@pytest.mark.parametrize("clock", ["lost", "uneven", "bursts"])
+@pytest.mark.parametrize("clock", ["uneven", "bursts"])
 def test_a_clock_that_is_not_even_costs_little(method, clock):
-    rng = np.random.default_rng(2)
     time_s = even()
-    if clock == "lost":
-        time_s = time_s[rng.random(time_s.size) > 0.1]
-    elif clock == "uneven":
-        time_s = time_s + rng.uniform(-0.3, 0.3, time_s.size) / RATE_HZ
+    if clock == "uneven":
+        time_s = time_s + np.random.default_rng(2).uniform(-0.3, 0.3, time_s.size) / RATE_HZ
     else:
         time_s = (time_s.reshape(-1, 4)[:, :1] + 1e-3 * np.arange(4)).ravel()
     truth, log = swung(time_s)
     found = orient(log, method=method)
-    # Taken for an even clock, a tenth lost turns every movement 10 % short.
     assert error_deg(truth, found).max() < 1.5
-    assert len(found) == time_s.size
     assert [note for note in found.notes if f"even clock: {time_s.size} samples" in note] == [*found.notes]
     assert len(found.notes) == 1
 

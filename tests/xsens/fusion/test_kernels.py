@@ -6,10 +6,10 @@ import fusion_twin as twin
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-
 from xsens.fusion.increments import Samples
-from xsens.fusion.settings import FusionSettings
 from xsens.fusion.smoothing import forward, fresh_filter, smooth, within_steps
+
+from xsens.fusion.settings import FusionSettings
 
 RATE_HZ, SECONDS = 50.0, 40.0
 
