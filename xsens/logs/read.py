@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader, TextIOWrapper
 
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from xsens.logs.clocks import Stamps
 from xsens.logs.datamessages import legacy_log, mtdata2_log
 from xsens.logs.parts import Hints, Parts
@@ -85,15 +87,20 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     >>> len(log), log.lost
     (4, 2)
     """
-    data = read_bounded(path, MOST_BYTES)
-    if not data:
-        raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
-    if (other := _other_kind(data)) is not None:
-        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
-    if _is_text(data):
-        text = data.decode("utf-16" if data.startswith(_WIDE) else "utf-8-sig", errors="replace")
-        del data
-        return parse_text(text, hints, str(path))
+    with _opened(path, MOST_BYTES) as (file, size):
+        head = file.read(_SNIFFED)
+        file.seek(0)
+        if not size:
+            raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
+        if (other := next((kind for first, kind in _BEGINNINGS if head.startswith(first)), None)) is not None:
+            raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
+        if _is_text(head):
+            encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
+            with TextIOWrapper(file, encoding, errors="replace") as text:
+                return parse_text(text, hints, str(path))
+        data = file.read(size)
+    if not data.strip(b"\0"):
+        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got nothing but zeros")
     return parse_stream(data, hints, str(path))
 
 
@@ -105,6 +112,13 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
     FileError
         If the file cannot be read, is no file, or is larger than `most_bytes`.
     """
+    with _opened(path, most_bytes) as (file, size):
+        return file.read(size)
+
+
+@contextmanager
+def _opened(path: PathLike, most_bytes: int) -> Iterator[tuple[BufferedReader, int]]:
+    """A file and its size, refused as `read_bounded` does."""
     try:
         # A pipe is opened without waiting for its writer.
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
@@ -113,25 +127,19 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
                 raise FileError(f"{path}: expected a file, got something else")
             if found.st_size > most_bytes:
                 raise FileError(f"{path}: expected at most {most_bytes} bytes, got {found.st_size}")
-            return file.read(found.st_size)
-    except FileError:
+            yield file, found.st_size
+    except Speckle3DError:
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FileError(f"{path}: cannot be read: {reason}") from error
 
 
-def _is_text(data: bytes) -> bool:
+def _is_text(first: bytes) -> bool:
     """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
-    head = np.frombuffer(data[:_SNIFFED], dtype=np.uint8)
+    head = np.frombuffer(first, dtype=np.uint8)
     controls = int((_TEXT_CONTROLS[head]).sum())
-    return (data.startswith(_WIDE) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
-
-
-def _other_kind(data: bytes) -> str | None:
-    """Kind of a file that is clearly no log, in words; None if it may be one."""
-    zeros = "nothing but zeros" if not data.strip(b"\0") else None
-    return next((kind for beginning, kind in _BEGINNINGS if data.startswith(beginning)), zeros)
+    return (first.startswith(_WIDE) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
 
 
 # -- the sensor's own bytes

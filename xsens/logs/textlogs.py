@@ -1,4 +1,4 @@
-"""Read text logs: exports of the MT9 software, MT Manager and Xsens DOT, and plain comma-separated files.
+"""Read text logs: exports of the MT9 software, MT Manager and Xsens DOT, RepoIMU's, and plain CSV files.
 
 Exports of the MT9 software name no columns: time, then 3 angles; or acceleration, rate of turn, field and
 perhaps temperature; or the 9 elements of a matrix. All other files name their columns, in any order.
@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -19,37 +20,38 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
 from xsens.logs.clocks import Stamps, timeline_of_times
-from xsens.logs.parts import Hints, Parts, are_rotations, assembled, from_angles, on_clock, orientations_of
+from xsens.logs.parts import Hints, Parts, are_rotations, assembled, on_clock, only, oriented
 from xsens.logs.samples import VECTORS, Gap, ImuLog
-from xsens.logs.texttables import TextTable, number, read_table
+from xsens.logs.texttables import Names, TextTable, number, read_table
+from xsens.logs.worlds import Claim
 
-Names = tuple[str, ...]
 
-PLAIN_VECTORS: tuple[Names, ...] = tuple(
-    tuple(f"{sensor}_{axis}_{unit}" for axis in "xyz")
-    for sensor, unit in (("accelerometer", "m_s2"), ("gyroscope", "rad_s"), ("magnetometer", "au"))
-)
+def _named_xyz(*sensors: str) -> tuple[Names, ...]:
+    return tuple(tuple(sensor.replace("?", axis) for axis in "xyz") for sensor in sensors)
 
-_VENDOR_VECTORS: tuple[Names, ...] = tuple(
-    tuple(f"{sensor}_{axis}" for axis in "xyz") for sensor in ("acc", "gyr", "mag")
-)
+
+PLAIN_VECTORS = _named_xyz("accelerometer_?_m_s2", "gyroscope_?_rad_s", "magnetometer_?_au")
+_VENDOR_VECTORS = _named_xyz("acc_?", "gyr_?", "mag_?")
+_REPO_VECTORS = _named_xyz("imu acceleration_?", "imu gyroscope_?", "imu magnetometer_?")
 _QUATERNIONS: tuple[Names, ...] = (
     ("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),
     ("quat_q0", "quat_q1", "quat_q2", "quat_q3"),
     ("quat_w", "quat_x", "quat_y", "quat_z"),
 )
+_OPTICAL: Names = tuple(f"vicon orientation_{axis}" for axis in "wxyz")
 _ANGLES: tuple[Names, ...] = (("roll", "pitch", "yaw"), ("euler_x", "euler_y", "euler_z"))
 _MATRIX: Names = tuple(f"mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3))
-_TIME, _TICKS = "time_s", "sampletimefine"
+_TIMES, _TICKS = ("time_s", "time (s)"), "sampletimefine"
 _COUNTERS = ("packetcounter", "counter")
 
-_ALL = (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS, *_ANGLES, _MATRIX, _COUNTERS, (_TIME, _TICKS))
-_KNOWN = frozenset(name for names in _ALL for name in names)
+_GROUPS = (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_REPO_VECTORS, *_QUATERNIONS, _OPTICAL, *_ANGLES, _MATRIX)
+_KNOWN = frozenset(name for names in (*_GROUPS, _COUNTERS, _TIMES, (_TICKS,)) for name in names)
 
 _MEASURED = re.compile(r"(acc|gyr|mag)[a-z]*(?:[ _.]?([xyz])(?![a-z]))?", re.ASCII)
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
 _MOST_NAMED = 9
-_RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.]+)\s*hz", re.IGNORECASE)
+_RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.e+-]+)\s*hz", re.IGNORECASE)
+_WORLD = re.compile(r"# world: (\w+)")
 _GAP = re.compile(r"# gap: after sample (\d+), (\d+) lost, (\S+) s$")
 _ENOUGH = 1000
 """Lines that show whether nine numbers are a matrix."""
@@ -59,29 +61,25 @@ _ENOUGH = 1000
 class _Dialect:
     """Facts that a program's exports leave out: units, and the world of orientations."""
 
+    claim: Claim
     tick_s: float = 1e-4
     gyroscope_to_rad: float = 1.0
     counter_span: int = 1 << 16
-    world: str = "ENU"
-    notes: tuple[str, ...] = ()
 
 
-_MT_MANAGER = _Dialect(notes=("orientation: taken as seen from east, north, up, the program's default",))
-_DOT = _Dialect(
-    1e-6,
-    np.pi / 180.0,
-    1 << 32,
-    notes=("orientation: taken as seen from east, north, up, as the sensor's are",),
-)
-_PLAIN = _Dialect(world="NWU")
+_MT_MANAGER = _Dialect(Claim("ENU", "the program's default", assumed=True))
+_DOT = _Dialect(Claim("ENU", "as the sensor's are", assumed=True), 1e-6, np.pi / 180.0, 1 << 32)
+_PLAIN = _Dialect(Claim("NWU", "as plain files are"))
+_MT9 = _Dialect(Claim("NWU", "as the MT9 software's are"))
 
 
-def parse_text(text: str, hints: Hints | None = None, source: str = "text") -> ImuLog:
+def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: str = "text") -> ImuLog:
     """Read the samples in a table of numbers.
 
     Parameters
     ----------
-    text : str
+    text : str, or iterable of str
+        Lines, if it is not one string.
     hints : Hints, optional
     source : str
         Name of the text in errors.
@@ -92,16 +90,22 @@ def parse_text(text: str, hints: Hints | None = None, source: str = "text") -> I
         If there is no table, or it holds no samples of the sensor, or they have no time.
     """
     with naming(source):
-        table = read_table(text, _KNOWN)
-        out = table.left_out
-        parts = Parts(source, (f"{out} lines of another length were left out",) if out else ())
+        table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text, _KNOWN)
+        parts = Parts(source)
+        if table.left_out:
+            parts = parts.noting(
+                f"{table.left_out} lines of another length or without a number were left out"
+            )
+        if table.words:
+            parts = parts.noting(f"{table.words} cells hold something else than a number: missing")
         read = _named if table.names else _unnamed
         return read(table, parts, hints or Hints())
 
 
 def _dialect(table: TextTable) -> _Dialect:
-    if _TIME in table.names:
-        return _PLAIN
+    if any(time in table.names for time in _TIMES):
+        told = next((match[1] for line in table.header if (match := _WORLD.match(line))), None)
+        return _PLAIN if told is None else replace(_PLAIN, claim=Claim(told, "as the file says", final=True))
     return _DOT if any("devicetag" in line.lower() for line in table.header) else _MT_MANAGER
 
 
@@ -112,9 +116,9 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
         parts = parts.noting(f"{untimed} lines without a time were left out")
     parts = _measured(table, parts, dialect, hints)
     counter = next((c for name in _COUNTERS if (c := _whole(table.column(name))) is not None), None)
-    time_s = table.column(_TIME)
+    time_s = table.first((name,) for name in _TIMES)
     if time_s is not None:
-        log = assembled(timeline_of_times(time_s, counter), parts)
+        log = assembled(timeline_of_times(time_s[:, 0], counter), parts)
         told = _gaps_told(table.header, len(log))
         return log if told is None else replace(log, gaps=told)
     rate = _RATE.search("\n".join(table.header))
@@ -130,11 +134,12 @@ def _timed(table: TextTable) -> tuple[TextTable, int]:
     good = np.ones(len(table.values), dtype=bool)
     for name in (*_COUNTERS, _TICKS):
         good &= _is_whole(table.column(name))
-    time_s = table.column(_TIME)
-    good &= True if time_s is None else np.isfinite(time_s)
+    for name in _TIMES:
+        time_s = table.column(name)
+        good &= True if time_s is None else np.isfinite(time_s)
     if not good.any():
         raise InvalidInputError("expected lines with a time, got none")
-    return replace(table, values=table.values[good]), int((~good).sum())
+    return replace(table, values=only(table.values, good)), int((~good).sum())
 
 
 def _is_whole(column: FloatArray | None) -> BoolArray:
@@ -149,29 +154,29 @@ def _whole(column: FloatArray | None) -> IntArray | None:
 
 
 def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -> Parts:
-    found = [table.first(names) for names in zip(PLAIN_VECTORS, _VENDOR_VECTORS, strict=True)]
-    orientations, notes = orientations_of(
-        hints.world or dialect.world,
-        found[0],
-        table.first(_QUATERNIONS),
-        table.columns(*_MATRIX),
-        table.first(_ANGLES),
-    )
-    odd = _not_understood(table.names, dialect is _PLAIN)
+    found = [table.first(names) for names in zip(PLAIN_VECTORS, _VENDOR_VECTORS, _REPO_VECTORS, strict=True)]
+    odd = _not_understood(table.names, dialect is not _MT_MANAGER and dialect is not _DOT)
     odd = (*odd, *_incomplete(table.names, (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_QUATERNIONS[:1])))
-    if all(vectors is None for vectors in (*found, orientations)):
+    if found[1] is not None:
+        found[1] = found[1] * dialect.gyroscope_to_rad
+    parts = replace(parts.noting(*odd), vectors=tuple(found))
+    if (optical := table.columns(*_OPTICAL)) is not None:
+        claim = Claim("NWU", "", final=True)
+        parts = oriented(replace(parts, vectors=()), claim, Hints(), optical)
+        parts = replace(parts, vectors=tuple(found)).noting(
+            "orientation: by cameras, in a world of their own whose x and z need not be north and up"
+        )
+    else:
+        notations = (table.first(_QUATERNIONS), table.columns(*_MATRIX), table.first(_ANGLES))
+        parts = oriented(parts, dialect.claim, hints, *notations)
+    if all(vectors is None for vectors in (*found, parts.orientations)):
         got = "; ".join(odd) or "got none"
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {got}"
         )
-    notes = (*odd, *notes)
-    if orientations is not None and hints.world is None:
-        notes = (*notes, *dialect.notes)
     if found[0] is None and "freeacc_x" in table.names:
-        notes = (*notes, "acceleration without gravity is no accelerometer's reading and was left out")
-    if found[1] is not None:
-        found[1] = found[1] * dialect.gyroscope_to_rad
-    return replace(parts.noting(*notes), vectors=tuple(found), orientations=orientations)
+        parts = parts.noting("acceleration without gravity is no accelerometer's reading and was left out")
+    return parts
 
 
 def _gaps_told(header: tuple[str, ...], samples: int) -> tuple[Gap, ...] | None:
@@ -193,7 +198,7 @@ def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     if not timed.any():
         raise InvalidInputError("expected times in the first column, got none")
     time_s, values = table.values[timed, 0], table.values[timed, 1:]
-    return assembled(timeline_of_times(time_s), _mt9(values, parts, hints.world or "NWU"))
+    return assembled(timeline_of_times(time_s), _of_mt9(values, parts, hints))
 
 
 def _require_unnamed(table: TextTable, count: int) -> None:
@@ -205,13 +210,12 @@ def _require_unnamed(table: TextTable, count: int) -> None:
                 raise InvalidInputError("; ".join(_not_understood(names, plain=True)))
 
 
-def _mt9(values: FloatArray, parts: Parts, world: str) -> Parts:
+def _of_mt9(values: FloatArray, parts: Parts, hints: Hints) -> Parts:
     if values.shape[1] == 3:
-        return replace(parts, orientations=from_angles(values, world))
+        return oriented(parts, _MT9.claim, hints, angles_deg=values)
     if values.shape[1] == 9 and np.mean(are_rotations(values[:_ENOUGH].reshape(-1, 3, 3))) > 0.5:
-        orientations, _ = orientations_of(world, None, matrices=values)
         note = "matrices are taken row by row: nothing in this file can tell"
-        return replace(parts, orientations=orientations).noting(note)
+        return oriented(parts.noting(note), _MT9.claim, hints, matrices=values)
     return replace(parts, vectors=(values[:, :3], values[:, 3:6], values[:, 6:9]))
 
 
@@ -306,6 +310,8 @@ def _csv_columns(log: ImuLog) -> Iterator[tuple[str, FloatArray | IntArray]]:
 def _comments(log: ImuLog) -> Iterator[str]:
     for note in (f"source: {log.source}", *(f"note: {note}" for note in log.notes)):
         yield "# " + " ".join(note.split())
+    if log.world_from_sensor is not None:
+        yield "# world: NWU (x magnetic north, y west, z up)"
     yield f"# gaps: {len(log.gaps)}"
     for gap in log.gaps:
         yield f"# gap: after sample {gap.after_index}, {gap.lost} lost, {gap.duration_s!r} s"
