@@ -161,11 +161,8 @@ def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -
         found[1] = found[1] * dialect.gyroscope_to_rad
     parts = replace(parts.noting(*odd), vectors=tuple(found))
     if (optical := table.columns(*_OPTICAL)) is not None:
-        claim = Claim("NWU", "", final=True)
-        parts = oriented(replace(parts, vectors=()), claim, Hints(), optical)
-        parts = replace(parts, vectors=tuple(found)).noting(
-            "orientation: by cameras, in a world of their own whose x and z need not be north and up"
-        )
+        note = "orientation: by cameras, in a world of their own whose x and z need not be north and up"
+        parts = oriented(parts, _PLAIN.claim, Hints(as_stated=True), optical).noting(note)
     else:
         notations = (table.first(_QUATERNIONS), table.columns(*_MATRIX), table.first(_ANGLES))
         parts = oriented(parts, dialect.claim, hints, *notations)
