@@ -19,16 +19,13 @@ from xsens.logs.samples import Gap
 UNKNOWN_PAUSE_S = 1.0
 """Assumed pause before a new start of unknown length; longer than interpolation bridges."""
 
-RATES_HZ = (1e-3, 1e5)
+_RATES_HZ = (1e-3, 1e5)
 """Sampling rates that a sensor may have: they end at 2 kHz."""
 
 _TICK_SPAN = 1 << 32
 _RARE = 0.01
-_LONGER = 1.6
-"""A clock step of more periods is a gap, unless the clock is irregular."""
-
-_MUCH_LONGER = 10.0
-"""So is one of an irregular clock."""
+_LONGER, _MUCH_LONGER = 1.6, 10.0
+"""A clock step of more periods is a gap; the latter if the clock is irregular."""
 
 _SHORTER = 0.6
 """A loss makes no step shorter than the period, rounding to 10 ms at 64 Hz none below this share of it."""
@@ -43,11 +40,7 @@ class Stamps:
     Attributes
     ----------
     counter, ticks : ndarray of int, shape (m,), optional
-        As sent, wrapping round.
-    counter_span : int
-        Value at which the counter wraps round to 0.
-    tick_s : float
-        Duration of a tick.
+        As sent, wrapping round: the counter at `counter_span`, the ticks, of `tick_s` each, at 2**32.
     period_s : float
         Sampling period as configured; NaN if not known.
     others : ndarray of int, shape (m,), optional
@@ -70,17 +63,7 @@ class Stamps:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Times of the samples that are kept.
-
-    Attributes
-    ----------
-    kept : ndarray of bool, shape (m,)
-        False for repeated samples.
-    time_s : ndarray, shape (kept,)
-    counter : ndarray of int, shape (kept,), optional
-    gaps : tuple of Gap
-    notes : tuple of str
-    """
+    """Times of the samples that are kept (of those sent twice, one), with their counter made to rise."""
 
     kept: BoolArray
     time_s: FloatArray
@@ -91,10 +74,9 @@ class Timeline:
 
 def require_rate(rate_hz: float, what: str) -> None:
     """Raise `InvalidInputError` if no sensor has such a sampling rate."""
-    if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
-        raise InvalidInputError(
-            f"{what}: expected a rate of {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz, got {rate_hz:g}"
-        )
+    low, high = _RATES_HZ
+    if not low <= rate_hz <= high:
+        raise InvalidInputError(f"{what}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
 
 
 def timeline(stamps: Stamps) -> Timeline:
@@ -112,7 +94,10 @@ def timeline(stamps: Stamps) -> Timeline:
         raise InvalidInputError(
             f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
         )
-    kept = _first_of_repeats(stamps)
+    same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
+    if stamps.starts is not None:
+        same.append(~stamps.starts[1:])
+    kept = np.concatenate(([True], ~np.logical_and.reduce(same)))
     if not kept.all():
         arrays: dict[str, Any] = {k: v[kept] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
         stamps = replace(stamps, **arrays)
@@ -122,9 +107,7 @@ def timeline(stamps: Stamps) -> Timeline:
     counter = None
     if stamps.counter is not None and counts is not None:
         counter = stamps.counter[0] + np.concatenate(([0], np.cumsum(counts)))
-    repeats = int((~kept).sum())
-    notes = (f"{repeats} samples came twice; the second was left out",) if repeats else ()
-    return Timeline(kept, time_s, counter, steps.gaps(), (*notes, *steps.notes()))
+    return Timeline(kept, time_s, counter, steps.gaps(), steps.notes(kept, "came twice; the second was"))
 
 
 def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Timeline:
@@ -139,22 +122,11 @@ def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Ti
     never = np.zeros(seconds.size, dtype=bool)
     period_s = float(np.median(seconds)) if seconds.size else float("nan")
     if counter is None:
-        taken, irregular = _by_clock(seconds)
+        taken, irregular = _by_clock(seconds, never)
     else:
-        taken, irregular = _periods_counted(np.diff(counter), never), False
+        taken, irregular = _by_counter(np.diff(counter), never), False
     steps = _Steps(seconds, taken, never, never, period_s, irregular)
-    late = int((~kept).sum())
-    notes = (f"{late} samples whose time did not rise were left out",) if late else ()
-    return Timeline(kept, time_s, counter, steps.gaps(), (*notes, *steps.notes()))
-
-
-def _first_of_repeats(stamps: Stamps) -> BoolArray:
-    """False for a sample with the same stamps as the one before."""
-    same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
-    repeated = np.logical_and.reduce(same)
-    if stamps.starts is not None:
-        repeated &= ~stamps.starts[1:]
-    return np.concatenate(([True], ~repeated))
+    return Timeline(kept, time_s, counter, steps.gaps(), steps.notes(kept, "whose time did not rise were"))
 
 
 @dataclass(frozen=True)
@@ -179,9 +151,9 @@ class _Steps:
         at = np.flatnonzero((missing > 0) | self.anew | long)
         return tuple(Gap(int(i), int(missing[i]), float(self.seconds[i])) for i in at)
 
-    def notes(self) -> tuple[str, ...]:
-        """An irregular clock, and new starts."""
-        notes = []
+    def notes(self, kept: BoolArray, why: str) -> tuple[str, ...]:
+        """What was left out and why, an irregular clock, and new starts."""
+        notes = [] if kept.all() else [f"{int((~kept).sum())} samples {why} left out"]
         if self.irregular:
             shortest, longest = 1e3 * self.seconds.min(), 1e3 * self.seconds.max()
             notes.append(
@@ -202,19 +174,17 @@ def _steps(stamps: Stamps) -> tuple[_Steps, IntArray | None]:
     counts = None if stamps.counter is None else np.diff(stamps.counter) % span
     ticks = None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN
     anew = _starts_anew(stamps, counts, ticks)
-    others = 0 if stamps.others is None else np.diff(stamps.others)
-    seconds = None if ticks is None else ticks * stamps.tick_s
+    seconds = None if ticks is None else np.asarray(ticks * stamps.tick_s)
     if seconds is not None and not period_s > 0.0:
         period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
     if counts is None:
         assert seconds is not None  # one of the two is there
         taken, irregular = _by_clock(seconds, anew)
     else:
-        taken = _periods_counted(counts - others, anew)
+        taken = _by_counter(counts - (0 if stamps.others is None else np.diff(stamps.others)), anew)
         if seconds is None:
             seconds = taken * period_s
-        elif period_s > 0.0:
-            # The clock tells how often the counter went all the way round.
+        elif period_s > 0.0:  # the clock tells how often the counter went all the way round
             rounds = np.maximum(np.round((seconds / period_s - taken) / span), 0.0)
             counts, taken = counts + rounds.astype(np.int64) * span, taken + rounds * span
     pauses = _pauses(stamps, anew, seconds)
@@ -234,16 +204,16 @@ def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None
     return anew if known is None else np.asarray(anew | known[1:])
 
 
-def _periods_counted(counts: IntArray, anew: BoolArray) -> FloatArray:
+def _by_counter(counts: IntArray, anew: BoolArray) -> FloatArray:
     """Sampling periods of each step of the counter; a sensor may count several for each sample."""
     values, often = np.unique(counts[~anew], return_counts=True)
     stride = int(np.gcd.reduce(values[often >= _RARE * counts.size])) or 1
-    return np.maximum(np.maximum(counts, 1) / stride, 1.0)
+    return np.maximum(counts / stride, 1.0)
 
 
-def _by_clock(seconds: FloatArray, anew: BoolArray | None = None) -> tuple[FloatArray, bool]:
+def _by_clock(seconds: FloatArray, anew: BoolArray) -> tuple[FloatArray, bool]:
     """Whole periods of each step; whether the clock is irregular: jitter makes short steps, losses none."""
-    running = seconds if anew is None else seconds[~anew]
+    running = seconds[~anew]
     if not running.size:
         return np.ones(seconds.size), False
     period_s = running[running < 2.5 * np.median(running)].mean()

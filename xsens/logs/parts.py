@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.constants import g
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from xsens.logs.clocks import Stamps, Timeline, require_rate, timeline
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.logs.worlds import Claim, nwu_from, settle
+from xsens.logs.worlds import Claim, nwu_from, settle, upright_part
 from xsens.messages.rawcounts import RawCalibration
 
 _ABSURD = 1e6
@@ -29,10 +28,8 @@ any number format (1e-6), far below the effect of damage."""
 
 _WORST_ANGLE_DEG = 720.0
 
-_AT_REST_M_S2 = 0.5
-"""How far from gravity an acceleration may be and still show where up is."""
-
-_CLEARLY_BETTER = 0.5
+_CLEARLY_LESS = 0.25
+"""Ratio of what misses to upright, by which columns must be better than rows: half the angle."""
 
 
 @dataclass(frozen=True)
@@ -125,38 +122,36 @@ def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hi
 
 def assembled(line: Timeline, parts: Parts) -> ImuLog:
     """Build the log of the samples that the timeline keeps."""
-    missing = 0 if parts.there is None else int((~parts.there).sum())
-    lacking = (f"{missing} samples lack the sensor's own orientation",) if missing else ()
-    oriented = parts.there is not None and bool(parts.there.any())
-    sane = [_sane(only(vectors, line.kept)) for vectors in parts.vectors]
-    absurd = tuple(
-        f"{wrong} {name.split('_')[0]} readings out of range were left out"
-        for name, (_, wrong) in zip(VECTORS, sane, strict=True)
-        if wrong
-    )
+    there = None if parts.there is None or not parts.there.any() else parts.there
+    notes = list(parts.notes)
+    sane = []
+    for name, vectors in zip(VECTORS, parts.vectors, strict=True):
+        rows: FloatArray | None = only(vectors, line.kept)
+        if rows is not None and not _within(rows):
+            good = np.asarray((np.abs(rows) < _ABSURD).all(axis=1))
+            if wrong := int((np.abs(rows) >= _ABSURD).any(axis=1).sum()):
+                notes.append(f"{wrong} {name.split('_')[0]} readings out of range were left out")
+            rows = np.where(good[:, None], rows, np.nan) if good.any() else None
+        sane.append(rows)
+    if parts.there is not None and not parts.there.all():
+        notes.append(f"{int((~parts.there).sum())} samples lack the sensor's own orientation")
     return ImuLog(
         line.time_s,
-        sane[0][0],
-        sane[1][0],
-        sane[2][0],
-        only(parts.orientations, line.kept) if oriented else None,
+        sane[0],
+        sane[1],
+        sane[2],
+        None if there is None else only(parts.orientations, line.kept),
         line.counter,
         line.gaps,
-        (*parts.notes, *absurd, *lacking, *line.notes),
+        (*notes, *line.notes),
         parts.source,
-        parts.there[line.kept] if parts.there is not None and oriented else np.zeros(0, dtype=bool),
+        np.zeros(0, dtype=bool) if there is None else there[line.kept],
     )
 
 
-def _sane(rows: FloatArray | None) -> tuple[FloatArray | None, int]:
-    """Rows, NaN where they cannot be a measurement, None if none can; and how many are absurd numbers."""
-    if rows is None or (
-        rows.max(initial=0.0) < _ABSURD and rows.min(initial=0.0) > -_ABSURD
-    ):  # no NaN either
-        return rows, 0
-    good = np.asarray((np.abs(rows) < _ABSURD).all(axis=1))
-    wrong = int((np.abs(rows) >= _ABSURD).any(axis=1).sum())
-    return (np.where(good[:, None], rows, np.nan) if good.any() else None), wrong
+def _within(rows: FloatArray) -> bool:
+    """Whether all are numbers that may be a measurement; without a copy of them."""
+    return bool(rows.max(initial=0.0) < _ABSURD and rows.min(initial=0.0) > -_ABSURD)  # false for a NaN
 
 
 # -- the sensor's own orientation
@@ -185,14 +180,19 @@ def oriented(
         Row after row.
     angles_deg : ndarray, shape (m, 3), optional
     """
-    wxyz = quaternions
-    notes: tuple[str, ...] = ()
+    wxyz, acceleration, field = quaternions, parts.vectors[0], parts.vectors[2]
     if wxyz is None and matrices is not None:
-        by_rows, notes = _rows_or_columns(matrices.reshape(-1, 3, 3), parts.vectors[0])
-        wxyz = _or_nan(are_rotations(by_rows), lambda there: Rotation.from_matrix(by_rows[there]))
+        wxyz = _quaternions(matrices)
+        turned = _quaternions(matrices.reshape(-1, 3, 3).swapaxes(1, 2))
+        as_is, by_columns = (1.0 - abs(upright_part(q, acceleration) or 0.0) for q in (wxyz, turned))
+        if by_columns < _CLEARLY_LESS * as_is:
+            wxyz, parts = turned, parts.noting("matrices were taken by columns: so they turn gravity upright")
     elif wxyz is None and angles_deg is not None:
         good = np.asarray((np.abs(angles_deg) <= _WORST_ANGLE_DEG).all(axis=1))
-        wxyz = _or_nan(good, lambda there: Rotation.from_euler("xyz", angles_deg[there], degrees=True))
+        wxyz = np.full((good.size, 4), np.nan)
+        if good.any():
+            turns = Rotation.from_euler("xyz", angles_deg[good], degrees=True)
+            wxyz[good] = turns.as_quat(scalar_first=True)
     if wxyz is None:
         return parts
     with np.errstate(over="ignore", invalid="ignore"):
@@ -201,21 +201,9 @@ def oriented(
         claim = Claim(hints.world, "as given", final=True)
     world = claim.world.upper()
     if not hints.as_stated and there.any():
-        world, told = settle(claim, wxyz[there] if not there.all() else wxyz, *_where(there, parts))
-        notes = (*notes, *told)
-    return replace(parts.noting(*notes), orientations=_seen_from_north(wxyz, there, world), there=there)
-
-
-def _where(there: BoolArray, parts: Parts) -> tuple[FloatArray | None, FloatArray | None]:
-    return only(parts.vectors[0], there), only(parts.vectors[2], there)
-
-
-def _or_nan(there: BoolArray, rotations: Callable[[BoolArray], Rotation]) -> FloatArray:
-    """Quaternions of the rotations that are there, scalar first; NaN elsewhere."""
-    wxyz = np.full((there.size, 4), np.nan)
-    if there.any():
-        wxyz[there] = rotations(there).as_quat(scalar_first=True)
-    return wxyz
+        world, told = settle(claim, *(only(rows, there) for rows in (wxyz, acceleration, field)))
+        parts = parts.noting(*told)
+    return replace(parts, orientations=_seen_from_north(wxyz, there, world), there=there)
 
 
 def are_rotations(matrices: FloatArray) -> BoolArray:
@@ -225,22 +213,14 @@ def are_rotations(matrices: FloatArray) -> BoolArray:
     return np.asarray((off < _WORST_NORM) & (np.linalg.det(finite) > 0.0))
 
 
-def _rows_or_columns(
-    matrices: FloatArray, accelerometer_m_s2: FloatArray | None
-) -> tuple[FloatArray, tuple[str, ...]]:
-    """The matrices or their transposes: those that turn the acceleration at rest upright; a note if so."""
-    if accelerometer_m_s2 is None:
-        return matrices, ()
-    with np.errstate(over="ignore", invalid="ignore"):
-        rest = np.abs(np.linalg.norm(accelerometer_m_s2, axis=1) - g) < _AT_REST_M_S2
-    rest &= are_rotations(matrices)
-    as_is, turned = (
-        np.linalg.norm(np.abs(np.einsum(how, matrices[rest], accelerometer_m_s2[rest])) - [0, 0, g], axis=1)
-        for how in ("mij,mj->mi", "mji,mj->mi")
-    )
-    if rest.any() and np.median(turned) < _CLEARLY_BETTER * np.median(as_is):
-        return np.swapaxes(matrices, 1, 2), ("matrices were taken by columns: so they turn gravity upright",)
-    return matrices, ()
+def _quaternions(matrices: FloatArray) -> FloatArray:
+    """Quaternions of matrices, row after row; NaN of those that are no rotations."""
+    matrices = matrices.reshape(-1, 3, 3)
+    good = are_rotations(matrices)
+    wxyz = np.full((good.size, 4), np.nan)
+    if good.any():
+        wxyz[good] = Rotation.from_matrix(matrices[good]).as_quat(scalar_first=True)
+    return wxyz
 
 
 def _seen_from_north(wxyz: FloatArray, there: BoolArray, world: str) -> Rotation:

@@ -22,11 +22,8 @@ WORLDS = {
 }
 """``nwu_from_world`` of each world that the sensors know."""
 
-_FEWEST = 8
-"""Samples that tell a world: an eighth of a second or so."""
-
-_MOST = 20_000
-"""Samples looked at: medians of more are no better."""
+_FEWEST, _MOST = 8, 20_000
+"""Samples that tell a world, and that are looked at: medians of more are no better."""
 
 _AT_REST = 0.05
 """Share of its median by which the acceleration's length may differ in samples that are preferred."""
@@ -46,18 +43,9 @@ _DECLINATION_DEG = 10.0
 
 @dataclass(frozen=True)
 class Claim:
-    """World that a log, its program's default or the user names.
+    """World named, and by whom in words.
 
-    Attributes
-    ----------
-    world : str
-        ENU, NED or NWU.
-    by : str
-        Who says so, in words.
-    final : bool
-        True if nothing outweighs it.
-    assumed : bool
-        True if nobody said so: what is taken is noted.
+    `final` if nothing outweighs it; `assumed` if nobody said so, which is always noted.
     """
 
     world: str
@@ -91,46 +79,41 @@ def settle(
         If acceleration and orientation contradict each other, unless the claim is final.
     """
     taken = claim.world.upper()
-    nwu_from(taken)
-    up = _median_up(wxyz, acceleration)
+    up = upright_part(wxyz, acceleration)
     if up is None:
         note = f"orientation: taken as {taken}, {claim.by}: no accelerometer's reading tells"
         return taken, ((note,) if claim.assumed else ())
     if abs(up) < _UPRIGHT:
-        found = f"the orientation turns the accelerometer's reading {_tilt(up)} degrees from the vertical"
+        tilt = np.degrees(np.arccos(up))
+        found = f"the orientation turns the accelerometer's reading {tilt:.0f} degrees from the vertical"
         if claim.final:
             return taken, (f"orientation: {taken}, {claim.by}, although {found}",)
         raise InvalidInputError(f"expected an orientation in ENU, NWU or NED, but {found}: give --world")
-    north_deg = _median_north_deg(wxyz, field)
+    north_deg = _north_deg(wxyz, field)
     shown = _shown(up > 0.0, north_deg, taken)
     world = taken if claim.final else shown
     return world, tuple(_notes(claim, world, shown, north_deg))
 
 
-def _median_up(wxyz: FloatArray, acceleration: FloatArray | None) -> float | None:
+def upright_part(wxyz: FloatArray, acceleration: FloatArray | None) -> float | None:
     """Vertical part of the median acceleration, at rest if there is any, over its length; None without."""
     vectors = _turned(wxyz, acceleration)
     if vectors is None:
         return None
     length = np.linalg.norm(vectors, axis=1)
-    usual = float(np.median(length))
-    rest = np.abs(length - usual) < _AT_REST * usual
-    if not usual > 0.0:
-        return None
-    return float(np.median(vectors[rest if rest.sum() >= _FEWEST else slice(None), 2]) / usual)
+    rest = np.abs(length - np.median(length)) < _AT_REST * np.median(length)
+    return float(np.median(vectors[rest if rest.sum() >= _FEWEST else slice(None), 2]) / np.median(length))
 
 
-def _median_north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
+def _north_deg(wxyz: FloatArray, field: FloatArray | None) -> float:
     """Direction of the field's horizontal part from x towards y; NaN if it has none."""
     vectors = _turned(wxyz, field)
     if vectors is None:
         return float("nan")
-    across = np.hypot(vectors[:, 0], vectors[:, 1])
-    there = across > 0.0
-    mean = (vectors[there, :2] / across[there, None]).mean(axis=0) if there.any() else np.zeros(2)
-    if np.hypot(*mean) < _STEADY:
+    along = vectors[:, :2] / np.maximum(np.hypot(vectors[:, 0], vectors[:, 1]), 1e-12)[:, None]
+    if np.hypot(*along.mean(axis=0)) < _STEADY:
         return float("nan")
-    x, y = np.median(vectors[there, :2] / across[there, None], axis=0)
+    x, y = np.median(along, axis=0)
     return float(np.degrees(np.arctan2(y, x)))
 
 
@@ -153,25 +136,21 @@ def _shown(z_is_up: bool, north_deg: float, taken: str) -> str:
     for world, axis_deg in (("NWU", 0.0), ("ENU", 90.0)):
         if abs(_apart(north_deg, axis_deg)) <= _NORTH_DEG:
             return world
-    return taken if taken != "NED" else "ENU"
+    return taken if taken != "NED" else "NWU"
 
 
 def _apart(degrees: float, others: float) -> float:
     return (degrees - others + 180.0) % 360.0 - 180.0
 
 
-def _tilt(up: float) -> str:
-    return f"{np.degrees(np.arccos(np.clip(up, -1.0, 1.0))):.0f}"
-
-
 def _notes(claim: Claim, world: str, shown: str, north_deg: float) -> list[str]:
     """What was taken for the world and why, and where its x is not north."""
-    notes = []
+    notes, taken = [], claim.world.upper()
     told = "accelerometer" if np.isnan(north_deg) else "accelerometer and magnetometer"
     if world != shown:
         notes.append(f"orientation: {world}, {claim.by}; by its own {told} it is {shown}")
-    elif world != claim.world.upper():
-        notes.append(f"orientation: {world} by its own {told}, not {claim.world.upper()}, {claim.by}")
+    elif world != taken:
+        notes.append(f"orientation: {world} by its own {told}, not {taken}, {claim.by}")
     elif claim.assumed and np.isnan(north_deg):
         notes.append(f"orientation: taken as {world}, {claim.by}: no steady field tells; see --world")
     elif claim.assumed:
