@@ -195,8 +195,7 @@ def oriented(
             wxyz[good] = turns.as_quat(scalar_first=True)
     if wxyz is None:
         return parts
-    with np.errstate(over="ignore", invalid="ignore"):
-        there = np.asarray(np.abs(np.sqrt(np.einsum("ij,ij->i", wxyz, wxyz)) - 1.0) < _WORST_NORM)
+    there = of_unit_length(wxyz)
     if hints.world is not None:
         claim = Claim(hints.world, "as given", final=True)
     world = claim.world.upper()
@@ -204,6 +203,12 @@ def oriented(
         world, told = settle(claim, *(only(rows, there) for rows in (wxyz, acceleration, field)))
         parts = parts.noting(*told)
     return replace(parts, orientations=_seen_from_north(wxyz, there, world), there=there)
+
+
+def of_unit_length(wxyz: FloatArray) -> BoolArray:
+    """Mark quaternions, shape (m, 4), that are no damage."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.abs(np.sqrt(np.einsum("ij,ij->i", wxyz, wxyz)) - 1.0) < _WORST_NORM)
 
 
 def are_rotations(matrices: FloatArray) -> BoolArray:

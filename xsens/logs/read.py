@@ -12,12 +12,11 @@ import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
-from xsens.logs.clocks import Stamps
 from xsens.logs.datamessages import legacy_log, mtdata2_log
 from xsens.logs.parts import Hints, Parts
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
-from xsens.messages.control import MessageId, utc_time_s
+from xsens.messages.control import MessageId
 from xsens.messages.framing import Frames, find_frames
 
 PathLike = str | os.PathLike[str]
@@ -51,8 +50,6 @@ _BEGINNINGS = (
 """First bytes of files that are no log of the sensor, so that an error can name what was given instead."""
 
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
-_STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
-"""Messages after which the sensor's counter may have begun anew."""
 
 
 def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
@@ -167,7 +164,7 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
         which = _of_one_kind(frames)
         parts = Parts(source, tuple(_passed_over(frames, which)))
         read = legacy_log if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_log
-        return read(frames, which, _stretches(frames, which), parts, hints or Hints())
+        return read(frames, which, parts, hints or Hints())
 
 
 def _of_one_kind(frames: Frames) -> IntArray:
@@ -188,23 +185,3 @@ def _passed_over(frames: Frames, which: IntArray) -> Iterator[str]:
         yield f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message"
     if others := int(np.isin(frames.mid, _DATA).sum()) - which.size:
         yield f"{others} data messages of another kind or unit were left out"
-
-
-def _stretches(frames: Frames, which: IntArray) -> Stamps:
-    """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
-    starts = np.zeros(which.size, dtype=bool)
-    utc = np.flatnonzero(frames.mid == MessageId.UTC_TIME)
-    computer_s = np.full(which.size, np.nan) if utc.size else None
-    starts[_next_data(np.flatnonzero(np.isin(frames.mid, _STARTS)), which)[0]] = True
-    if computer_s is not None:
-        for after, i in zip(*_next_data(utc, which), strict=True):
-            computer_s[after] = utc_time_s(frames.message(int(i)))
-    return Stamps(starts=starts, computer_s=computer_s)
-
-
-def _next_data(messages: IntArray, which: IntArray) -> tuple[IntArray, IntArray]:
-    """Positions in `which` of the first data after each of `messages`, and the last message before those."""
-    after = np.searchsorted(which, messages)
-    after, messages = after[after < which.size], messages[after < which.size]
-    last = np.append(after[1:] != after[:-1], True)[: after.size]
-    return after[last], messages[last]
