@@ -219,12 +219,14 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
+    held = None
     inside = _inside_probe(path)
+    if inside is None and (held := _ridden_along(path)) is not None:
+        inside = log_of(held, path.name)
     if inside is not None:
+        if world is not None:
+            note("--world is not used: it is for logs, and the world of a recording's stream is known")
         return inside
-    held = _ridden_along(path)
-    if held is not None:
-        return log_of(held, path.name)
     return read_log(path, Hints(rate_hz=rate_hz, world=world))
 
 

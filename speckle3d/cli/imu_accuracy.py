@@ -19,6 +19,7 @@ from speckle3d.cli.imu import (
     orientation_of,
     read,
     require_finite_offset,
+    tell,
 )
 from speckle3d.core.errors import InvalidInputError, naming
 
@@ -75,6 +76,7 @@ def imu_accuracy(
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
     require_finite_offset(time_offset_s)
     log = read(log_file, rate_hz, world)
+    tell(log)
     mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
     if not mountings:
         note("no --calibration: the sensor's axes are taken for the image's")
@@ -141,4 +143,6 @@ def _tracked(path: Path) -> TimedRotations:
     if is_tum(path):
         poses = read_tum(path)
         return TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
-    return read(path).rotations()
+    log = read(path)
+    tell(log)
+    return log.rotations()
