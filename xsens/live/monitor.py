@@ -112,7 +112,7 @@ class Monitor:
         self._note = ""
         self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_ARRIVALS)
         self._framer = Framer()
-        self._header, self._hints, self._pending = b"", Hints(), bytearray()
+        self._header, self._hints, self._pending = b"", Hints(as_stated=True), bytearray()
         self._counter: int | None = None
         self._attitude = _Attitude()
         self._field = _Field()
@@ -122,7 +122,7 @@ class Monitor:
         with self._lock:
             self._digest()
             self._header = b"".join(encode(message) for message in info.header)
-            self._hints = Hints(rate_hz=info.rate_hz if info.rate_hz > 0 else None)
+            self._hints = Hints(rate_hz=info.rate_hz if info.rate_hz > 0 else None, as_stated=True)
             self._connected, self._counter = True, None
             self._framer = Framer()
             self._arrivals.clear()
