@@ -44,7 +44,6 @@ def calibration(seed=0):
         offsets=rng.integers(29000, 34000, (3, 3)).astype(float),
         gains=np.round(np.array([[1270.0], [1250.0], [8000.0]]) * rng.uniform(0.9, 1.1, (3, 3)) * 256) / 256,
         misalignments=np.round((np.eye(3) + rng.normal(0, 0.01, (3, 3, 3))) * 2**14) / 2**14,
-        housing=np.eye(3),
     )
 
 

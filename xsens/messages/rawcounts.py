@@ -26,12 +26,11 @@ NOT_COMPENSATED = (
     "nor the housing's alignment applied"
 )
 
-_ID, _PERIOD, _OFFSETS, _GAINS = 0, 81, 87, 105
-_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER, _HOUSING = 8, 26, 132, 150
+_ACCELEROMETER, _GYROSCOPE, _PERIOD, _OFFSETS, _GAINS, _MAGNETOMETER = 8, 26, 81, 87, 105, 132
+"""First bytes in the block; the serial number is at its beginning."""
+
 _ROWS = 2048
 """Rows converted at a time: they stay in the cache, and are too few for BLAS to wake a team of threads."""
-
-_Q14, _Q8 = 2.0**14, 2.0**8
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,6 @@ class RawCalibration:
         Counts per m/s², rad/s and unit of field.
     misalignments : ndarray, shape (3, 3, 3)
         ``sensing axes from sensor axes`` of each of the three sensors.
-    housing : ndarray, shape (3, 3)
-        Alignment with the housing, not applied.
 
     Raises
     ------
@@ -63,7 +60,6 @@ class RawCalibration:
     offsets: FloatArray
     gains: FloatArray
     misalignments: FloatArray
-    housing: FloatArray
 
     def __post_init__(self) -> None:
         if not (self.gains > 0.0).all():
@@ -95,11 +91,12 @@ class RawCalibration:
                 f"calibration block: expected message {MessageId.EMTS:#04x} of {BLOCK_SIZE} bytes, "
                 f"got {message.mid:#04x} of {len(data)}"
             )
-        number, period = struct.unpack_from(">I", data, _ID)[0], struct.unpack_from(">H", data, _PERIOD)[0]
-        matrices = [_matrix(data, at) for at in (_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER)]
+        number, period = struct.unpack_from(f">I{_PERIOD - 4}xH", data)
+        sensors = (_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER)
+        matrices = [np.frombuffer(data, ">i2", 9, at).reshape(3, 3) / 2.0**14 for at in sensors]
         offsets = np.frombuffer(data, ">u2", 9, _OFFSETS).reshape(3, 3).astype(float)
-        gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [65536.0, 256.0, 1.0] / _Q8
-        return cls(number, period, offsets, gains, np.stack(matrices), _matrix(data, _HOUSING))
+        gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [256.0, 1.0, 1.0 / 256.0]
+        return cls(number, period, offsets, gains, np.stack(matrices))
 
     def to_units(self, counts: npt.ArrayLike) -> FloatArray:
         """Acceleration in m/s², rate of turn in rad/s and field in arbitrary units.
@@ -121,7 +118,3 @@ class RawCalibration:
             some = slice(at, at + _ROWS)
             np.matmul(rows[some] - self.offsets.ravel(), mixing.reshape(9, 9).T, out=values[some])
         return np.moveaxis(values.reshape(-1, 3, 3), 1, 0)
-
-
-def _matrix(data: bytes, at: int) -> FloatArray:
-    return np.frombuffer(data, ">i2", 9, at).reshape(3, 3) / _Q14
