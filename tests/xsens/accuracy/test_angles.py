@@ -228,9 +228,9 @@ class TestMechanism:
             ("tilt,roll\n1,2\n", r"settings.csv:1: .*tilt, roll"),
             ("tilt,yaw,tilt\n1,2,3\n", ":1: .*tilt, yaw, tilt"),
             ("1,2,3,4\n", ":1: .* 4$"),
-            ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: .* 2 .* 3$"),
-            ("tilt,yaw\n1,x\n", ":2: .*'x'"),
-            ("tilt,yaw\n1,inf\n", ":2: .*'inf'"),
+            ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: .* 2 .*'1, 2, 3'"),
+            ("tilt,yaw\n1,x\n", ":2: .*'1, x'"),
+            ("tilt,yaw\n1,inf\n", ":2: .*'1, inf'"),
             ("tilt,yaw,until_s\n1,2,3\n", "until_s: .*time_s"),
             (
                 "tilt,yaw,time_s,until_s\n1,2,3,4\n1,2,5,4\n",

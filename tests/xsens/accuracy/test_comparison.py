@@ -37,7 +37,7 @@ def test_a_turn_about_north_is_inclination_alone():
 def test_the_other_stream_is_interpolated_and_must_overlap():
     one, other = streams(Rotation.identity())
     half = TimedRotations(TIME_S[::2], other.world_from_sensor[::2])
-    # Between samples a tenth of a second apart, of up to 1 rad/s^2 (angles of 0.4, and yaw's rate of 1): 0.1**2 / 8.
+    # Between samples a tenth of a second apart, of up to 1 rad/s^2: 0.1**2 / 8.
     assert compare_orientations(one, half).total_rms_rad < 1.25e-3
     with pytest.raises(InsufficientDataError):
         compare_orientations(one, TimedRotations(TIME_S + 100.0, other.world_from_sensor))
