@@ -98,5 +98,5 @@ def _stream(given: object) -> TimedRotations:
     return stream
 
 
-def _rms(values: npt.NDArray[np.floating]) -> float:
+def _rms(values: npt.ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
