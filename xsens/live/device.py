@@ -101,6 +101,8 @@ class DeviceInfo:
 class Device:
     """A sensor on an open port, which answers requests and sends data.
 
+    All methods raise `DeviceError` if the port is gone.
+
     Parameters
     ----------
     port : serial.Serial
@@ -120,13 +122,7 @@ class Device:
         self.baud = int(port.baudrate)
 
     def receive(self) -> list[Message]:
-        """Messages that arrive within a twentieth of a second.
-
-        Raises
-        ------
-        DeviceError
-            If the port is gone.
-        """
+        """Messages that arrive within a twentieth of a second."""
         with self._there():
             data = self._port.read(max(1, self._port.in_waiting))
         if data and self.tap is not None:
@@ -138,14 +134,12 @@ class Device:
         with self._there():
             self._port.write(encode(message))
 
-    def _waiting(self) -> bool:
-        with self._there():
-            return bool(self._port.in_waiting)
-
     @contextmanager
     def _there(self) -> Iterator[None]:
         try:
             yield
+        except DeviceError:
+            raise
         except OSError as error:  # pyserial's own errors are OSErrors
             raise DeviceError(f"{self._port.name}: the port is gone: {_first_line(error)}") from error
 
@@ -157,8 +151,9 @@ class Device:
         DeviceError
             If there is no answer after `tries`, or the answer is an error.
         """
-        while self._waiting():  # a late answer to an earlier request is not one to this
-            self.receive()
+        with self._there():
+            while self._port.in_waiting:  # a late answer to an earlier request is not one to this
+                self.receive()
         for _ in range(tries):
             self.send(Message(mid, payload))
             deadline = time.monotonic() + ANSWER_S
@@ -183,10 +178,6 @@ class Device:
         except DeviceError:
             return None
 
-    def go_to_config(self, tries: int = _TRIES) -> None:
-        """Bring the sensor to take settings; it stops sending data."""
-        self.request(MessageId.GO_TO_CONFIG, tries=tries)
-
 
 def connect(port_name: str, baud: int | None = None) -> Device:
     """Open a port with a sensor on it and bring the sensor to take settings.
@@ -203,7 +194,7 @@ def connect(port_name: str, baud: int | None = None) -> Device:
         device = Device(_opened(port_name, rate))
         with ExitStack() as undo, suppress(DeviceError):
             undo.callback(device.close)
-            device.go_to_config(tries=2 if baud is None else _TRIES)
+            device.request(MessageId.GO_TO_CONFIG, tries=2 if baud is None else _TRIES)
             undo.pop_all()
             return device
     tried = ", ".join(str(rate) for rate in rates)

@@ -160,7 +160,7 @@ class Recorder:
         device.request(MessageId.GO_TO_MEASUREMENT)
         self._listen(device)
         with suppress(DeviceError):  # what it sends until it stops is recorded as well
-            device.go_to_config()
+            device.request(MessageId.GO_TO_CONFIG)
 
     def _take(self, data: bytes) -> None:
         self._file.append(data)
@@ -182,7 +182,7 @@ class Recorder:
         while not self._stop.is_set():
             try:
                 device = device or connect(self._port, self._baud)
-                device.go_to_config(tries=1)
+                device.request(MessageId.GO_TO_CONFIG, tries=1)
                 info, number = prepare(device, self._settings), self._info.device_id
                 if info.device_id == number:
                     self._info = info

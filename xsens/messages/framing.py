@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, ByteArray, IntArray
+from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 
 PREAMBLE = 0xFA
@@ -206,7 +206,17 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
 
     Unless `final`, a possible message that later bytes may complete, and all after it, is left for later.
     """
-    start, end, whole = _candidates(data)
+    start = np.flatnonzero(data == PREAMBLE)
+    padded = np.append(data, np.zeros(5, dtype=np.uint8))
+    length = padded[start + 3].astype(np.int64)
+    extended = np.flatnonzero(length == _EXTENDED)
+    at = start[extended]
+    length[extended] = 256 * padded[at + 4].astype(np.int64) + padded[at + 5]
+    end = start + 5 + length
+    end[extended] += 2
+    plausible = length <= MOST_PAYLOAD
+    start, end = start[plausible], end[plausible]
+    whole = end <= data.size  # without the whole head it is not, as what is missing is taken for zeros
     unfinished = start[~whole]
     start, end = start[whole], end[whole]
     summed = np.cumsum(data, dtype=np.uint8)
@@ -219,20 +229,6 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
     used = int(waiting[0]) if waiting.size else data.size
     settled = start < used
     return start[settled], end[settled], used
-
-
-def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, BoolArray]:
-    """First and end bytes of possible messages, and whether `data` holds all of their bytes."""
-    start = np.flatnonzero(data == PREAMBLE)
-    last = data.size - 1
-    length = data[np.minimum(start + 3, last)].astype(np.int64)
-    extended = (length == _EXTENDED) & (start + 3 <= last)
-    at = np.minimum(start[extended] + 4, last)
-    length[extended] = 256 * data[at].astype(np.int64) + data[np.minimum(at + 1, last)]
-    end = start + 5 + 2 * extended + length
-    header = start + 4 + 2 * extended <= data.size
-    plausible = ~header | (length <= MOST_PAYLOAD)
-    return start[plausible], end[plausible], (header & (end <= data.size))[plausible]
 
 
 def _without_overlaps(start: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
