@@ -107,7 +107,7 @@ class Monitor:
 
     def _begin(self, info: DeviceInfo) -> None:
         self._header = b"".join(map(encode, info.header))
-        self._hints = Hints(rate_hz=info.rate_hz if info.rate_hz > 0 else None)
+        self._hints = Hints(info.rate_hz if info.rate_hz > 0 else None, as_stated=True)
         self._framer, self._pending = Framer(), list[Message]()
         self._arrivals = deque[tuple[float, int]](maxlen=1 << 12)
         self._counter: int | None = None
