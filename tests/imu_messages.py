@@ -58,19 +58,19 @@ def _item(item):
     return struct.pack(">HB", item.identifier, len(data)) + data
 
 
-def configuration_message(c):
-    """The answer to a request for the configuration."""
-    payload = struct.pack(">IHH88xH", c.device_id, c.period, c.skip_factor, len(c.units))
-    for u in c.units:
-        payload += struct.pack(">IHHI8x", u.device_id, u.data_length, u.output_mode, u.output_settings)
+def configuration_message(units, period=1152, skip=0, length=0):
+    """The answer to a request for the configuration, of units of some mode and settings."""
+    payload = struct.pack(">IHH88xH", 0x1234, period, skip, len(units))
+    for mode, settings in units:
+        payload += struct.pack(">IHHI8x", 0x1234, length, mode, settings)
     return Message(MessageId.CONFIGURATION, payload)
 
 
 def calibration_message(unit):
     """The calibration block of an MT9-B; its housing square, what is not understood of it zero."""
     data = bytearray(168)
-    struct.pack_into(">I", data, 0, unit.device_id)
-    struct.pack_into(">H", data, 81, unit.period)
+    struct.pack_into(">I", data, 0, 0x7154)
+    struct.pack_into(">H", data, 81, round(115200 / unit.rate_hz))
     data[87:105] = np.round(unit.offsets).astype(">u2").tobytes()
     gains = np.round(unit.gains * 256).astype(">u4").reshape(9, 1).view(np.uint8)
     data[105:132] = gains[:, 1:].tobytes()

@@ -18,6 +18,9 @@ from xsens.messages.framing import Message
 BASE_RATE_HZ = 115200
 """Ticks per second of the sampling period."""
 
+_ON_REQUEST = 0xFFFF
+"""Skip factor of a sensor that sends data only when it is asked for them."""
+
 
 class MessageId(IntEnum):
     """Ids of requests and data, and of those replies that are read; a reply's is its request's plus one."""
@@ -54,6 +57,11 @@ _ERRORS = {
 }
 
 
+def rate_of(period: int) -> float:
+    """Rate in Hz by a period in ticks; NaN if it is zero."""
+    return BASE_RATE_HZ / period if period else float("nan")
+
+
 def error_of(message: Message) -> str:
     """Text of an error message of the sensor."""
     code = message.payload[0] if message.payload else -1
@@ -61,18 +69,16 @@ def error_of(message: Message) -> str:
 
 
 class UnitConfiguration(NamedTuple):
-    """Serial number of a unit, bytes of its part of an MTData message, and its layout (`DataLayout`)."""
+    """Output mode and settings of a unit: see `xsens.messages.mtdata.DataLayout`."""
 
-    device_id: int
-    data_length: int
     output_mode: int
     output_settings: int
 
 
-_HEAD = struct.Struct(">IHH88xH")
-"""Device, period, skip factor; synchronisation, date and time, which are not read; number of units."""
+_HEAD = struct.Struct(">4xHH88xH")
+"""Period, skip factor, number of units; serial number, synchronisation, date and time are not read."""
 
-_UNIT = struct.Struct(">IHHI8x")
+_UNIT = struct.Struct(">6xHI8x")
 
 
 @dataclass(frozen=True)
@@ -81,39 +87,27 @@ class Configuration:
 
     Attributes
     ----------
-    device_id : int
-        Of the unit, or of the master if there are several units.
-    period : int
-        Sampling period, in 1/115200 s.
-    skip_factor : int
-        Samples left out between two that are sent; 65535 if data are sent only on request.
+    rate_hz : float
+        Messages per second; NaN if they are sent only on request.
     units : tuple of UnitConfiguration
+        More than one behind a master.
     """
 
-    device_id: int
-    period: int
-    skip_factor: int
+    rate_hz: float
     units: tuple[UnitConfiguration, ...]
-
-    @property
-    def rate_hz(self) -> float:
-        """Messages per second; NaN if they are sent only on request."""
-        if self.period == 0 or self.skip_factor == 0xFFFF:
-            return float("nan")
-        return BASE_RATE_HZ / (self.period * (self.skip_factor + 1))
 
     @classmethod
     def from_message(cls, message: Message) -> Configuration:
         """Decode; raises `InvalidInputError` if the length does not suit the number of units."""
         payload = message.payload
-        number, period, skip, count = _HEAD.unpack_from(payload.ljust(_HEAD.size, b"\0"))
+        period, skip, count = _HEAD.unpack_from(payload.ljust(_HEAD.size, b"\0"))
         if len(payload) != _HEAD.size + count * _UNIT.size:
             raise InvalidInputError(
                 f"configuration: expected {_HEAD.size} bytes and {_UNIT.size} for each of {count} units, "
                 f"got {len(payload)}"
             )
-        units = tuple(map(UnitConfiguration._make, _UNIT.iter_unpack(payload[_HEAD.size :])))
-        return cls(number, period, skip, units)
+        units = map(UnitConfiguration._make, _UNIT.iter_unpack(payload[_HEAD.size :]))
+        return cls(rate_of(0 if skip == _ON_REQUEST else period * (skip + 1)), tuple(units))
 
 
 _UTC = struct.Struct(">IH6B")

@@ -1,7 +1,7 @@
 """Decode the legacy data message MTData, and the number formats it shares with MTData2.
 
 The message does not describe its own layout: output mode and settings do, known from the configuration or
-from whoever set them. A unit on a bus with a master, and the MT9-B, put the counter first instead of last.
+from whoever set them. The MT9-B puts the counter first instead of last.
 """
 
 from __future__ import annotations
@@ -110,8 +110,6 @@ class DataLayout:
     mode, settings : int
         See `OutputMode` and `OutputSettings`; bits 2 and 3 of the settings choose quaternion, Euler angles or
         matrix, bits 8 and 9 the type of real numbers (`REAL`).
-    counter_first : bool
-        As behind a master, and always for the MT9-B.
 
     Raises
     ------
@@ -121,7 +119,6 @@ class DataLayout:
 
     mode: int
     settings: int = OutputSettings.COUNTER
-    counter_first: bool = False
 
     def __post_init__(self) -> None:
         raw = self.mode & (OutputMode.RAW | OutputMode.MT9)
@@ -147,7 +144,7 @@ class DataLayout:
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
         utc = (Field("utc", 12, ">u1"),) if self.settings & OutputSettings.UTC else ()
         body = _RAW if self.mode == OutputMode.RAW else self._measured()
-        return (*counter, *body, *utc) if self.counter_first else (*body, *counter, *utc)
+        return (*body, *counter, *utc)
 
     def _measured(self) -> tuple[Field, ...]:
         orientation = _ORIENTATION[(self.settings >> 2) & 3]

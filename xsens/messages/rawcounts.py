@@ -7,7 +7,6 @@ on temperature: expect an error of about 1 % of gravity.
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.control import BASE_RATE_HZ, MessageId
+from xsens.messages.control import MessageId, rate_of
 from xsens.messages.framing import Message
 
 BLOCK_SIZE = 168
@@ -27,7 +26,7 @@ NOT_COMPENSATED = (
 )
 
 _ACCELEROMETER, _GYROSCOPE, _PERIOD, _OFFSETS, _GAINS, _MAGNETOMETER = 8, 26, 81, 87, 105, 132
-"""First bytes in the block; the serial number is at its beginning."""
+"""First bytes in the block."""
 
 _ROWS = 2048
 """Rows converted at a time: they stay in the cache, and are too few for BLAS to wake a team of threads."""
@@ -39,9 +38,8 @@ class RawCalibration:
 
     Attributes
     ----------
-    device_id : int
-    period : int
-        Sampling period, in 1/115200 s.
+    rate_hz : float
+        Samples per second; NaN if the block does not hold the period.
     offsets : ndarray, shape (3, 3)
         Counts at zero of accelerometer, gyroscope and magnetometer, each x, y, z.
     gains : ndarray, shape (3, 3)
@@ -55,8 +53,7 @@ class RawCalibration:
         If a gain is zero or a misalignment cannot be inverted.
     """
 
-    device_id: int
-    period: int
+    rate_hz: float
     offsets: FloatArray
     gains: FloatArray
     misalignments: FloatArray
@@ -70,11 +67,6 @@ class RawCalibration:
             raise InvalidInputError(
                 f"calibration block: expected axes nearly square, got determinant {worst:.2g}"
             )
-
-    @property
-    def rate_hz(self) -> float:
-        """Samples per second; NaN if the block does not hold the period."""
-        return BASE_RATE_HZ / self.period if self.period else float("nan")
 
     @classmethod
     def from_message(cls, message: Message) -> RawCalibration:
@@ -91,12 +83,13 @@ class RawCalibration:
                 f"calibration block: expected message {MessageId.EMTS:#04x} of {BLOCK_SIZE} bytes, "
                 f"got {message.mid:#04x} of {len(data)}"
             )
-        number, period = struct.unpack_from(f">I{_PERIOD - 4}xH", data)
         sensors = (_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER)
         matrices = [np.frombuffer(data, ">i2", 9, at).reshape(3, 3) / 2.0**14 for at in sensors]
         offsets = np.frombuffer(data, ">u2", 9, _OFFSETS).reshape(3, 3).astype(float)
         gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [256.0, 1.0, 1.0 / 256.0]
-        return cls(number, period, offsets, gains, np.stack(matrices))
+        return cls(
+            rate_of(int.from_bytes(data[_PERIOD : _PERIOD + 2], "big")), offsets, gains, np.stack(matrices)
+        )
 
     def to_units(self, counts: npt.ArrayLike) -> FloatArray:
         """Acceleration in m/s², rate of turn in rad/s and field in arbitrary units.

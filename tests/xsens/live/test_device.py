@@ -34,7 +34,7 @@ class TestDevice:
         with closing(connect(str(sensor.path), BAUD)) as device:
             info = prepare(device, DeviceSettings(rate_hz=256.0))
         assert info.rate_hz == sensor.rate_hz == 256.0
-        assert Configuration.from_message(info.header[0]).period == 450
+        assert Configuration.from_message(info.header[0]).rate_hz == 256.0
 
     def test_one_that_knows_no_configuration_is_described_by_its_calibration(self, sensor, monkeypatch):
         monkeypatch.setattr("xsens.live.device.ANSWER_S", 0.1)

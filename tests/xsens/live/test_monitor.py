@@ -8,15 +8,14 @@ from imu_messages import calibration_message, configuration_message, counts_of, 
 from xsens.live.device import DeviceInfo
 from xsens.live.monitor import LiveState, Monitor, _Attitude
 from xsens.logs.samples import ImuLog
-from xsens.messages.control import Configuration, MessageId, UnitConfiguration
+from xsens.messages.control import MessageId
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
 from xsens.messages.rawcounts import RawCalibration
 
 RATE_HZ = 100.0
 MODE = OutputMode.CALIBRATED | OutputMode.ORIENTATION
-UNIT = UnitConfiguration(7, 54, MODE, 1)
-INFO = DeviceInfo(7, RATE_HZ, (configuration_message(Configuration(7, 1152, 0, (UNIT,))),))
+INFO = DeviceInfo(7, RATE_HZ, (configuration_message([(MODE, 1)]),))
 
 
 def sent(indices, iron=0.0) -> bytes:
@@ -111,7 +110,7 @@ class TestMonitor:
 
     def test_raw_counts_are_read_with_the_sensors_calibration(self):
         block = RawCalibration(
-            1, 1152, np.reshape(simulated.OFFSETS, (3, 3)), np.reshape(simulated.GAINS, (3, 3)),
+            100.0, np.reshape(simulated.OFFSETS, (3, 3)), np.reshape(simulated.GAINS, (3, 3)),
             np.stack([np.eye(3)] * 3),
         )  # fmt: skip
         raw = Monitor()
