@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -198,7 +198,7 @@ def imu_record(
     from xsens.live.device import DeviceSettings
     from xsens.live.recording import record
 
-    settings: Any = DeviceSettings(content=content, rate_hz=rate_hz, baud=baud)  # type: ignore[arg-type]
+    settings = DeviceSettings(content, rate_hz, baud)
     console = Console(stderr=True)
     state = None
     try:
