@@ -40,7 +40,6 @@ from field_scenes import recorded, scenes
 from vqf import VQF
 
 from xsens.fusion.methods import Method
-from xsens.fusion.online import OnlineFilter
 from xsens.fusion.settings import FusionSettings
 
 METHODS = ONLINE + OFFLINE
@@ -50,9 +49,9 @@ SINGLY = 5000
 """Samples that are given one by one."""
 
 GRID = {
-    "field_sd_rad": (0.5, 1.0, 2.0),
-    "field_place_s": (0.5, 1.0, 2.0),
-    "field_noise_rad_sqrt_s": (1.0, 2.0),
+    "field_place": (0.5, 1.0, 2.0),
+    "field_first_place": (1.0, 2.0, 4.0),
+    "moving_bias_rad_s": (0.5, 1.0, 2.0),
 }
 """Candidates of --leave-one-out: the settings with each of these fields times each factor."""
 
@@ -151,6 +150,8 @@ def timed(work, *arguments):
 
 def one_by_one(log, method):
     rows = list(zip(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au, strict=True))[:SINGLY]
+    from xsens.fusion.online import OnlineFilter
+
     if method == "filter":
         live = OnlineFilter()
         for gyroscope, force, field in rows:
