@@ -1,4 +1,4 @@
-"""The angle from level axes, carried by the gyroscope, to magnetic north: an extended Kalman filter per model.
+"""The angle from level axes, carried by the gyroscope, to magnetic north: a Kalman filter per model.
 
 `xsens.fusion.heading` says what is done and why; arrays are laid out in `heading_arrays`.
 """

@@ -4,9 +4,9 @@
 
 SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE = 0, 1, 2, 3, 4, 5, 8, 11, 20
 BIN = 23
-"""s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its change
-(three); the mean field in the level axes, over its norm at the start (three); mean level axes from the
-sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three)."""
+"""s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
+change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
+from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three)."""
 
 # -- a model of the field
 

@@ -3,7 +3,8 @@
 The accelerometer is integrated to velocity, which stays near zero in a hand: over many swings that shows the
 direction of gravity in spite of movement, where the accelerometer itself shows it only at rest. The attitude
 error is the invariant one (velocity turns with it), so that errors of heading and velocity stay separate. The
-magnetometer has no part in it: it cannot tilt the orientation; `speckle3d.kernels.heading` turns that to north.
+magnetometer has no part in it: it cannot tilt the orientation; `speckle3d.kernels.heading` turns that to
+north.
 
 References
 ----------

@@ -1,21 +1,22 @@
-"""Turn level axes, carried by the gyroscope, to magnetic north: a bank of filters, each with a model of the field.
+"""Turn level axes, carried by the gyroscope, to magnetic north: a bank of filters with models of the field.
 
-The field that a moving sensor reads is the room's, plus what the place adds (another one for each stay at rest
-and for the movement between), plus a stray that changes as it moves on, plus the field of iron on the sensor,
-all as vectors. Norm and dip, which tell nothing of the heading, tell how large those are here: each model states
-other sizes, each filter's evidence tells how well its model explains the readings, and the headings are averaged
-with those weights. So a quiet room's field is followed closely and a poor one's hardly, iron that is put on the
-sensor is found by turning it, and the claimed deviation is that of the room at hand. Two properties of the
-sensor are found on the way: the lag of its magnetometer (its readings are older than the gyroscope's), and the
-gyroscope's bias in movement, which is not quite that at rest.
+The field that a moving sensor reads is the room's, plus what the place adds (another one for each stay at
+rest and for the movement between), plus a stray that changes as it moves on, plus the field of iron on the
+sensor, all as vectors. Norm and dip, which tell nothing of the heading, tell how large those are here: each
+model states other sizes, each filter's evidence tells how well its model explains the readings, and the
+headings are averaged with those weights. So a quiet room's field is followed closely and a poor one's hardly,
+iron that is put on the sensor is found by turning it, and the claimed deviation is that of the room at hand.
+Two properties of the sensor are found on the way: the lag of its magnetometer (its readings are older than
+the gyroscope's), and the gyroscope's bias in movement, which is not quite that at rest.
 
 North is the field's where the sensor was at first.
 
 References
 ----------
-.. [1] D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE TAC 10, 1965 (the bank).
-.. [2] M. Roth, E. Ozkan, F. Gustafsson, "A Student's t filter for heavy tailed process and measurement noise",
-   ICASSP 2013 (readings off the model).
+.. [1] D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE TAC 10, 1965 (the
+   bank).
+.. [2] M. Roth, E. Ozkan, F. Gustafsson, "A Student's t filter for heavy tailed process and measurement
+   noise", ICASSP 2013 (readings off the model).
 .. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", 1965.
 """
 
@@ -33,7 +34,7 @@ from speckle3d.kernels.heading import find_headings
 from xsens.fusion.settings import FusionSettings
 
 if TYPE_CHECKING:
-    from xsens.fusion.smoothing import FilterSteps
+    from xsens.fusion.inclination import FilterSteps
 
 BIN_S = 0.25
 """Readings are averaged over this time: the heading's error changes in seconds."""
@@ -70,16 +71,16 @@ class FieldModel:
 MODELS = (
     *(FieldModel(stray) for stray in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
     *(FieldModel(stray, stray_s=8.0) for stray in (0.02, 0.05, 0.12)),
-    *(FieldModel(stray, after_s=3.0, handicap=20.0) for stray in (0.01, 0.03, 0.1)),
+    *(FieldModel(stray, after_s=3.0, handicap=300.0) for stray in (0.01, 0.03, 0.1)),
     *(
         FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=300.0)
         for stray in (0.005, 0.01, 0.02, 0.04, 0.08)
     ),
 )
-"""Rooms from a quiet one to a workshop. Iron on the sensor must be proved: a sensor that is turned while it is
-carried through an uneven field shows nearly the same."""
+"""Rooms from a quiet one to a workshop. Iron on the sensor must be proved: a sensor that is turned while it
+is carried through an uneven field shows nearly the same."""
 
-PLACE_S = 60.0
+BIAS_S = 20.0
 """How long what is left of the gyroscope's bias persists."""
 
 ROOM = 0.05
@@ -107,6 +108,9 @@ MEMORY_S = 100.0
 """Time over which models are weighed while samples arrive; a recording is weighed as a whole."""
 
 _DISTRUSTED = 0.5
+_ROUNDING = 1e-12
+"""Variance that keeps covariances invertible: (1 microradian)^2, a millionth of the field, 1 microsecond."""
+
 _NEGLIGIBLE = 5.0
 """Models whose evidence is less by this, in logarithms, are not smoothed: their weight is below 1 %."""
 
@@ -158,7 +162,7 @@ def bins_of(
         See `heading_arrays`; fields as they were read, not yet over their norm.
     """
     field, duration = steps.field_au, steps.duration_s
-    seen = np.isfinite(field).all(axis=1)
+    seen = np.asarray(np.isfinite(field).all(axis=1))
     field = np.where(seen[:, None], field, 0.0)
     rate = steps.rate_rad_s - bias_rad_s
     columns = np.column_stack(
@@ -305,7 +309,7 @@ def _shared(s: FusionSettings) -> FloatArray:
         (at.WHITE, s.field_noise_sqrt_s),
         (at.GYRO, s.gyro_noise_rad_sqrt_s),
         (at.GYRO_SCALE, s.gyro_scale_noise_sqrt_s),
-        (at.BIAS_S, PLACE_S),
+        (at.BIAS_S, BIAS_S),
         (at.ROOM, ROOM),
         (at.ROOM_WALK, ROOM_WALK_SQRT_S),
         (at.REST_GYRO, REST_GYRO_RAD_SQRT_S),
@@ -351,7 +355,7 @@ def _backward(
     first = int(np.argmax(after[:, at.TURN, at.TURN] > 0.0))
     rows = bins[first:]
     steps = _transitions(rows, model)
-    noise = before[first:].copy()
+    noise = before[first:] + _ROUNDING * np.eye(at.STATES)
     noise[1:] -= steps[1:] @ after[first:-1] @ np.swapaxes(steps[1:], 1, 2)
     smoother = KalmanFilter(dim_x=at.STATES, dim_z=3)
     means, covariances, _, _ = smoother.rts_smoother(states[first:], after[first:], steps, noise)
@@ -371,7 +375,7 @@ def _transitions(rows: FloatArray, model: FieldModel) -> FloatArray:
     """Transition to each bin from the one before, shape (n, STATES, STATES)."""
     steps = np.tile(np.eye(at.STATES), (len(rows), 1, 1))
     span, moving = rows[:, at.SPAN], rows[:, at.RESTS] == 0.0
-    keep = np.exp(-span / PLACE_S)
+    keep = np.exp(-span / BIAS_S)
     fade = np.where(moving, np.exp(-span / model.stray_s), 1.0)
     stays = np.concatenate([[1.0], rows[1:, at.RESTS] == rows[:-1, at.RESTS]])
     for i in range(3):

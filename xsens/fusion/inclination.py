@@ -200,6 +200,13 @@ def forward(
     return steps
 
 
+def joined(parts: list[FilterSteps]) -> FilterSteps:
+    """Steps of several runs, one after another, without the samples within them."""
+    rows = np.concatenate([part.rows for part in parts])
+    none = np.empty((0, places.SIZE, places.SIZE))
+    return FilterSteps(np.arange(1, len(rows) + 1), rows, np.empty((0, places.SAMPLE)), none, none)
+
+
 def _work() -> FloatArray:
     return np.zeros((places.WORK, places.SIZE))
 

@@ -43,13 +43,13 @@ class FusionSettings:
         How far the bias in movement is from that at rest, 0.05 deg/s: an error of half the gyroscope's
         resolution at rest, acceleration and vibration.
     magnetometer_lag_s : float
-        Standard deviation of the magnetometer's delay behind the gyroscope: a chip that averages readings, and
-        sends them at a lower rate, is 10 to 20 ms late.
+        Standard deviation of the magnetometer's delay behind the gyroscope: a chip that averages readings
+        and sends them at a lower rate is 10 to 20 ms late.
     field_noise_sqrt_s : float
         Noise of the magnetometer, as a fraction of the field's norm.
     field_first_place, field_place : float
-        What a place adds to the room's field, as a fraction of its norm, per component: 2.5 %, or 4 degrees of
-        heading; north is that of the first place, to a fifth of it.
+        What a place adds to the room's field, as a fraction of its norm, per component: 2.5 %, or 4 degrees
+        of heading; north is that of the first place, to a fifth of it.
     rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
         The sensor rests if for the last of these neither reading differs by more from its mean of half a
         second.
