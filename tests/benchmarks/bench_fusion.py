@@ -40,6 +40,7 @@ from field_scenes import recorded, scenes
 from vqf import VQF
 
 from xsens.fusion.methods import Method
+from xsens.fusion.online import OnlineFilter
 from xsens.fusion.settings import FusionSettings
 
 METHODS = ONLINE + OFFLINE
@@ -150,8 +151,6 @@ def timed(work, *arguments):
 
 def one_by_one(log, method):
     rows = list(zip(log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au, strict=True))[:SINGLY]
-    from xsens.fusion.online import OnlineFilter
-
     if method == "filter":
         live = OnlineFilter()
         for gyroscope, force, field in rows:

@@ -87,7 +87,7 @@ def test_no_trial_is_much_worse_than_with_vqf(folder, methods):
 @kinds
 @pytest.mark.parametrize("part", ["heading", "inclination"])
 def test_claimed_sigma_fits_the_errors(folder, methods, part):
-    # Heading as BROAD counts it: sigma is about north, and the cameras' is that of the field at rest to 1 degree
+    # Heading as BROAD counts it: sigma is about north, and the cameras' is the field's at rest, to one degree
     # in most trials. Without a constant heading, errors are less and sigma is still that of north.
     counted, steady = zip(*(coverages(folder, name, methods[1]) for name in trials_in(folder)), strict=True)
     share, least = (np.mean([getattr(each, f"{part}_share") for each in held]) for held in (counted, steady))
