@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from broad import OFFLINE, ONLINE, Estimate, coverage, errors_deg, errors_rad, estimate, read_trial, trials_in
+from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
 GAIN = 0.9
@@ -94,6 +95,18 @@ def test_claimed_sigma_fits_the_errors(folder, methods, part):
     assert SHARES[0] <= share <= SHARES[1]
     assert max(getattr(each, f"{part}_ratio") for each in counted) <= WIDEST
     assert least >= SHARES[0]
+
+
+@pytest.mark.realdata
+@pytest.mark.slow
+@kinds
+@pytest.mark.parametrize("name", ["15_undisturbed_fast_translation_A", "28_disturbed_stationary_magnet_A"])
+def test_a_recording_that_begins_in_movement_is_no_worse_than_with_vqf(folder, methods, name):
+    begun = scene(recorded(folder, name), "cut", 15.0, None)
+    theirs, ours = (
+        errors_deg(estimate(begun.log, method).wxyz, begun.true_wxyz, begun.moving)[0] for method in methods
+    )
+    assert ours <= WORSE * theirs
 
 
 # -- the scores themselves
