@@ -17,6 +17,7 @@ from speckle3d.kernels.heading_arrays import (
     BIAS_VARIANCE,
     EVIDENCE,
     FIRST_PLACE,
+    FIRST_STRAY,
     FOUND_TURN,
     FOUND_VARIANCE,
     FREEDOM,
@@ -46,10 +47,13 @@ from speckle3d.kernels.heading_arrays import (
     ROOM,
     ROOM_WALK,
     SEEN,
+    SETTLING_S,
     SPAN,
     STATES,
     STRAY,
     STRAY_S,
+    TILT,
+    TILT_S,
     TRUST,
     TURNING,
     WHITE,
@@ -101,14 +105,16 @@ def find_headings(
             if row[SEEN] > 0.0:
                 _expect(x, row, rows, off)
                 _spread(p, rows, cross, total)
-                misfit, _ = _inverted(total, shared[WHITE] * shared[WHITE] / row[SPAN], off, inverse)
+                _add_noise(x, row, shared, total)
+                misfit, _ = _inverted(total, 0.0, off, inverse)
                 if misfit > shared[OUTLIER] and model[IRON_JUMP] > 0.0 and flag[HOLDING] <= 0.0:
                     _iron_changes(p, flag, model, shared)
                     _spread(p, rows, cross, total)
+                    _add_noise(x, row, shared, total)
             if keeps:
                 kept_predicted[k, j] = p
             if row[SEEN] > 0.0:
-                _correct(x, p, row, shared, off, cross, gain, total, inverse, out)
+                _correct(x, p, shared, off, cross, gain, total, inverse, out)
             out[FOUND_TURN], out[FOUND_VARIANCE] = turn_to_north(x, p)
             if keeps:
                 kept_means[k, j], kept[k, j] = x, p
@@ -148,7 +154,7 @@ def _begin(
     _forget(x, p, OF_ROOM, 3, shared[ROOM])
     _forget(x, p, GYRO_BIAS, 3, math.sqrt(row[BIAS_VARIANCE]))
     _forget(x, p, OF_PLACE, 3, shared[FIRST_PLACE] if flag[RAN] == 0.0 else shared[PLACE])
-    _forget(x, p, OF_STRAY, 3, model[STRAY])
+    _forget(x, p, OF_STRAY, 3, shared[FIRST_STRAY] * model[STRAY])
     for i in range(3):
         x[OF_ROOM + i] = row[READING + i]
         for j in range(3):
@@ -176,7 +182,8 @@ def _predict(
     """Predict over a bin."""
     span, resting = row[SPAN], row[RESTS] > 0.0
     if row[RESTS] != flag[RESTED]:
-        _forget(x, p, OF_PLACE, 3, shared[PLACE])
+        if flag[MOVED] > shared[SETTLING_S]:  # a sensor is known to rest after a while
+            _forget(x, p, OF_PLACE, 3, shared[PLACE])
         flag[RESTED] = row[RESTS]
     for i in range(3):
         x[GYRO_BIAS + i] -= row[BIAS_CHANGE + i]
@@ -274,10 +281,21 @@ def _spread(p: FloatArray, rows: FloatArray, cross: FloatArray, total: FloatArra
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _add_noise(x: FloatArray, row: FloatArray, shared: FloatArray, total: FloatArray) -> None:
+    """Add the noise of the reading, and what the error of the level axes, which persists, makes of the field."""
+    white = shared[WHITE] * shared[WHITE] / row[SPAN]
+    tilt = row[TILT] * max(shared[TILT_S] / row[SPAN], 1.0)
+    across, along, up = x[OF_ROOM], x[OF_ROOM + 1], x[OF_ROOM + 2]
+    total[0, 0] += white + tilt * up * up
+    total[1, 1] += white + tilt * up * up
+    total[2, 2] += white + tilt * (across * across + along * along)
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _inverted(
     total: FloatArray, variance: float, off: FloatArray, inverse: FloatArray
 ) -> tuple[float, float]:
-    """Fill the inverse of the covariance with that noise; return the squared misfit and the determinant."""
+    """Fill the inverse of the covariance with more noise; return the squared misfit and the determinant."""
     a, d, f = total[0, 0] + variance, total[1, 1] + variance, total[2, 2] + variance
     b, c, e = total[0, 1], total[0, 2], total[1, 2]
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = d * f - e * e, a * f - c * c, a * d - b * b
@@ -297,7 +315,6 @@ def _inverted(
 def _correct(
     x: FloatArray,
     p: FloatArray,
-    row: FloatArray,
     shared: FloatArray,
     off: FloatArray,
     cross: FloatArray,
@@ -307,15 +324,15 @@ def _correct(
     out: FloatArray,
 ) -> None:
     """Correct by a reading, the less the less likely it is: its errors have Student's distribution."""
-    freedom, variance = shared[FREEDOM], shared[WHITE] * shared[WHITE] / row[SPAN]
-    misfit, determinant = _inverted(total, variance, off, inverse)
+    freedom = shared[FREEDOM]
+    misfit, determinant = _inverted(total, 0.0, off, inverse)
     density = math.lgamma(0.5 * (freedom + 3.0)) - math.lgamma(0.5 * freedom) - 1.5 * math.log(freedom)
     out[EVIDENCE] = density - 0.5 * math.log(determinant)
     out[EVIDENCE] -= 0.5 * (freedom + 3.0) * math.log(1.0 + misfit / freedom)
     trust = (freedom + 3.0) / (freedom + misfit)
     if trust < 1.0:
-        mean = (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0 + variance
-        _inverted(total, variance + (1.0 / trust - 1.0) * mean, off, inverse)
+        mean = (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
+        _inverted(total, (1.0 / trust - 1.0) * mean, off, inverse)
     out[TRUST] = min(trust, 1.0)
     for j in range(STATES):
         for i in range(3):

@@ -2,11 +2,12 @@
 
 # -- a bin: a quarter of a second of steps
 
-SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE = 0, 1, 2, 3, 4, 5, 8, 11, 20
-BIN = 23
+SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE, TILT = 0, 1, 2, 3, 4, 5, 8, 11, 20, 23
+BIN = 24
 """s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
 change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
-from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three)."""
+from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three); variance of the
+level axes' tilt, rad^2."""
 
 # -- a model of the field
 
@@ -19,8 +20,8 @@ sensor must have moved before the field is used."""
 # -- what all models share
 
 PLACE, FIRST_PLACE, WHITE, GYRO, GYRO_SCALE, BIAS_S, ROOM, ROOM_WALK, REST_GYRO = 0, 1, 2, 3, 4, 5, 6, 7, 8
-FREEDOM, LAG_S, OUTLIER, HOLD_S = 9, 10, 11, 12
-SHARED = 13
+FREEDOM, LAG_S, OUTLIER, HOLD_S, TILT_S, SETTLING_S, FIRST_STRAY = 9, 10, 11, 12, 13, 14, 15
+SHARED = 16
 """See `xsens.fusion.heading`."""
 
 # -- state of a model's filter

@@ -104,6 +104,15 @@ OUTLIER = 25.0
 HOLD_S = 3.0
 """How long putting it on takes."""
 
+SETTLING_S = 2.5
+"""A start that rests for less than this is none: rest is noticed late."""
+
+FIRST_STRAY = 0.5
+"""The stray at the start, as a fraction of a model's: a measurement is begun with care."""
+
+TILT_S = 1.0
+"""How long an error of the level axes persists."""
+
 MEMORY_S = 100.0
 """Time over which models are weighed while samples arrive; a recording is weighed as a whole."""
 
@@ -144,6 +153,7 @@ def bins_of(
     level: FloatArray,
     bias_rad_s: FloatArray,
     bias_sd_rad_s: FloatArray,
+    sd_rad: FloatArray,
     settings: FusionSettings,
 ) -> FloatArray:
     """Average the steps of each bin.
@@ -155,6 +165,8 @@ def bins_of(
         Level axes from the sensor's at the start of each step.
     bias_rad_s, bias_sd_rad_s : ndarray, shape (n, 3)
         After each step.
+    sd_rad : ndarray, shape (n, 3)
+        Deviation of the level axes about the world's; the third is not used.
 
     Returns
     -------
@@ -185,7 +197,9 @@ def bins_of(
     rows[:, at.BIAS_VARIANCE] = variance + settings.moving_bias_rad_s**2
     weight = np.where((fields > 0.0)[np.repeat(np.arange(len(firsts)), counts)], seen, 1.0)
     sums = np.add.reduceat(weight[:, None] * columns, firsts)
-    rows[:, at.READING :] = sums / np.add.reduceat(weight, firsts)[:, None]
+    rows[:, at.READING : at.TILT] = sums / np.add.reduceat(weight, firsts)[:, None]
+    tilt = (sd_rad[:, :2] ** 2).mean(axis=1)
+    rows[:, at.TILT] = np.add.reduceat(tilt, firsts) / counts
     return rows
 
 
@@ -261,7 +275,7 @@ class HeadingBank:
             self._norm = float(np.linalg.norm(first))
         if self._norm > 0.0:
             rows[:, at.READING : at.READING + 3] /= self._norm
-            rows[:, at.LATE :] /= self._norm
+            rows[:, at.LATE : at.LATE + 3] /= self._norm
         found = np.empty((len(rows), len(self.models), at.FOUND))
         wide = (0, len(self.models), at.STATES, at.STATES)
         into = kept or (np.empty(wide[:3]), np.empty(wide), np.empty(wide))
@@ -317,6 +331,9 @@ def _shared(s: FusionSettings) -> FloatArray:
         (at.LAG_S, s.magnetometer_lag_s),
         (at.OUTLIER, OUTLIER),
         (at.HOLD_S, HOLD_S),
+        (at.TILT_S, TILT_S),
+        (at.SETTLING_S, SETTLING_S),
+        (at.FIRST_STRAY, FIRST_STRAY),
     ):
         shared[place] = value
     return shared
@@ -376,7 +393,8 @@ def _transitions(rows: FloatArray, model: FieldModel, states: FloatArray) -> Flo
     span, moving = rows[:, at.SPAN], rows[:, at.RESTS] == 0.0
     keep = np.exp(-span / BIAS_S)
     fade = np.where(moving, np.exp(-span / model.stray_s), 1.0)
-    stays = np.concatenate([[1.0], rows[1:, at.RESTS] == rows[:-1, at.RESTS]])
+    moved_s = np.cumsum(span * moving)
+    stays = np.concatenate([[1.0], (rows[1:, at.RESTS] == rows[:-1, at.RESTS]) | (moved_s[1:] <= SETTLING_S)])
     across, along = np.vstack([states[:1], states[:-1]])[:, at.OF_ROOM : at.OF_ROOM + 2].T
     for i in range(3):
         rate = rows[:, at.POSE + 6 + i] * span * keep * moving

@@ -31,7 +31,7 @@ class StretchFilter:
         if magnetic:
             if self._ran:
                 self._bank.resume()
-            bins = bins_of(steps, starts, steps.bias, steps.bias_sd_rad_s, settings)
+            bins = bins_of(steps, starts, steps.bias, steps.bias_sd_rad_s, sd, settings)
             lasts = _lasts(steps, settings)
             found = self._bank.follow(bins, steps.bias[lasts])
             # A step turns by the heading of the last whole bin; those of the first bin by its own.
@@ -50,7 +50,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     nodes, sd = level.matrices, level.sd_rad
     disturbed = np.zeros(len(steps.last), dtype=bool)
     if settings.use_magnetometer and np.isfinite(steps.field_au[:, 0]).any():
-        bins = bins_of(steps, nodes[:-1], level.bias_rad_s[1:], level.bias_sd_rad_s[1:], settings)
+        bins = bins_of(steps, nodes[:-1], level.bias_rad_s[1:], level.bias_sd_rad_s[1:], sd[1:], settings)
         found = smooth_headings(bins, settings)
         turn, heading_sd = _at_nodes(steps, found, settings)
         nodes = _turned(turn, nodes)
