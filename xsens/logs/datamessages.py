@@ -87,8 +87,9 @@ def legacy_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> I
     rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
     counts = _all_of(layout, data, ("counter",))
     counter = counts["counter"][:, 0].astype(np.int64) if counts else None
-    stamps = replace(_stretches(frames, which), counter=counter)
-    return on_clock(stamps, len(data), read, replace(hints, rate_hz=rate_hz))
+    stamps = [replace(_stretches(frames, which), counter=counter)]
+    del counts, counter, which  # so that nothing holds them once the times are known
+    return on_clock(stamps.pop(), len(data), read, replace(hints, rate_hz=rate_hz))
 
 
 def _decoded(layout: DataLayout, frames: Frames) -> Iterator[tuple[slice, Values]]:

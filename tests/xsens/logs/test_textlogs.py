@@ -149,7 +149,7 @@ def test_a_rate_is_the_headers_or_given(counted):
     rows = [[f"{i:05d}"] * counted + ["0.1", "0.2", "9.8"] for i in range(20)]
     names = ["PacketCounter"] * counted + ["Acc_X", "Acc_Y", "Acc_Z"]
     text = "\n".join("\t".join(row) for row in [names, *rows]) + "\n"
-    with pytest.raises(InvalidInputError, match="give --rate-hz$"):
+    with pytest.raises(InvalidInputError, match=r"give --rate-hz$"):
         parse_text(text)
     for log in (parse_text(text, Hints(rate_hz=50.0)), parse_text("// Update Rate: 50.0Hz\n" + text)):
         assert (len(log), log.rate_hz, log.counter is not None) == (20, pytest.approx(50.0), counted)
