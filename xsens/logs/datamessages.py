@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
-from xsens.logs.parts import Hints, Parts, of_unit_length, on_clock, only, oriented
-from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.parts import Hints, Parts, of_unit_length, only
+from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
@@ -55,7 +54,11 @@ _ENOUGH = 10_000
 """Messages that show where the counter is."""
 
 
-def legacy_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> ImuLog:
+Found = tuple[Stamps, Parts, Claim, tuple[FloatArray | None, ...]]
+"""Samples, and their orientation as quaternions, matrices or angles: all that the bytes are needed for."""
+
+
+def legacy_samples(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> Found:
     """Read the samples of the MTData messages at indices `which`.
 
     Raises
@@ -77,19 +80,21 @@ def legacy_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> I
         parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
     which = only(which, fits)
     data = frames[which]
-    if not layout.mode & _RAW:
-        read = partial(_as_sent, layout, data, parts, hints)
-    elif calibration is not None:
-        read = partial(_in_units, layout, data, calibration, parts)
-    else:
+    raw = layout.mode & _RAW
+    if raw and calibration is None:
         raise InvalidInputError("expected a calibration block before raw counts, got none")
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
-    rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
-    counts = _all_of(layout, data, ("counter",))
-    counter = counts["counter"][:, 0].astype(np.int64) if counts else None
-    stamps = [replace(_stretches(frames, which), counter=counter)]
-    del counts, counter, which  # so that nothing holds them once the times are known
-    return on_clock(stamps.pop(), len(data), read, replace(hints, rate_hz=rate_hz))
+    rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
+    stamps = replace(_stretches(frames, which), period_s=1.0 / rate_hz)
+    notations = ("quaternion_wxyz", "matrix", "euler_deg")
+    values = _all_of(layout, data, ("counter", *notations, *(() if raw else VECTORS)))
+    if raw and calibration is not None:
+        values |= zip(VECTORS, _in_units(layout, data, calibration), strict=True)
+        parts = parts.noting(NOT_COMPENSATED)
+    if "counter" in values:
+        stamps = replace(stamps, counter=values["counter"][:, 0].astype(np.int64))
+    parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
+    return stamps, parts, Claim(layout.frame, "as configured"), tuple(map(values.get, notations))
 
 
 def _decoded(layout: DataLayout, frames: Frames) -> Iterator[tuple[slice, Values]]:
@@ -139,37 +144,24 @@ def _share_counting(frames: Frames, at: IntArray) -> float:
     return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
 
 
-def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration, parts: Parts) -> Parts:
+def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration) -> FloatArray:
     names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
     vectors = np.empty((3, len(data), 3))
     for some, values in _decoded(layout, data):
         vectors[:, some] = calibration.to_units(np.stack([values[name] for name in names], axis=1))
-    return replace(parts.noting(NOT_COMPENSATED), vectors=tuple(vectors))
-
-
-def _as_sent(layout: DataLayout, data: Frames, parts: Parts, hints: Hints) -> Parts:
-    notations = ("quaternion_wxyz", "matrix", "euler_deg")
-    values = _all_of(layout, data, (*VECTORS, *notations))
-    parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
-    return oriented(parts, Claim(layout.frame, "as configured"), hints, *map(values.get, notations))
+    return vectors
 
 
 # -- MTData2
 
-_NOTATIONS = {
-    "quaternion_wxyz": "quaternions",
-    "rotation_matrix_by_column": "matrices",
-    "euler_deg": "angles_deg",
-}
-"""Parameter of `oriented` by the name of the item."""
-
+_NOTATIONS = ("quaternion_wxyz", "rotation_matrix_by_column", "euler_deg")
 _STAMPS = ("packet_counter", "sample_time_fine")
 
 _Table = dict[int, Column]
 """Numbers by the identifier of the item."""
 
 
-def mtdata2_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> ImuLog:
+def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts, _: Hints) -> Found:
     """Read the samples of the MTData2 messages at indices `which`.
 
     Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.
@@ -197,12 +189,12 @@ def mtdata2_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> 
     counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
     others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
     stamps = replace(_stretches(frames, only(which, rows)), counter=counter, ticks=ticks, others=others)
-    log = on_clock(stamps, int(rows.sum()), partial(_measured, table, rows, parts, hints), hints)
-    if log.accelerometer_m_s2 is not None and not _named(table, "acceleration_m_s2"):
-        log = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 * log.rate_hz)
-    if log.gyroscope_rad_s is not None and not _named(table, "rate_of_turn_rad_s"):
-        log = replace(log, gyroscope_rad_s=log.gyroscope_rad_s * log.rate_hz)
-    return log
+    most = [max(n, key=lambda i: n[i].rows.size) for name in _NOTATIONS if (n := _named(table, name))]
+    notations = [only(_filled({i: table[i] for i in most[:1]}, name, rows.size), rows) for name in _NOTATIONS]
+    if notations[1] is not None:
+        notations[1] = np.swapaxes(notations[1].reshape(-1, 3, 3), 1, 2).reshape(-1, 9)
+    claim = Claim(world_of(most[0]) if most else "NWU", "as its messages say")
+    return stamps, _measured(table, rows, parts), claim, tuple(notations)
 
 
 def _named(table: _Table, name: str) -> _Table:
@@ -222,26 +214,22 @@ def _filled(table: _Table, name: str, size: int) -> FloatArray | None:
     return values
 
 
-def _measured(table: _Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
-    """Readings, or increments in their place, and the orientation whose identifier most messages have."""
+def _measured(table: _Table, rows: BoolArray, parts: Parts) -> Parts:
+    """Add readings, or increments in their place."""
 
     def item(name: str) -> Any:
         return only(_filled(table, name, rows.size), rows)
 
     acceleration, rate = item("acceleration_m_s2"), item("rate_of_turn_rad_s")
+    increments = []
     if acceleration is None and (acceleration := item("delta_v_m_s")) is not None:
         parts = parts.noting("acceleration is the sensor's velocity increments over its sampling period")
+        increments.append(VECTORS[0])
     if rate is None and (turns := item("delta_q_wxyz")) is not None:
         unit = of_unit_length(turns)[:, None]
         turned = Rotation.from_quat(np.where(unit, turns, 1.0), scalar_first=True)
         rate = np.where(unit, turned.as_rotvec(), np.nan)
         parts = parts.noting("rate of turn is the sensor's orientation increments over its sampling period")
-    parts = replace(parts, vectors=(acceleration, rate, item("magnetic_field_au")))
-    for name, notation in _NOTATIONS.items():
-        if found := _named(table, name):
-            most = max(found, key=lambda i: found[i].rows.size)
-            values = only(_filled({most: found[most]}, name, rows.size), rows)
-            if notation == "matrices":
-                values = np.swapaxes(values.reshape(-1, 3, 3), 1, 2).reshape(-1, 9)
-            return oriented(parts, Claim(world_of(most), "as its messages say"), hints, **{notation: values})
-    return parts
+        increments.append(VECTORS[1])
+    vectors = (acceleration, rate, item("magnetic_field_au"))
+    return replace(parts, vectors=vectors, increments=tuple(increments))

@@ -6,7 +6,6 @@ sensor's axes to the world's; angles are roll, pitch, yaw with R = Rz(yaw) Ry(pi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,8 +69,8 @@ class Hints:
 class Parts:
     """Samples before their clock is known: as in `ImuLog`, one row for each message or line.
 
-    `vectors` are the readings of accelerometer, gyroscope and magnetometer; `orientations` the sensor's own,
-    meaningless where `there` is false.
+    `vectors` are the readings of accelerometer, gyroscope and magnetometer, those named in `increments` times
+    the sampling period; `orientations` the sensor's own, meaningless where `there` is false.
     """
 
     source: str
@@ -79,6 +78,7 @@ class Parts:
     vectors: tuple[FloatArray | None, ...] = (None, None, None)
     orientations: Rotation | None = None
     there: BoolArray | None = None
+    increments: tuple[str, ...] = ()
 
     def noting(self, *notes: str) -> Parts:
         """The same parts with more notes."""
@@ -93,14 +93,8 @@ def only(values: Any, kept: BoolArray) -> Any:
 # -- from parts to a log
 
 
-def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hints) -> ImuLog:
+def on_clock(stamps: Stamps, samples: int, parts: Parts, hints: Hints) -> ImuLog:
     """Build the log of samples that have a clock, or a counter and a rate, or a rate alone.
-
-    Parameters
-    ----------
-    parts : callable
-        Returns the samples' parts. It is called once their times are known: finding those takes as much
-        memory meanwhile as the parts do.
 
     Raises
     ------
@@ -112,12 +106,13 @@ def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hi
     counted = stamps.counter is not None or stamps.ticks is not None
     if not counted and stamps.period_s > 0.0:
         stamps = replace(stamps, counter=np.arange(samples), counter_span=1 << 62)
-    line = timeline(stamps)
-    if counted:
-        del stamps
-        return assembled(line, parts())
-    note = "samples have no counter: losses cannot be found"
-    return replace(assembled(line, parts().noting(note)), counter=None)
+        parts = parts.noting("samples have no counter: losses cannot be found")
+    log = assembled(timeline(stamps), parts)
+    changed: dict[str, Any] = {} if counted else {"counter": None}
+    for name in parts.increments:
+        values = getattr(log, name)
+        changed[name] = None if values is None else values * log.rate_hz
+    return replace(log, **changed) if changed else log
 
 
 def assembled(line: Timeline, parts: Parts) -> ImuLog:

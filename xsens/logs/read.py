@@ -12,8 +12,8 @@ import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
-from xsens.logs.datamessages import legacy_log, mtdata2_log
-from xsens.logs.parts import Hints, Parts
+from xsens.logs.datamessages import legacy_samples, mtdata2_samples
+from xsens.logs.parts import Hints, Parts, on_clock, oriented
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
@@ -95,10 +95,7 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
             encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
             with TextIOWrapper(file, encoding, errors="replace") as text:
                 return parse_text(text, hints, str(path))
-        data = file.read(size)
-    if not data.strip(b"\0"):
-        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got nothing but zeros")
-    return parse_stream(data, hints, str(path))
+        return parse_stream(file.read(size), hints, str(path))  # which alone holds the bytes
 
 
 def read_bounded(path: PathLike, most_bytes: int) -> bytes:
@@ -159,21 +156,30 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
     InvalidInputError
         If they hold no data message, or lack what is needed to understand one.
     """
-    frames = find_frames(data)
+    hints = hints or Hints()
     with naming(source):
+        frames = find_frames(data)
         which = _of_one_kind(frames)
         parts = Parts(source, tuple(_passed_over(frames, which)))
-        read = legacy_log if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_log
-        return read(frames, which, parts, hints or Hints())
+        read = legacy_samples if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_samples
+        stamps, parts, claim, notations = read(frames, which, parts, hints)
+        samples = next(
+            stamp.size for stamp in (stamps.counter, stamps.ticks, stamps.starts) if stamp is not None
+        )
+        del data, frames, which  # as large as the samples
+        parts = oriented(parts, claim, hints, *notations)
+        del notations
+        return on_clock(stamps, samples, parts, hints)
 
 
 def _of_one_kind(frames: Frames) -> IntArray:
     """Indices of the data messages of the most common kind and bus id."""
     data = np.flatnonzero(np.isin(frames.mid, _DATA))
     if not data.size:
-        raise InvalidInputError(
-            f"expected messages with data, got {len(frames)} others in {frames.data.size} bytes"
+        got = (
+            f"{len(frames)} others in {frames.data.size} bytes" if frames.data.any() else "nothing but zeros"
         )
+        raise InvalidInputError(f"expected messages with data, got {got}")
     kinds = frames.mid[data].astype(np.uint16) * 256 + frames.bid[data]
     return np.asarray(data[kinds == np.bincount(kinds).argmax()].astype(frames.start.dtype))
 
