@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
-from xsens.logs.parts import Hints, Parts, of_unit_length, only
+from xsens.logs.parts import Parts, of_unit_length, only
 from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim
 from xsens.messages.control import Configuration, MessageId, utc_time_s
@@ -58,20 +58,20 @@ Found = tuple[Stamps, Parts, Claim, tuple[FloatArray | None, ...]]
 """Samples, and their orientation as quaternions, matrices or angles: all that the bytes are needed for."""
 
 
-def legacy_samples(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> Found:
+def legacy_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     """Read the samples of the MTData messages at indices `which`.
 
     Raises
     ------
     InvalidInputError
-        If layout, rate or calibration is neither in the log nor in the hints.
+        If the layout, or the calibration of raw counts, is not in the log.
     """
     configuration = _last(
         frames, np.flatnonzero(frames.mid == MessageId.CONFIGURATION), Configuration.from_message
     )
     blocks = np.flatnonzero(frames.mid == MessageId.EMTS)
     blocks = blocks[frames[blocks].payload_size == BLOCK_SIZE]
-    calibration = hints.calibration or _last(frames, blocks, RawCalibration.from_message)
+    calibration = _last(frames, blocks, RawCalibration.from_message)
     layout = _layout(frames[which], configuration)
     fits = frames[which].payload_size == layout.size
     if not fits.any():
@@ -161,7 +161,7 @@ _Table = dict[int, Column]
 """Numbers by the identifier of the item."""
 
 
-def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts, _: Hints) -> Found:
+def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     """Read the samples of the MTData2 messages at indices `which`.
 
     Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.

@@ -16,7 +16,6 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from xsens.logs.clocks import Stamps, Timeline, require_rate, timeline
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.worlds import Claim, nwu_from, settle, upright_part
-from xsens.messages.rawcounts import RawCalibration
 
 _ABSURD = 1e6
 """Larger values, in any of the units, are damage: the sensors' ranges end at 160 m/s² and 35 rad/s."""
@@ -39,8 +38,6 @@ class Hints:
     ----------
     rate_hz : float, optional
         Samples per second, for logs with a counter but no clock.
-    calibration : RawCalibration, optional
-        Of raw counts without their calibration block, from another log of the same unit.
     world : str, optional
         Of the sensor's own orientation, ENU, NED or NWU.
     as_stated : bool
@@ -54,7 +51,6 @@ class Hints:
     """
 
     rate_hz: float | None = None
-    calibration: RawCalibration | None = None
     world: str | None = None
     as_stated: bool = False
 

@@ -22,7 +22,8 @@ from xsens.messages.framing import Frames, find_frames
 PathLike = str | os.PathLike[str]
 
 MOST_BYTES = 1 << 27
-"""Of a log: five hours of raw counts at 256 Hz. Reading takes up to six times the memory, damage more."""
+"""Of a log: five hours of raw counts at 256 Hz. Reading takes 2.5 times the memory of text, 3.6 to 5.3 times
+that of messages, whose numbers are shorter than a double: raw counts alone become 3.3 times as large."""
 
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _SNIFFED = 1 << 16
@@ -162,7 +163,7 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
         which = _of_one_kind(frames)
         parts = Parts(source, tuple(_passed_over(frames, which)))
         read = legacy_samples if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_samples
-        stamps, parts, claim, notations = read(frames, which, parts, hints)
+        stamps, parts, claim, notations = read(frames, which, parts)
         samples = next(
             stamp.size for stamp in (stamps.counter, stamps.ticks, stamps.starts) if stamp is not None
         )
