@@ -9,9 +9,9 @@ import typer
 
 from speckle3d.cli.common import Json, emit, emit_rows, note
 from speckle3d.cli.imu import (
+    DEFAULT_SOURCE,
     Log,
     Magnetometer,
-    Method,
     MethodOption,
     RateHz,
     WorldOption,
@@ -59,7 +59,7 @@ def imu_accuracy(
     time_offset_s: Annotated[
         float, typer.Option(help="A reading of the sensor at t belongs to the tracker's time t + this.")
     ] = 0.0,
-    method: MethodOption = Method.smoother,
+    method: MethodOption = DEFAULT_SOURCE,
     magnetometer: Magnetometer = True,
     figure: Annotated[
         Path | None, typer.Option(help="PNG of single turns, as Figure 5 of the paper.")

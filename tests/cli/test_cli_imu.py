@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
+from xsens.fusion.methods import Method
 from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
@@ -90,23 +91,14 @@ def log_as_reference(log, folder):
     return folder / "reference.csv"
 
 
-@pytest.mark.parametrize("method", ["smoother", "filter", "sensor"])
+@pytest.mark.parametrize("method", [*Method, "sensor"])
 def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path, method):
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
-    code, _, err = run(
-        "imu",
-        "orient",
-        log_file,
-        "--into",
-        sweep_file,
-        "--replace",
-        "--method",
-        method,
-        "--time-offset-s",
-        "0.05",
-    )
+    into = ("--into", sweep_file, "--replace", "--time-offset-s", "0.05")
+    code, out, err = run("imu", "orient", log_file, *into, "--method", method, "--json")
     assert code == 0, err
+    assert json.loads(out)["method"] == method
     stream = load_sweep(sweep_file).orientation
     assert stream is not None
     assert stream.time_offset_s == 0.05

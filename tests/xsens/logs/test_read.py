@@ -28,7 +28,7 @@ from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream, read_log
 from xsens.logs.samples import Gap, ImuLog
 from xsens.logs.textlogs import write_csv
-from xsens.messages.control import Configuration, MessageId, UnitConfiguration, utc_message
+from xsens.messages.control import MessageId, utc_message
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
@@ -154,8 +154,7 @@ def test_messages_not_as_long_as_configured_are_left_out(s):
 
 def test_several_units_behind_a_master_are_refused(s):
     layout = DataLayout(EVERYTHING, COUNTED)
-    units = (UnitConfiguration(0x100, layout.size, layout.mode, layout.settings),) * 2
-    data = encode(configuration_message(Configuration(0x1, 1152, 0, units)))
+    data = encode(configuration_message([(layout.mode, layout.settings)] * 2))
     with pytest.raises(InvalidInputError, match=r"one unit.*master of 2"):
         parse_stream(data + b"".join(legacy_messages(s, layout)))
 

@@ -203,7 +203,7 @@ def test_decoders_of_single_messages_refuse_with_one_line(data):
     readers = (
         lambda b: Configuration.from_message(Message(MessageId.CONFIGURATION, b)),
         lambda b: RawCalibration.from_message(Message(MessageId.EMTS, b[:168].ljust(168, b"\x01"))),
-        lambda b: DataLayout(int.from_bytes(b[:2], "big"), int.from_bytes(b[2:6], "big")).decode(b[6:]),
+        lambda b: DataLayout(int.from_bytes(b[:2], "big"), int.from_bytes(b[2:6], "big")).size,
         lambda b: parse_text(b.decode("utf-8", "replace")),
     )
     for reader in readers:
