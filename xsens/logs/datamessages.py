@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +19,7 @@ from xsens.logs.worlds import Claim
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, Values
-from xsens.messages.mtdata2 import Column, columns, name_of, world_of
+from xsens.messages.mtdata2 import columns, name_of, world_of
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
 
 _Read = TypeVar("_Read")
@@ -157,9 +157,6 @@ def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration) -> 
 _NOTATIONS = ("quaternion_wxyz", "rotation_matrix_by_column", "euler_deg")
 _STAMPS = ("packet_counter", "sample_time_fine")
 
-_Table = dict[int, Column]
-"""Numbers by the identifier of the item."""
-
 
 def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     """Read the samples of the MTData2 messages at indices `which`.
@@ -171,65 +168,64 @@ def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    table, damaged = columns(frames[which])
+    items, world, rows, damaged = _items(frames[which])
     if damaged:
         parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
-    told = [_filled(table, name, which.size) for name in _STAMPS]
-    rows = np.zeros(which.size, dtype=bool)
-    for identifier, column in table.items():
-        rows[column.rows] |= name_of(identifier) not in _STAMPS
-    for values in told:
-        rows &= True if values is None else np.isfinite(values[:, 0])
+    told = [items.pop(name, None) for name in _STAMPS]
+    for stamp in told:
+        rows &= True if stamp is None else np.isfinite(stamp[:, 0])
     if not rows.any():
         raise InvalidInputError(
             f"expected measurements with a time in {which.size} MTData2 messages, got none"
         )
     if not rows.all():
         parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
-    counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
+        items = {name: values[rows] for name, values in items.items()}
+    counter, ticks = (None if stamp is None else stamp[rows, 0].astype(np.int64) for stamp in told)
     others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
     stamps = replace(_stretches(frames, only(which, rows)), counter=counter, ticks=ticks, others=others)
-    most = [max(n, key=lambda i: n[i].rows.size) for name in _NOTATIONS if (n := _named(table, name))]
-    notations = [only(_filled({i: table[i] for i in most[:1]}, name, rows.size), rows) for name in _NOTATIONS]
-    if notations[1] is not None:
-        notations[1] = np.swapaxes(notations[1].reshape(-1, 3, 3), 1, 2).reshape(-1, 9)
-    claim = Claim(world_of(most[0]) if most else "NWU", "as its messages say")
-    return stamps, _measured(table, rows, parts), claim, tuple(notations)
+    claim = Claim(world, "as its messages say")
+    return stamps, _measured(items, parts), claim, tuple(map(items.get, _NOTATIONS))
 
 
-def _named(table: _Table, name: str) -> _Table:
-    return {identifier: column for identifier, column in table.items() if name_of(identifier) == name}
+def _items(frames: Frames) -> tuple[Values, str, BoolArray, int]:
+    """Items of messages by name, NaN where missing; their world; which measure; how many are damaged.
+
+    Orientations in another world than the first are left out.
+    """
+    items: Values = {}
+    world, damaged = "", 0
+    measured = np.zeros(len(frames), dtype=bool)
+    for first in range(0, len(frames), _SOME):
+        found, bad = columns(frames[first : first + _SOME])
+        damaged += bad
+        for identifier, column in found.items():
+            name, values, rows = name_of(identifier), column.values, first + column.rows
+            measured[rows] |= name not in _STAMPS
+            if name in _NOTATIONS:
+                world = world or world_of(identifier)
+                if world != world_of(identifier):
+                    continue
+            if name == _NOTATIONS[1]:
+                values = values.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
+            if name not in items:
+                items[name] = np.full((len(frames), values.shape[1]), np.nan)
+            items[name][rows] = values
+    return items, world or "NWU", measured, damaged
 
 
-def _filled(table: _Table, name: str, size: int) -> FloatArray | None:
-    """The item called `name` for every message, shape (size, count), NaN where it is missing."""
-    found = list(_named(table, name).values())
-    if not found:
-        return None
-    if len(found) == 1 and found[0].rows.size == size and (np.diff(found[0].rows) == 1).all():
-        return found[0].values
-    values = np.full((size, found[0].values.shape[1]), np.nan)
-    for column in found:
-        values[column.rows] = column.values
-    return values
-
-
-def _measured(table: _Table, rows: BoolArray, parts: Parts) -> Parts:
+def _measured(items: Values, parts: Parts) -> Parts:
     """Add readings, or increments in their place."""
-
-    def item(name: str) -> Any:
-        return only(_filled(table, name, rows.size), rows)
-
-    acceleration, rate = item("acceleration_m_s2"), item("rate_of_turn_rad_s")
+    acceleration, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
     increments = []
-    if acceleration is None and (acceleration := item("delta_v_m_s")) is not None:
+    if acceleration is None and (acceleration := items.get("delta_v_m_s")) is not None:
         parts = parts.noting("acceleration is the sensor's velocity increments over its sampling period")
         increments.append(VECTORS[0])
-    if rate is None and (turns := item("delta_q_wxyz")) is not None:
+    if rate is None and (turns := items.get("delta_q_wxyz")) is not None:
         unit = of_unit_length(turns)[:, None]
         turned = Rotation.from_quat(np.where(unit, turns, 1.0), scalar_first=True)
         rate = np.where(unit, turned.as_rotvec(), np.nan)
         parts = parts.noting("rate of turn is the sensor's orientation increments over its sampling period")
         increments.append(VECTORS[1])
-    vectors = (acceleration, rate, item("magnetic_field_au"))
+    vectors = (acceleration, rate, items.get("magnetic_field_au"))
     return replace(parts, vectors=vectors, increments=tuple(increments))
