@@ -87,12 +87,13 @@ def legacy_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
     stamps = replace(_stretches(frames, which), period_s=1.0 / rate_hz)
     notations = ("quaternion_wxyz", "matrix", "euler_deg")
-    values = _all_of(layout, data, ("counter", *notations, *(() if raw else VECTORS)))
+    counter = _all_of(layout, data, ("counter",)).get("counter")
+    if counter is not None:
+        stamps, counter = replace(stamps, counter=counter[:, 0].astype(np.int64)), None
+    values = _all_of(layout, data, (*notations, *VECTORS))
     if raw and calibration is not None:
         values |= zip(VECTORS, _in_units(layout, data, calibration), strict=True)
         parts = parts.noting(NOT_COMPENSATED)
-    if "counter" in values:
-        stamps = replace(stamps, counter=values["counter"][:, 0].astype(np.int64))
     parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
     return stamps, parts, Claim(layout.frame, "as configured"), tuple(map(values.get, notations))
 
@@ -181,9 +182,10 @@ def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     if not rows.all():
         parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
         items = {name: values[rows] for name, values in items.items()}
+    stamps = _stretches(frames, only(which, rows))
     counter, ticks = (None if stamp is None else stamp[rows, 0].astype(np.int64) for stamp in told)
     others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
-    stamps = replace(_stretches(frames, only(which, rows)), counter=counter, ticks=ticks, others=others)
+    stamps = replace(stamps, counter=counter, ticks=ticks, others=others)
     claim = Claim(world, "as its messages say")
     return stamps, _measured(items, parts), claim, tuple(map(items.get, _NOTATIONS))
 
