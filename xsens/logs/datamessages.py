@@ -47,7 +47,7 @@ def _stretches(frames: Frames, which: IntArray) -> Stamps:
 
 _RAW = OutputMode.RAW | OutputMode.MT9
 _RAW_WITH_COUNTER = 22
-_SOME = 1 << 15
+_SOME = 1 << 12
 """Messages decoded at a time: as numbers they take several times their memory."""
 
 _ENOUGH = 10_000
