@@ -154,9 +154,12 @@ class _Rows:
             yield line if self.separator == "," else line.replace(",", ".")
 
     def _number(self, cell: str) -> float:
-        value = number(cell)
-        self.words += value != value and cell.strip().lower() not in ("", "nan")
-        return value
+        try:
+            return float(cell)
+        except ValueError:  # quoted, blank, or a word
+            value = number(cell)
+            self.words += value != value and bool(cell.strip())
+            return value
 
 
 def number(cell: str) -> float:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
-from imu_messages import Item, items_payload
+from imu_logs import calibration, configured, legacy_messages, mt9_bin, mt9_records, mtdata2_messages, samples
+from imu_messages import Item, calibration_message, items_payload
 
 from speckle3d.core.errors import FileError, Speckle3DError
 from xsens.logs.read import MOST_BYTES, parse_stream, read_log
@@ -313,3 +313,33 @@ def test_time_and_memory_grow_with_the_size_alone(name, tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 70 * len(data)
     finally:
         tracemalloc.stop()
+
+
+def long_logs():
+    """Logs of 10,000 samples again and again, so that the counter starts anew."""
+    s = samples(10_000, 256.0)
+    layout = DataLayout(OutputMode.CALIBRATED | OutputMode.ORIENTATION, OutputSettings.COUNTER)
+    names = [f"{name}_{axis}" for name in ("Acc", "Gyr", "Mag") for axis in "XYZ"]
+    vectors = [s[name] for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")]
+    rows = np.column_stack([*vectors, s["world_from_sensor"].as_quat(scalar_first=True)]).tolist()
+    lines = ["\t".join([str(i), *(f"{v:.6f}" for v in row)]) for i, row in enumerate(rows)]
+    heads = "\t".join(["PacketCounter", *names, *(f"Quat_q{i}" for i in range(4))])
+    return {
+        "text": "\n".join(["// Update Rate: 256.0Hz", heads, *lines * 4, ""]).encode(),
+        "mtdata2": b"".join(mtdata2_messages(s, ticks=39)) * 30,
+        "legacy": configured(layout, period=450) + b"".join(legacy_messages(s, layout)) * 30,
+        "mt9": encode(calibration_message(calibration())) + b"".join(mt9_records(s, calibration())) * 30,
+    }
+
+
+@pytest.mark.slow
+def test_reading_takes_a_few_times_the_memory_of_the_file(tmp_path):
+    """The samples alone, as doubles, are 1.5 times the bytes of MTData2, 2 of MTData, 3.3 of raw counts."""
+    for (name, data), most in zip(long_logs().items(), (3.0, 3.2, 3.9, 5.3), strict=True):
+        (tmp_path / name).write_bytes(data)
+        tracemalloc.start()
+        try:
+            assert len(read_log(tmp_path / name)) % 10_000 == 0
+            assert tracemalloc.get_traced_memory()[1] < most * len(data), name
+        finally:
+            tracemalloc.stop()
