@@ -8,6 +8,7 @@ this package's own engine, and what that engine claims, and how far VQF is from 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,11 +20,12 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S
-from xsens.fusion.stretch import Estimate
 from xsens.logs.parts import nwu_from
 
 if TYPE_CHECKING:
     from vqf import VQF
+
+    from xsens.fusion.stretch import Estimate  # which loads numba
 
 _EVEN = 0.05
 """Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
@@ -139,12 +141,13 @@ class VqfEngine:
         disturbed = found["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
         if magnetic:
             self._fields.append(not disturbed.all())
-        return Estimate(
-            xyzw,
-            np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi),
-            found["bias"][at],
-            disturbed,
-            found["restDetected"][at],
+        return replace(
+            own,
+            xyzw=xyzw,
+            sd_rad=np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi),
+            bias_rad_s=found["bias"][at],
+            disturbed=disturbed,
+            resting=found["restDetected"][at],
         )
 
     def _offline(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
