@@ -11,7 +11,7 @@ from imu_messages import (
 )
 from scipy.spatial.transform import Rotation
 
-from xsens.messages.control import Configuration, MessageId, UnitConfiguration
+from xsens.messages.control import MessageId
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode
 from xsens.messages.rawcounts import RawCalibration
@@ -39,12 +39,10 @@ def calibration(seed=0):
     """A calibration block like that of a real unit."""
     rng = np.random.default_rng(seed)
     return RawCalibration(
-        device_id=0x00007154,
-        period=450,
+        rate_hz=256.0,
         offsets=rng.integers(29000, 34000, (3, 3)).astype(float),
         gains=np.round(np.array([[1270.0], [1250.0], [8000.0]]) * rng.uniform(0.9, 1.1, (3, 3)) * 256) / 256,
         misalignments=np.round((np.eye(3) + rng.normal(0, 0.01, (3, 3, 3))) * 2**14) / 2**14,
-        housing=np.eye(3),
     )
 
 
@@ -78,11 +76,9 @@ def mt9_bin(s, unit, first=0, stray=15):
     return encode(calibration_message(unit)) + records[0][-stray:] + b"".join(records)
 
 
-def configured(layout, period=1152, skip=0, size=None):
+def configured(layout, period=1152):
     """The answer to a request for the configuration."""
-    size = layout.size if size is None else size
-    unit = UnitConfiguration(0x1234, size, layout.mode, layout.settings)
-    return encode(configuration_message(Configuration(0x1234, period, skip, (unit,))))
+    return encode(configuration_message([(layout.mode, layout.settings)], period))
 
 
 def legacy_values(s, layout, first=0):

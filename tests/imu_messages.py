@@ -7,20 +7,18 @@ import numpy as np
 
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Message
-from xsens.messages.mtdata import NumberFormat
 from xsens.messages.mtdata2 import kind_of
 
 
 def bytes_from_numbers(values, form):
-    """Numbers, shape (n, k), to the nearest that `form` can hold, as rows of bytes."""
+    """Numbers, shape (n, k), to the nearest that the format of those two bits can hold, as rows of bytes."""
     array = np.asarray(values, dtype=np.float64)
-    if form in (NumberFormat.FLOAT32, NumberFormat.FLOAT64):
+    if form in (0, 3):
         with np.errstate(over="ignore", invalid="ignore"):  # to infinity, as the sensor's own would
-            return np.ascontiguousarray(array.astype(f">f{form.size}")).view(np.uint8)
-    fraction_bits = 20 if form is NumberFormat.FP12_20 else 32
-    ticks = np.round(array * 2.0**fraction_bits)
-    if form is NumberFormat.FP12_20:
-        return np.ascontiguousarray(ticks.astype(">i4")).view(np.uint8)
+            return np.ascontiguousarray(array.astype((">f4", "", "", ">f8")[form])).view(np.uint8)
+    if form == 1:
+        return np.ascontiguousarray(np.round(array * 2.0**20).astype(">i4")).view(np.uint8)
+    ticks = np.round(array * 2.0**32)
     whole = np.ascontiguousarray(ticks.astype(">i8")[..., None]).view(np.uint8)
     return np.concatenate((whole[..., 4:], whole[..., 2:4]), axis=-1).reshape(*array.shape[:-1], -1)
 
@@ -31,10 +29,10 @@ def mtdata_payloads(layout, values):
     for field in layout.fields:
         array = np.atleast_2d(np.asarray(values[field.name], dtype=float))
         assert array.shape[1] == field.count, field.name
-        if field.kind == "real":
-            parts.append(bytes_from_numbers(array, layout.number_format))
+        if field.whole:
+            parts.append(np.ascontiguousarray(array.astype(field.whole)).view(np.uint8))
         else:
-            parts.append(np.ascontiguousarray(array.astype(field.kind)).view(np.uint8))
+            parts.append(bytes_from_numbers(array, layout.settings >> 8 & 3))
     return np.concatenate(parts, axis=1)
 
 
@@ -55,28 +53,28 @@ def _item(item):
     data = item.values
     if not isinstance(data, bytes):
         whole = kind_of(item.identifier).whole
-        form = NumberFormat(item.identifier & 3)
+        form = item.identifier & 3
         data = np.array(data).astype(whole).tobytes() if whole else bytes_from_numbers([data], form).tobytes()
     return struct.pack(">HB", item.identifier, len(data)) + data
 
 
-def configuration_message(c):
-    """The answer to a request for the configuration."""
-    payload = struct.pack(">IHH88xH", c.device_id, c.period, c.skip_factor, len(c.units))
-    for u in c.units:
-        payload += struct.pack(">IHHI8x", u.device_id, u.data_length, u.output_mode, u.output_settings)
+def configuration_message(units, period=1152, skip=0, length=0):
+    """The answer to a request for the configuration, of units of some mode and settings."""
+    payload = struct.pack(">IHH88xH", 0x1234, period, skip, len(units))
+    for mode, settings in units:
+        payload += struct.pack(">IHHI8x", 0x1234, length, mode, settings)
     return Message(MessageId.CONFIGURATION, payload)
 
 
 def calibration_message(unit):
-    """The calibration block of an MT9-B; what is not understood of it is zero."""
+    """The calibration block of an MT9-B; its housing square, what is not understood of it zero."""
     data = bytearray(168)
-    struct.pack_into(">I", data, 0, unit.device_id)
-    struct.pack_into(">H", data, 81, unit.period)
+    struct.pack_into(">I", data, 0, 0x7154)
+    struct.pack_into(">H", data, 81, round(115200 / unit.rate_hz))
     data[87:105] = np.round(unit.offsets).astype(">u2").tobytes()
     gains = np.round(unit.gains * 256).astype(">u4").reshape(9, 1).view(np.uint8)
     data[105:132] = gains[:, 1:].tobytes()
-    for at, matrix in zip((8, 26, 132, 150), (*unit.misalignments, unit.housing), strict=True):
+    for at, matrix in zip((8, 26, 132, 150), (*unit.misalignments, np.eye(3)), strict=True):
         data[at : at + 18] = np.round(matrix * 2**14).astype(">i2").tobytes()
     return Message(MessageId.EMTS, bytes(data))
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -39,6 +39,24 @@ Log = Annotated[
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs that do not say.")]
 
 
+class World(StrEnum):
+    """World that the sensor's own orientation is seen from: east, north, up and so on."""
+
+    ENU = "ENU"
+    NWU = "NWU"
+    NED = "NED"
+
+
+WorldOption = Annotated[
+    World | None,
+    typer.Option(
+        "--world",
+        case_sensitive=False,
+        help="World of the sensor's own orientation; by default as its accelerometer and magnetometer show.",
+    ),
+]
+
+
 class Source(StrEnum):
     """Source of an orientation: the engines of `xsens.orient`, or the sensor itself."""
 
@@ -63,13 +81,13 @@ Magnetometer = Annotated[
 
 
 @imu.command("info")
-def imu_info(log_file: Log, rate_hz: RateHz = None, as_json: Json = False) -> None:
+def imu_info(log_file: Log, rate_hz: RateHz = None, world: WorldOption = None, as_json: Json = False) -> None:
     """Tell what a log holds, what is missing and what was skipped."""
     import numpy as np
 
     from speckle3d.core.sweep import INERTIAL
 
-    log = read(log_file, rate_hz)
+    log = read(log_file, rate_hz, world)
     rows = [
         ("samples", str(len(log)), ""),
         ("duration", f"{log.duration_s:.3f}", "s"),
@@ -95,12 +113,13 @@ def imu_convert(
     log_file: Log,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="CSV to write.")],
     rate_hz: RateHz = None,
+    world: WorldOption = None,
 ) -> None:
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock."""
     from xsens.logs.textlogs import write_csv
 
     require_own_place(out, "log", log_file)
-    log = read(log_file, rate_hz)
+    log = read(log_file, rate_hz, world)
     write_csv(out, log)
     tell(log)
 
@@ -128,6 +147,7 @@ def imu_orient(
         bool, typer.Option("--replace", help="Replace a stream that the sweep has.")
     ] = False,
     rate_hz: RateHz = None,
+    world: WorldOption = None,
     as_json: Json = False,
 ) -> None:
     """Find the sensor's orientation from its log, and put it into a sweep, on its own clock."""
@@ -139,7 +159,7 @@ def imu_orient(
     if out is not None:
         require_own_place(out, "log", log_file, into, calibration)
     held = _ridden_along(log_file)
-    log = read(log_file, rate_hz) if held is None else log_of(held, log_file.name)
+    log = read(log_file, rate_hz, world) if held is None else log_of(held, log_file.name)
     with naming(str(log_file)):
         rotations, found = orientation_of(log, method, magnetometer)
     if into is not None:
@@ -178,7 +198,7 @@ def imu_record(
     from xsens.live.device import DeviceSettings
     from xsens.live.recording import record
 
-    settings: Any = DeviceSettings(content=content, rate_hz=rate_hz, baud=baud)  # type: ignore[arg-type]
+    settings = DeviceSettings(content, rate_hz, baud)
     console = Console(stderr=True)
     state = None
     try:
@@ -199,18 +219,20 @@ def require_finite_offset(time_offset_s: float) -> None:
         raise InvalidInputError(f"--time-offset-s: expected a finite number, got {time_offset_s}")
 
 
-def read(path: Path, rate_hz: float | None) -> ImuLog:
-    """Read a log of any kind, or what a sweep holds of its orientation sensor."""
+def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> ImuLog:
+    """Read a log of any kind, or what a sweep holds of its orientation sensor (its world is known)."""
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
+    held = None
     inside = _inside_probe(path)
+    if inside is None and (held := _ridden_along(path)) is not None:
+        inside = log_of(held, path.name)
     if inside is not None:
+        if world is not None:
+            note("--world is not used: it is for logs, and the world of a recording's stream is known")
         return inside
-    held = _ridden_along(path)
-    if held is not None:
-        return log_of(held, path.name)
-    return read_log(path, None if rate_hz is None else Hints(rate_hz=rate_hz))
+    return read_log(path, Hints(rate_hz=rate_hz, world=world))
 
 
 def _ridden_along(path: Path) -> OrientationSensor | None:

@@ -14,10 +14,12 @@ from speckle3d.cli.imu import (
     Magnetometer,
     MethodOption,
     RateHz,
+    WorldOption,
     imu,
     orientation_of,
     read,
     require_finite_offset,
+    tell,
 )
 from speckle3d.core.errors import InvalidInputError, naming
 
@@ -63,6 +65,7 @@ def imu_accuracy(
         Path | None, typer.Option(help="PNG of single turns, as Figure 5 of the paper.")
     ] = None,
     rate_hz: RateHz = None,
+    world: WorldOption = None,
     as_json: Json = False,
 ) -> None:
     """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2)."""
@@ -72,7 +75,8 @@ def imu_accuracy(
     if (reference is None) == (optical is None):
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
     require_finite_offset(time_offset_s)
-    log = read(log_file, rate_hz)
+    log = read(log_file, rate_hz, world)
+    tell(log)
     mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
     if not mountings:
         note("no --calibration: the sensor's axes are taken for the image's")
@@ -139,4 +143,6 @@ def _tracked(path: Path) -> TimedRotations:
     if is_tum(path):
         poses = read_tum(path)
         return TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
-    return read(path, None).rotations()
+    log = read(path)
+    tell(log)
+    return log.rotations()

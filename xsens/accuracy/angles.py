@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.tables import text_table
@@ -43,82 +43,74 @@ class PairErrors:
 
     Attributes
     ----------
-    first, second : ndarray of int, shape (p,)
-        Frames of the pair, first < second: 0 1, 0 2 and so on, 1 2 and so on.
+    frames : int
+        Number n of orientations; pairs are in the order of ``np.triu_indices(n, 1)``: 0 1, 0 2 and so on.
     reference_rad : ndarray, shape (p, 3)
         Roll, yaw and tilt of the second frame seen from the first, about the pair's mean z, y and x.
     error_rad : ndarray, shape (k, p, 3)
         Measured angles less the reference's, for every calibration.
     """
 
-    first: IntArray
-    second: IntArray
+    frames: int
     reference_rad: FloatArray
     error_rad: FloatArray
 
     def __len__(self) -> int:
         """Number of errors: pairs times calibrations."""
-        return int(self.error_rad.shape[0] * self.error_rad.shape[1])
-
-    @property
-    def frames(self) -> int:
-        """Number of orientations."""
-        return int(self.second.max()) + 1
-
-    @property
-    def measured_rad(self) -> FloatArray:
-        """Angles measured by the sensor, shape (k, p, 3)."""
-        return self.reference_rad + self.error_rad
-
-
-@dataclass(frozen=True)
-class AccuracyRow:
-    """Errors of one experiment over all pairs and calibrations; each array is roll, yaw, tilt, radians.
-
-    The mean is the error that grows from earlier frames to later ones: a pair taken the other way round has
-    the opposite error, so it depends on the order of the frames, and `rms_rad` does not.
-    `calibration_sd_rad` is the scatter caused by the calibrations: the deviation of a pair's errors from
-    their mean over the calibrations, zero if there is only one.
-    """
-
-    name: str
-    frames: int
-    calibrations: int
-    errors: int
-    mean_rad: FloatArray
-    sd_rad: FloatArray
-    rms_rad: FloatArray
-    worst_rad: FloatArray
-    calibration_sd_rad: FloatArray
+        return self.error_rad.size // 3
 
 
 @dataclass(frozen=True)
 class AccuracyTable:
-    """One row per experiment, as in table 2 of [1]_.
+    """Errors of each experiment over all pairs and calibrations, as in table 2 of [1]_.
+
+    Attributes
+    ----------
+    statistics : mapping of str to mapping of str to ndarray, shape (3,)
+        By experiment and statistic: roll, yaw and tilt in radians. The mean is the error that grows from
+        earlier frames to later ones: a pair taken the other way round has the opposite error, so it depends
+        on the order of the frames, and the RMS does not. The deviation with the calibration is that of a
+        pair's errors from their mean over the calibrations, zero if there is only one.
 
     References
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008.
     """
 
-    rows: tuple[AccuracyRow, ...]
+    statistics: Mapping[str, Mapping[str, FloatArray]]
 
     @classmethod
     def of(cls, experiments: Mapping[str, PairErrors]) -> AccuracyTable:
         """Summarise the errors of every experiment, by its name."""
-        return cls(tuple(_row(name, errors) for name, errors in experiments.items()))
+        return cls({name: _statistics(errors.error_rad) for name, errors in experiments.items()})
 
     def text(self) -> str:
         """Mean and standard deviation in degrees as an aligned table."""
-        lines = [["degrees", *(angle.capitalize() for angle in ANGLES)]]
-        for row in self.rows:
-            pairs = zip(np.rad2deg(row.mean_rad), np.rad2deg(row.sd_rad), strict=True)
-            lines.append([row.name, *(f"{mean:+.4f} ± {sd:.4f}" for mean, sd in pairs)])
+        lines = [["degrees", *map(str.capitalize, ANGLES)]]
+        for name, found in self.statistics.items():
+            pairs = np.rad2deg([found["mean"], found["standard deviation"]]).T
+            lines.append([name, *(f"{mean:+.4f} ± {sd:.4f}" for mean, sd in pairs)])
         return text_table(lines).rstrip("\n")
 
     def values(self) -> tuple[tuple[str, float, str], ...]:
         """All statistics as rows of description, value, unit."""
-        return tuple(value for row in self.rows for value in _values(row))
+        return tuple(
+            (f"{name}: {angle} error, {what}", float(value), "degrees")
+            for name, found in self.statistics.items()
+            for what, radians in found.items()
+            for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
+        )
+
+
+def _statistics(error_rad: FloatArray) -> dict[str, FloatArray]:
+    all_errors = error_rad.reshape(-1, 3)
+    return {
+        "mean": all_errors.mean(axis=0),
+        "standard deviation": all_errors.std(axis=0),
+        "RMS": np.sqrt(np.square(all_errors).mean(axis=0)),
+        "largest": np.abs(all_errors).max(axis=0),
+        "standard deviation with the calibration": np.sqrt(error_rad.var(axis=0).mean(axis=0)),
+    }
 
 
 def pair_errors(
@@ -149,10 +141,6 @@ def pair_errors(
     InvalidInputError
         If pairs times calibrations exceed `MOST_ERRORS`.
 
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008.
-
     Examples
     --------
     A sensor that measures 10.5 degrees of tilt for 10:
@@ -165,15 +153,16 @@ def pair_errors(
     >>> round(float(tilt), 6)
     0.5
     """
-    matrices = _calibrations(sensor_from_image)
-    first, second = _pairs(world_from_sensor, reference_from_image, len(matrices))
-    reference = _turns(reference_from_image, first, second)
+    alone = isinstance(sensor_from_image, Rotation) and sensor_from_image.single
+    if not alone and not len(sensor_from_image):
+        raise InsufficientDataError("sensor_from_image: expected at least one calibration, got none")
+    matrices = Rotation.concatenate(sensor_from_image).as_matrix().reshape(-1, 3, 3)
+    turns, reference = _turns(world_from_sensor, reference_from_image, len(matrices))
     # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T in the image's axes, so that
     # each pair's rotation vector is computed once for all calibrations.
-    turns = _turns(world_from_sensor, first, second)
     measured = np.einsum("kji,pj->kpi", matrices, turns)
     errors = _nearest_turn(measured, reference) - reference
-    return PairErrors(first, second, reference[:, ::-1].copy(), errors[..., ::-1].copy())
+    return PairErrors(len(world_from_sensor), reference[:, ::-1].copy(), errors[..., ::-1].copy())
 
 
 def common_readings(
@@ -205,7 +194,8 @@ def common_readings(
     """
     if frames < 2:
         raise InvalidInputError(f"frames: expected at least 2, got {frames}")
-    covered = np.flatnonzero(sensor.covers(reference.time_s - sensor_offset_s))
+    times_s = reference.time_s - sensor_offset_s
+    covered = np.flatnonzero(sensor.covers(times_s))
     if covered.size < 2:
         raise InsufficientDataError(
             f"expected at least 2 samples of the reference covered by the sensor's, got {covered.size}: the "
@@ -213,7 +203,7 @@ def common_readings(
             f"{_span(sensor.time_s + sensor_offset_s)}"
         )
     some = covered[np.unique(np.linspace(0, covered.size - 1, frames).round().astype(int))]
-    return sensor.at(reference.time_s[some] - sensor_offset_s), reference.world_from_sensor[some]
+    return sensor.at(times_s[some]), reference.world_from_sensor[some]
 
 
 def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
@@ -235,48 +225,32 @@ def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
     InsufficientDataError
         If the frames turn about one axis only, or hardly at all.
     """
-    first, second = _pairs(measured, reference, 1)
-    target, image = _turns(reference, first, second), _turns(measured, first, second)
-    spread = np.linalg.svd(target, compute_uv=False) / np.sqrt(len(target))
-    if spread.size < 2 or spread[1] < _MOUNTING_LIMIT:
+    image, target = _turns(measured, reference, 1)
+    _, second, _ = np.sqrt(np.linalg.eigvalsh(target.T @ target / len(target)).clip(0.0))
+    if second < _MOUNTING_LIMIT:
         raise InsufficientDataError(
             f"expected turns about two axes, {np.rad2deg(_MOUNTING_LIMIT):.0f} degrees RMS between frames, "
-            f"got {np.rad2deg(spread[1] if spread.size > 1 else 0.0):.2g} about the second: the motion does "
-            "not tell how the reference is mounted"
+            f"got {np.rad2deg(second):.2g} about the second: the motion does not tell how the reference is "
+            "mounted"
         )
-    mounting, _ = Rotation.align_vectors(target, image)
-    return mounting
+    return Rotation.align_vectors(target, image)[0]
 
 
-def _calibrations(sensor_from_image: Rotation | Sequence[Rotation]) -> FloatArray:
-    """Matrices, shape (k, 3, 3)."""
-    alone = isinstance(sensor_from_image, Rotation) and sensor_from_image.single
-    if not alone and not len(sensor_from_image):
-        raise InsufficientDataError("sensor_from_image: expected at least one calibration, got none")
-    listed = [sensor_from_image] if isinstance(sensor_from_image, Rotation) else sensor_from_image
-    return np.concatenate([each.as_matrix().reshape(-1, 3, 3) for each in listed])
-
-
-def _pairs(measured: Rotation, reference: Rotation, calibrations: int) -> tuple[IntArray, IntArray]:
-    """Indices of all pairs of frames, first < second."""
-    n = 0 if measured.single else len(measured)
-    found = 0 if reference.single else len(reference)
+def _turns(measured: Rotation, reference: Rotation, calibrations: int) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors between the frames of all pairs by each, in the axes of the body, shape (p, 3)."""
+    n, found = (0 if each.single else len(each) for each in (measured, reference))
     if found != n:
         raise MismatchError(f"expected one reference per reading, got {found} and {n}")
     if n < 2:
         raise InsufficientDataError(f"expected at least 2 orientations, got {n}")
-    if n * (n - 1) // 2 * calibrations > MOST_ERRORS:
+    if (pairs := n * (n - 1) // 2) * calibrations > MOST_ERRORS:
         raise InvalidInputError(
-            f"expected at most {MOST_ERRORS} frame pairs times calibrations, got {n * (n - 1) // 2} pairs of "
+            f"expected at most {MOST_ERRORS} frame pairs times calibrations, got {pairs} pairs of "
             f"{n} orientations times {calibrations}: take fewer orientations"
         )
     first, second = np.triu_indices(n, 1)
-    return first, second
-
-
-def _turns(world_from_body: Rotation, first: IntArray, second: IntArray) -> FloatArray:
-    """Rotation vectors from the first to the second of each pair, about the body's x, y, z, shape (p, 3)."""
-    return np.asarray((world_from_body[first].inv() * world_from_body[second]).as_rotvec())
+    turned = [(each[first].inv() * each[second]).as_rotvec() for each in (measured, reference)]
+    return turned[0], turned[1]
 
 
 def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
@@ -289,36 +263,6 @@ def _nearest_turn(turns: FloatArray, reference: FloatArray) -> FloatArray:
         other = np.where(angle > 0, turns * (1.0 - 2.0 * np.pi / angle), turns)
     nearer = np.linalg.norm(other - reference, axis=-1) < np.linalg.norm(turns - reference, axis=-1)
     return np.where(nearer[..., None], other, turns)
-
-
-def _row(name: str, errors: PairErrors) -> AccuracyRow:
-    by_pair = errors.error_rad.mean(axis=0)
-    return AccuracyRow(
-        name=name,
-        frames=errors.frames,
-        calibrations=len(errors.error_rad),
-        errors=len(errors),
-        mean_rad=errors.error_rad.mean(axis=(0, 1)),
-        sd_rad=errors.error_rad.std(axis=(0, 1)),
-        rms_rad=np.sqrt(np.square(errors.error_rad).mean(axis=(0, 1))),
-        worst_rad=np.abs(errors.error_rad).max(axis=(0, 1)),
-        calibration_sd_rad=np.sqrt(np.square(errors.error_rad - by_pair).mean(axis=(0, 1))),
-    )
-
-
-def _values(row: AccuracyRow) -> list[tuple[str, float, str]]:
-    shown = {
-        "mean": row.mean_rad,
-        "standard deviation": row.sd_rad,
-        "RMS": row.rms_rad,
-        "largest": row.worst_rad,
-        "standard deviation with the calibration": row.calibration_sd_rad,
-    }
-    return [
-        (f"{row.name}: {angle} error, {what}", float(value), "degrees")
-        for what, radians in shown.items()
-        for angle, value in zip(ANGLES, np.rad2deg(radians), strict=True)
-    ]
 
 
 def _span(time_s: FloatArray) -> str:

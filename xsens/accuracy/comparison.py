@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedRotations
 
@@ -17,45 +17,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Differences of one stream from another.
+    """Root mean squares of one stream's difference from another, as in [1]_.
 
     Attributes
     ----------
-    time_s : ndarray, shape (m,)
-        Times of the first stream's samples that the second covers.
-    total_rad, heading_rad, inclination_rad : ndarray, shape (m,)
-        The whole angle, the signed angle about up, and the angle that remains without it (Laidig et al.
-        2021); a constant heading offset is included.
-    heading_offset_rad : float
-        Mean difference in heading.
+    total_rms_rad, heading_rms_rad, inclination_rms_rad : float
+        Of the whole angle, of the signed angle about up, and of the angle that remains without it.
+    heading_offset_rad, heading_rms_without_offset_rad : float
+        Mean difference in heading, and the root mean square of what is left without it.
+
+    References
+    ----------
+    .. [1] D. Laidig et al., "BROAD - A benchmark for robust inertial orientation estimation", Data 6(7),
+       2021.
     """
 
-    time_s: FloatArray
-    total_rad: FloatArray
-    heading_rad: FloatArray
-    inclination_rad: FloatArray
+    total_rms_rad: float
+    heading_rms_rad: float
+    inclination_rms_rad: float
     heading_offset_rad: float
-
-    @property
-    def total_rms_rad(self) -> float:
-        """Root mean square of the whole angle."""
-        return _rms(self.total_rad)
-
-    @property
-    def heading_rms_rad(self) -> float:
-        """Root mean square of the heading's difference."""
-        return _rms(self.heading_rad)
-
-    @property
-    def heading_rms_without_offset_rad(self) -> float:
-        """Root mean square of the heading's difference less its mean."""
-        off = np.angle(np.exp(1j * (self.heading_rad - self.heading_offset_rad)))
-        return _rms(off)
-
-    @property
-    def inclination_rms_rad(self) -> float:
-        """Root mean square of the inclination's difference."""
-        return _rms(self.inclination_rad)
+    heading_rms_without_offset_rad: float
 
 
 def compare_orientations(
@@ -75,11 +56,6 @@ def compare_orientations(
     InvalidInputError
         If one is no stream of orientation.
 
-    References
-    ----------
-    .. [1] D. Laidig et al., "BROAD - A benchmark for robust inertial orientation estimation", Data 6(7),
-    2021.
-
     Examples
     --------
     >>> import numpy as np
@@ -92,21 +68,24 @@ def compare_orientations(
     >>> round(found.heading_rms_rad, 6), round(found.inclination_rms_rad, 6)
     (0.1, 0.0)
     """
-    one, other = _stream(one), _stream(other)
-    common = other.covers(one.time_s)
+    first, second = _stream(one), _stream(other)
+    common = second.covers(first.time_s)
     if not common.any():
         raise InsufficientDataError(
-            f"expected streams that overlap, got {one.time_s[0]:.3f} to {one.time_s[-1]:.3f} s "
-            f"and {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s"
+            f"expected streams that overlap, got {first.time_s[0]:.3f} to {first.time_s[-1]:.3f} s "
+            f"and {second.time_s[0]:.3f} to {second.time_s[-1]:.3f} s"
         )
-    time_s = one.time_s[common]
-    apart = one.world_from_sensor[common] * other.at(time_s).inv()
+    apart = first.world_from_sensor[common] * second.at(first.time_s[common]).inv()
     w, x, y, z = apart.as_quat(scalar_first=True).T
-    heading = np.angle(np.exp(2j * np.arctan2(z, w)))
-    inclination = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
-    total = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
-    offset = float(np.angle(np.exp(1j * heading).mean()))
-    return Comparison(time_s, total, heading, inclination, offset)
+    turn = np.exp(2j * np.arctan2(z, w))
+    offset = turn.mean()
+    return Comparison(
+        _rms(apart.magnitude()),
+        _rms(np.angle(turn)),
+        _rms(2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))),
+        float(np.angle(offset)),
+        _rms(np.angle(turn / offset)),
+    )
 
 
 def _stream(given: object) -> TimedRotations:
@@ -119,5 +98,5 @@ def _stream(given: object) -> TimedRotations:
     return stream
 
 
-def _rms(values: FloatArray) -> float:
+def _rms(values: npt.ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))

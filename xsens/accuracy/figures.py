@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.printable import printable
 from xsens.accuracy.angles import ANGLES, PairErrors
@@ -38,31 +38,44 @@ class Turn:
     Attributes
     ----------
     experiment, angle : str
-    frame : ndarray of int, shape (m,)
     reference_rad : ndarray, shape (m,)
         Angle from the first frame; it starts at zero and grows.
-    measured_rad : ndarray, shape (k, m)
-        Measured angle by every calibration.
+    error_rad : ndarray, shape (k, m)
+        Of the angle measured with every calibration.
     """
 
     experiment: str
     angle: str
-    frame: IntArray
     reference_rad: FloatArray
-    measured_rad: FloatArray
+    error_rad: FloatArray
 
     @property
     def drift_rad(self) -> FloatArray:
         """Largest error along the turn by every calibration, shape (k,)."""
-        return np.asarray(np.abs(self.measured_rad - self.reference_rad).max(axis=1))
+        return np.asarray(np.abs(self.error_rad).max(axis=1))
 
 
 def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]:
     """Turns about one axis, of at least `FEWEST_FRAMES` frames and nearly as long as the longest."""
-    axis = ANGLES.index(angle)
-    found = [turn for name, errors in experiments.items() for turn in _turns(name, errors, axis)]
+    found = [turn for name, errors in experiments.items() for turn in _turns(name, errors, angle)]
     longest = max((turn.reference_rad[-1] for turn in found), default=0.0)
     return [turn for turn in found if turn.reference_rad[-1] >= _SHORTEST * longest]
+
+
+def _turns(name: str, errors: PairErrors, angle: str) -> Iterator[Turn]:
+    axis, n = ANGLES.index(angle), errors.frames
+    pair = np.zeros((n, n), dtype=int)
+    pair[np.triu_indices(n, 1)] = np.arange(len(errors.reference_rad))
+    pair += pair.T
+    for start in range(n):
+        sign = np.sign(np.arange(n) - start)
+        reference = sign[:, None] * errors.reference_rad[pair[start]]
+        alone = (np.abs(np.delete(reference, axis, axis=1)) <= OFF_AXIS_RAD).all(axis=1)
+        kept = np.flatnonzero(alone & (reference[:, axis] >= 0))
+        kept = kept[np.argsort(reference[kept, axis], kind="stable")]
+        if kept.size >= FEWEST_FRAMES and reference[kept[-1], axis] > 0:
+            error_rad = sign[kept] * errors.error_rad[:, pair[start, kept], axis]
+            yield Turn(name, angle, reference[kept, axis], error_rad)
 
 
 def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figure:
@@ -82,8 +95,7 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 5.
     """
-    turns = {angle: turns_about(angle, experiments) for angle in ANGLES}
-    drawn = [angle for angle in ANGLES if turns[angle]]
+    drawn = [turns for angle in ANGLES if (turns := turns_about(angle, experiments))]
     if not drawn:
         raise InsufficientDataError(
             f"expected at least {FEWEST_FRAMES} frames that differ in one angle only, to within "
@@ -92,48 +104,23 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     figure = Figure(figsize=(9.0, 2.8 * len(drawn)), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(len(drawn), 2, squeeze=False)
-    for row, angle in zip(panels, drawn, strict=True):
-        _draw(row[0], max(turns[angle], key=lambda turn: float(turn.drift_rad.max())), worst=True)
-        _draw(row[1], min(turns[angle], key=lambda turn: float(turn.drift_rad.min())), worst=False)
+    for (left, right), turns in zip(panels, drawn, strict=True):
+        worst = max(turns, key=lambda turn: float(turn.drift_rad.max()))
+        best = min(turns, key=lambda turn: float(turn.drift_rad.min()))
+        _draw(left, "worst", worst, int(worst.drift_rad.argmax()))
+        _draw(right, "best", best, int(best.drift_rad.argmin()))
     panels[0, 0].legend(frameon=False, fontsize="small")
     figure.suptitle(printable(title), parse_math=False)
     return figure
 
 
-def _turns(name: str, errors: PairErrors, axis: int) -> Iterator[Turn]:
-    for start in range(errors.frames):
-        frame, reference, measured = _seen_from(start, errors)
-        off_axis = np.delete(reference, axis, axis=1)
-        kept = np.flatnonzero((np.abs(off_axis) <= OFF_AXIS_RAD).all(axis=1) & (reference[:, axis] >= 0))
-        kept = kept[np.argsort(reference[kept, axis], kind="stable")]
-        if kept.size >= FEWEST_FRAMES and reference[kept[-1], axis] > 0:
-            yield Turn(name, ANGLES[axis], frame[kept], reference[kept, axis], measured[:, kept, axis])
-
-
-def _seen_from(start: int, errors: PairErrors) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Frames, reference and measured angles from one frame to itself and all others."""
-    n = errors.frames
-    others = np.delete(np.arange(n), start)
-    low, high = np.minimum(start, others), np.maximum(start, others)
-    pairs = np.concatenate([[0], low * (2 * n - low - 1) // 2 + high - low - 1])
-    frame = np.concatenate([[start], others])
-    sign = np.sign(frame - start).astype(float)
-    reference = sign[:, None] * errors.reference_rad[pairs]
-    return frame, reference, reference + sign[:, None] * errors.error_rad[:, pairs]
-
-
-def _draw(axes: Axes, turn: Turn, worst: bool) -> None:
-    calibration = int(turn.drift_rad.argmax() if worst else turn.drift_rad.argmin())
-    measured = np.rad2deg(turn.measured_rad[calibration])
-    at = np.arange(turn.frame.size)
-    axes.plot(at, np.rad2deg(turn.reference_rad), color="black", linewidth=2.2, alpha=0.55, label="reference")
-    axes.plot(at, measured, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
-    which = "worst" if worst else "best"
-    axes.set_title(
-        f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}",
-        fontsize="medium",
-        parse_math=False,
-    )
+def _draw(axes: Axes, which: str, turn: Turn, calibration: int) -> None:
+    reference = np.rad2deg(turn.reference_rad)
+    measured = reference + np.rad2deg(turn.error_rad[calibration])
+    axes.plot(reference, color="black", linewidth=2.2, alpha=0.55, label="reference")
+    axes.plot(measured, "o--", color=_COLOURS[turn.angle], markersize=4, linewidth=1.3, label="sensor")
+    title = f"{which} {turn.angle}: {turn.experiment}, calibration {calibration + 1}"
+    axes.set_title(title, fontsize="medium", parse_math=False)
     axes.set_xlabel("orientation in the turn")
     axes.set_ylabel(f"{turn.angle} / degrees")
     axes.grid(visible=True, alpha=0.3)

@@ -14,10 +14,8 @@ and ``until_s`` when it left. Without a header the columns are tilt, yaw and, if
 
 from __future__ import annotations
 
-import math
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +26,6 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.streams import TimedRotations
 from xsens.logs.read import read_bounded
-from xsens.logs.texttables import number
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
 
@@ -64,11 +61,10 @@ class MechanismSettings:
             return
         if self.time_s is None:
             raise InvalidInputError("until_s: expected time_s beside it, got none")
-        bad = np.flatnonzero(self.until_s < self.time_s)
-        if bad.size:
-            until_s, time_s = self.until_s[bad[0]], self.time_s[bad[0]]
+        for bad in np.flatnonzero(self.until_s < self.time_s):
+            came, rest = self.until_s[bad], self.time_s[bad]
             raise InvalidInputError(
-                f"until_s[{bad[0]}]: expected no less than time_s, {time_s:g} s, got {until_s:g} s"
+                f"until_s[{bad}]: expected no less than time_s, {rest:g} s, got {came:g} s"
             )
 
     def __len__(self) -> int:
@@ -93,7 +89,9 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     InvalidInputError
         With file and line, if the text is not as described.
     """
-    sequence = _sequence(turns)
+    sequence = re.split(r"[\s,-]+", turns.strip().lower())
+    if sorted(sequence) != sorted(_AXIS):
+        raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
     text = read_bounded(path, _LARGEST_BYTES).decode("utf-8-sig", errors="replace")
     table = _table(text, str(path))
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
@@ -121,55 +119,43 @@ def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation
         return sensor.world_from_sensor
     if settings.until_s is None:
         return sensor.at(settings.time_s)
-    spans = zip(settings.time_s, settings.until_s, strict=True)
-    return Rotation.concatenate([_mean_between(sensor, start, end) for start, end in spans])
-
-
-def _mean_between(sensor: TimedRotations, start_s: float, end_s: float) -> Rotation:
-    low, high = np.searchsorted(sensor.time_s, [start_s, end_s])
-    if high - low < 2:
-        return sensor.at(0.5 * (start_s + end_s))
-    return sensor.world_from_sensor[low:high].mean()
-
-
-def _sequence(turns: str) -> list[str]:
-    names = re.split(r"[\s,-]+", turns.strip().lower())
-    if sorted(names) != sorted(_AXIS):
-        raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
-    return names
+    bounds = np.searchsorted(sensor.time_s, [settings.time_s, settings.until_s]).T
+    middles = 0.5 * (settings.time_s + settings.until_s)
+    return Rotation.concatenate(
+        [
+            sensor.world_from_sensor[low:high].mean() if high - low > 1 else sensor.at(middle)
+            for (low, high), middle in zip(bounds, middles, strict=True)
+        ]
+    )
 
 
 def _table(text: str, where: str) -> dict[str, FloatArray]:
     """Columns by name."""
-    lines = list(_lines(text))
+    lines = [(at, cells) for at, line in enumerate(text.splitlines(), 1) if (cells := _cells(line))]
     if not lines:
         raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got an empty file")
-    named = any(math.isnan(number(cell)) for cell in lines[0][1])
-    names = _names(lines[0][1], f"{where}:{lines[0][0]}") if named else list(_COLUMNS[: len(lines[0][1])])
-    if not named and len(names) not in (2, 3):
-        raise InvalidInputError(
-            f"{where}:{lines[0][0]}: expected a header or 2 or 3 columns, got {len(names)}"
-        )
-    rows = [_row(cells, names, f"{where}:{at}") for at, cells in lines[named:]]
+    header = _names(lines[0][1], f"{where}:{lines[0][0]}")
+    names, rows = header or list(_COLUMNS[: len(lines[0][1])]), []
+    for at, cells in lines[bool(header) :]:
+        numbers = _numbers(cells)
+        if len(numbers) != len(names) or not np.isfinite(numbers).all():
+            got = ", ".join(cells)[:60]
+            raise InvalidInputError(f"{where}:{at}: expected {len(names)} finite numbers, got {got!r}")
+        rows.append(numbers)
     if not rows:
         raise InvalidInputError(f"{where}: expected settings below the header, got none")
     return dict(zip(names, np.array(rows).T.copy(), strict=True))
 
 
-def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and cells of the lines that are not empty or comments."""
-    for at, line in enumerate(text.splitlines(), 1):
-        content = line.partition("#")[0].strip()
-        if not content:
-            continue
-        separator = next((mark for mark in ";,\t" if mark in content), None)
-        cells = [cell.strip() for cell in content.split(separator)]
-        # Where the decimal sign is a comma, semicolons separate.
-        yield at, [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
-
-
 def _names(cells: list[str], where: str) -> list[str]:
-    names = [_name(cell) for cell in cells]
+    """Names of the columns; none if the first line is not a header."""
+    if _numbers(cells):
+        if len(cells) not in (2, 3):
+            raise InvalidInputError(f"{where}: expected a header or 2 or 3 columns, got {len(cells)}")
+        return []
+    # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
+    words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in cells]
+    names = [f"{word}_s" if word in ("time", "until") else word for word in words]
     if len(set(names)) != len(names) or not {"tilt", "yaw"} <= set(names) <= set(_COLUMNS):
         raise InvalidInputError(
             f"{where}: expected columns tilt and yaw, perhaps roll, time_s and until_s, "
@@ -178,17 +164,17 @@ def _names(cells: list[str], where: str) -> list[str]:
     return names
 
 
-def _name(cell: str) -> str:
-    """``Tilt_deg``, ``tilt/deg`` and ``tilt(deg)`` are all tilt; ``time`` is ``time_s``."""
-    word = re.split(r"[^a-z]", cell.lower().strip('"'))[0]
-    return f"{word}_s" if word in ("time", "until") else word
+def _cells(line: str) -> list[str]:
+    """Cells of a line without its comment; where semicolons separate, the decimal sign may be a comma."""
+    content = line.partition("#")[0].strip()
+    separator = next((mark for mark in ";,\t" if mark in content), None)
+    cells = [cell.strip() for cell in content.split(separator)]
+    return [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
 
 
-def _row(cells: list[str], names: list[str], where: str) -> list[float]:
-    if len(cells) != len(names):
-        raise InvalidInputError(f"{where}: expected {len(names)} columns, got {len(cells)}")
-    values = [number(cell) for cell in cells]
-    for cell, value in zip(cells, values, strict=True):
-        if not math.isfinite(value):
-            raise InvalidInputError(f"{where}: expected a finite number, got {cell[:40]!r}")
-    return values
+def _numbers(cells: list[str]) -> list[float]:
+    """The cells' numbers; none if one is not a number."""
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError:
+        return []

@@ -162,7 +162,7 @@ def bins_of(
         See `heading_arrays`; fields as they were read, not yet over their norm.
     """
     field, duration = steps.field_au, steps.duration_s
-    seen = np.isfinite(field).all(axis=1)
+    seen = np.asarray(np.isfinite(field).all(axis=1))
     field = np.where(seen[:, None], field, 0.0)
     rate = steps.rate_rad_s - bias_rad_s
     columns = np.column_stack(

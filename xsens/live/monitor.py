@@ -6,18 +6,21 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from xsens.fusion.online import OnlineFilter
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
 from xsens.logs.samples import ImuLog
 from xsens.messages.control import MessageId
-from xsens.messages.framing import Framer, encode
+from xsens.messages.framing import Framer, Message, encode
+
+if TYPE_CHECKING:
+    from xsens.fusion.online import OnlineFilter
 
 RATE_OVER_S = 2.0
 """Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
@@ -29,9 +32,9 @@ Information Fusion 91, 2023)."""
 REFERENCE_S = 1.0
 """Time at the start over which the reference field is averaged."""
 
-_WORD = 1 << 16
-_MOST_PENDING = 1 << 20
-_MOST_ARRIVALS = 1 << 12
+_MOST_PENDING = 1 << 14
+"""Messages kept until the state is asked for, as many as eight seconds bring at most."""
+
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 
@@ -50,7 +53,6 @@ class LiveState:
         How often the connection was lost.
     rate_hz : float
         Samples received per second over the last two seconds.
-    bytes_written : int
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
@@ -67,7 +69,6 @@ class LiveState:
     lost: int
     interruptions: int
     rate_hz: float
-    bytes_written: int
     world_from_sensor: Rotation | None
     field: float
     dip_change_rad: float
@@ -104,35 +105,33 @@ class Monitor:
     def __init__(self) -> None:
         self._lock = Lock()
         self._since_s = time.monotonic()
-        self._connected = False
+        self._connected, self._note = False, ""
         self._samples = self._lost = self._interruptions = 0
-        self._note = ""
-        self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_ARRIVALS)
-        self._framer = Framer()
-        self._header, self._hints, self._pending = b"", Hints(), bytearray()
-        self._counter: int | None = None
-        self._attitude = _Attitude()
         self._field = _Field()
+        self._begin(DeviceInfo(0, float("nan"), ()))
+
+    def _begin(self, info: DeviceInfo) -> None:
+        self._header = b"".join(map(encode, info.header))
+        self._hints = Hints(info.rate_hz if info.rate_hz > 0 else None, as_stated=True)
+        self._framer, self._pending = Framer(), list[Message]()
+        self._arrivals = deque[tuple[float, int]](maxlen=1 << 12)
+        self._counter: int | None = None
+        self._attitude = _Attitude(1.0 / info.rate_hz if info.rate_hz > 0 else float("nan"))
 
     def started(self, info: DeviceInfo) -> None:
         """Note that the sensor begins to measure; its counter may start anywhere."""
         with self._lock:
             self._digest()
-            self._header = b"".join(encode(message) for message in info.header)
-            self._hints = Hints(rate_hz=info.rate_hz if info.rate_hz > 0 else None)
-            self._connected, self._counter = True, None
-            self._framer = Framer()
-            self._arrivals.clear()
-            self._attitude = _Attitude(info.rate_hz)
+            self._begin(info)
+            self._connected = True
 
     def arrived(self, received: bytes) -> None:
         """Take in received bytes, in pieces of any size."""
         with self._lock:
-            now_s = time.monotonic()
             data = [message for message in self._framer.feed(received) if message.mid in _DATA]
             self._samples += len(data)
-            self._arrivals.append((now_s, len(data)))
-            self._pending += b"".join(map(encode, data))
+            self._arrivals.append((time.monotonic(), self._samples))
+            self._pending += data
             if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
                 self._digest()
 
@@ -143,8 +142,8 @@ class Monitor:
             self._interruptions += self._connected
             self._connected, self._note = False, reason
 
-    def state(self, bytes_written: int) -> LiveState:
-        """The state now, given the size of the file."""
+    def state(self) -> LiveState:
+        """The state now."""
         with self._lock:
             self._digest()
             return LiveState(
@@ -153,8 +152,7 @@ class Monitor:
                 samples=self._samples,
                 lost=self._lost,
                 interruptions=self._interruptions,
-                rate_hz=self._rate_hz(),
-                bytes_written=bytes_written,
+                rate_hz=self._rate_hz() if self._connected else 0.0,
                 world_from_sensor=self._attitude.latest if self._connected else None,
                 field=self._field.ratio,
                 dip_change_rad=self._field.dip_change_rad,
@@ -163,15 +161,15 @@ class Monitor:
 
     def _rate_hz(self) -> float:
         """Samples after the oldest arrival that is kept, over the time since it."""
-        while len(self._arrivals) > 2 and self._arrivals[-1][0] - self._arrivals[0][0] > RATE_OVER_S:
-            self._arrivals.popleft()
-        if not self._connected or len(self._arrivals) < 2:
-            return 0.0
-        span_s = max(time.monotonic(), self._arrivals[-1][0]) - self._arrivals[0][0]
-        return sum(count for _, count in list(self._arrivals)[1:]) / span_s
+        arrivals = self._arrivals
+        while len(arrivals) > 2 and arrivals[-1][0] - arrivals[0][0] > RATE_OVER_S:
+            arrivals.popleft()
+        first_s, before = arrivals[0] if arrivals else (0.0, 0)
+        span_s = time.monotonic() - first_s
+        return (self._samples - before) / span_s if len(arrivals) > 1 and span_s > 0 else 0.0
 
     def _digest(self) -> None:
-        data, self._pending = bytes(self._pending), bytearray()
+        data, self._pending = b"".join(map(encode, self._pending)), []
         if not data:
             return
         try:
@@ -179,56 +177,49 @@ class Monitor:
         except Speckle3DError as error:
             self._note = str(error)
             return
-        rotations = self._attitude.follow(log, self._count_lost(log))
-        self._field.follow(log, rotations)
+        missing = 0
+        if log.counter is not None:
+            if self._counter is not None:
+                missing = int(log.counter[0] - self._counter - 1) % (1 << 16)
+            self._counter = int(log.counter[-1])
+        self._lost += log.lost + missing
+        self._attitude.follow(log, missing)
+        self._field.follow(log)
 
-    def _count_lost(self, log: ImuLog) -> int:
-        """Count the samples missing within the log and before it; return the latter."""
-        self._lost += log.lost
-        if log.counter is None:
-            return 0
-        before = 0
-        if self._counter is not None:
-            before = int(log.counter[0] - self._counter - 1) % _WORD
-            self._lost += before
-        self._counter = int(log.counter[-1]) % _WORD
-        return before
+
+def _fresh_filter() -> OnlineFilter:
+    from xsens.fusion.online import OnlineFilter  # which loads numba
+
+    return OnlineFilter()
 
 
 class _Attitude:
     """Latest orientation: the sensor's own if it sends one, else the filter's."""
 
-    def __init__(self, rate_hz: float = float("nan")) -> None:
+    def __init__(self, step_s: float) -> None:
         self.latest: Rotation | None = None
-        self._filter = OnlineFilter()
-        self._step_s = 1.0 / rate_hz if rate_hz > 0 else float("nan")
+        self._filter = _fresh_filter()
+        self._step_s = step_s
 
-    def follow(self, log: ImuLog, lost_before: int) -> Rotation | None:
-        """Take in some samples; return the orientation of each if the sensor sent all of them."""
-        if log.world_from_sensor is None or not log.oriented.any():
-            self._filtered(log, lost_before)
-            return None
-        self.latest = log.world_from_sensor[log.oriented][-1]
-        return log.world_from_sensor if log.oriented.all() else None
-
-    def _filtered(self, log: ImuLog, lost_before: int) -> None:
-        if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
-            self.latest = None
+    def follow(self, log: ImuLog, missing: int) -> None:
+        """Take in some samples, with the number of those missing before them."""
+        if log.world_from_sensor is not None and log.oriented.any():
+            self.latest = log.world_from_sensor[log.oriented][-1]
             return
+        self.latest = None
         steps = np.diff(log.time_s)
         if steps.size:
             self._step_s = float(np.median(steps))
-        if not np.isfinite(self._step_s):
+        gyroscope, accelerometer = log.gyroscope_rad_s, log.accelerometer_m_s2
+        if gyroscope is None or accelerometer is None or not np.isfinite(self._step_s):
             return
-        first = self._step_s * (1 + lost_before)
+        steps = np.append(self._step_s * (1 + missing), steps)
         try:
-            self._filter.push(
-                [first, *steps], log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au
-            )
+            self._filter.push(steps, gyroscope, accelerometer, log.magnetometer_au)
         except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts
-            self._filter = OnlineFilter()
-        state = self._filter.state
-        self.latest = None if state is None else state.world_from_sensor
+            self._filter = _fresh_filter()
+        if self._filter.state is not None:
+            self.latest = self._filter.state.world_from_sensor
 
 
 class _Field:
@@ -239,9 +230,11 @@ class _Field:
         self._learnt_s = 0.0
         self._sum = np.zeros(3)
 
-    def follow(self, log: ImuLog, rotations: Rotation | None) -> None:
+    def follow(self, log: ImuLog) -> None:
         """Take in some samples."""
-        up = log.accelerometer_m_s2 if rotations is None else rotations.inv().apply([0.0, 0.0, 1.0])
+        up = log.accelerometer_m_s2
+        if log.world_from_sensor is not None and log.oriented.all():
+            up = log.world_from_sensor.inv().apply([0.0, 0.0, 1.0])
         if log.magnetometer_au is None or up is None:
             return
         norm, length = np.linalg.norm(log.magnetometer_au, axis=1), np.linalg.norm(up, axis=1)

@@ -13,14 +13,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.parts import cannot_write
-from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
+from xsens.live.device import Device, DeviceError, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor
 from xsens.messages.control import MessageId, utc_message
-from xsens.messages.framing import Message, encode
+from xsens.messages.framing import encode
+
+PathLike = str | os.PathLike[str]
 
 SILENCE_S = 2.0
 """A sensor silent for so long is taken for disconnected and asked to answer; its slowest rate is 1 Hz."""
@@ -44,11 +45,10 @@ class RawFile:
         If the file exists and `append` is false, or it cannot be written.
     """
 
-    def __init__(self, path: str | os.PathLike[str], append: bool = False) -> None:
-        self.path, self.written = Path(path), 0
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
+    def __init__(self, path: PathLike, append: bool = False) -> None:
+        self.path = path
         try:
-            self._file = os.open(self.path, flags | (0 if append else os.O_EXCL), 0o644)
+            self._file = open(path, "ab" if append else "xb", buffering=0)  # noqa: SIM115
         except FileExistsError as error:
             raise FileError(f"{path}: there already; expected a new file, or to be told to append") from error
         except OSError as error:
@@ -59,23 +59,19 @@ class RawFile:
         left = memoryview(data)
         try:
             while left:
-                left = left[os.write(self._file, left) :]
+                left = left[self._file.write(left) :]
         except OSError as error:
             raise cannot_write(self.path, error) from error
-        self.written += len(data)
 
     def sync(self) -> None:
         """Write to the disk, so that the bytes survive a power failure, not only one of the program."""
-        if self._file >= 0:
-            with suppress(OSError):  # pipes and some network file systems cannot
-                os.fsync(self._file)
+        with suppress(OSError, ValueError):  # pipes and some network file systems cannot, nor a closed file
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Write everything to the disk and close; closing twice does nothing."""
         self.sync()
-        if self._file >= 0:
-            os.close(self._file)
-        self._file = -1
+        self._file.close()
 
 
 class Recorder:
@@ -90,30 +86,19 @@ class Recorder:
     settings : DeviceSettings
     append : bool
 
-    Attributes
-    ----------
-    info : DeviceInfo
-        Identity and settings that the sensor reports.
-
     Raises
     ------
-    DeviceError
-        If no sensor answers, or refuses its settings.
     FileError
-        If the port cannot be opened or the file cannot be written.
+        If no sensor answers or it refuses its settings (a DeviceError), or the file cannot be written.
     """
 
     def __init__(
-        self,
-        port: str,
-        path: str | os.PathLike[str],
-        settings: DeviceSettings | None = None,
-        append: bool = False,
+        self, port: str, path: PathLike, settings: DeviceSettings | None = None, append: bool = False
     ) -> None:
         self._port, self._settings = port, settings or DeviceSettings()
         device = connect(port, self._settings.baud)
         try:
-            self.info = prepare(device, self._settings)
+            self._info = prepare(device, self._settings)
             self._file = RawFile(path, append)
         except BaseException:
             device.close()
@@ -150,7 +135,7 @@ class Recorder:
         if not (self._thread.is_alive() or self._stop.is_set()):
             raise DeviceError(f"{self._port}: the recording has ended by an error of the program")
         self._file.sync()
-        return self._monitor.state(self._file.written)
+        return self._monitor.state()
 
     def _record(self, device: Device | None) -> None:
         """Run in the thread: measure, and find the sensor again when it is lost, until told to stop."""
@@ -169,14 +154,13 @@ class Recorder:
                 device.close()
 
     def _measure(self, device: Device) -> None:
-        for message in (*self.info.header, utc_message()):
-            self._file.append(encode(message))
-        self._monitor.started(self.info)
+        self._file.append(b"".join(map(encode, (*self._info.header, utc_message()))))
+        self._monitor.started(self._info)
         device.tap = self._take
-        device.request(Message(MessageId.GO_TO_MEASUREMENT))
+        device.request(MessageId.GO_TO_MEASUREMENT)
         self._listen(device)
         with suppress(DeviceError):  # what it sends until it stops is recorded as well
-            device.go_to_config()
+            device.request(MessageId.GO_TO_CONFIG)
 
     def _take(self, data: bytes) -> None:
         self._file.append(data)
@@ -193,35 +177,30 @@ class Recorder:
             if time.monotonic() - heard > SILENCE_S:
                 raise DeviceError(f"{self._port}: the sensor has been silent for {SILENCE_S:g} s")
 
-    def _found_again(self, device: Device) -> Device | None:
+    def _found_again(self, device: Device | None) -> Device | None:
         """The same sensor, ready to measure; None if told to stop before it is found."""
-        found: Device | None = device
         while not self._stop.is_set():
             try:
-                found = found or connect(self._port, self._baud)
-                found.go_to_config(tries=1)
-                self._require_same(prepare(found, self._settings))
+                device = device or connect(self._port, self._baud)
+                device.request(MessageId.GO_TO_CONFIG, tries=1)
+                info, number = prepare(device, self._settings), self._info.device_id
+                if info.device_id == number:
+                    self._info = info
+                    return device
+                problem = f"{self._port}: expected sensor {number:08X}, got {info.device_id:08X}"
             except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
-                self._monitor.interrupted(str(error))
-                if found is not None:
-                    found.close()
-                found = None
-                self._stop.wait(RETRY_S)
-            else:
-                return found
+                problem = str(error)
+            self._monitor.interrupted(problem)
+            if device is not None:
+                device.close()
+            device = None
+            self._stop.wait(RETRY_S)
         return None
-
-    def _require_same(self, info: DeviceInfo) -> None:
-        if info.device_id != self.info.device_id:
-            raise DeviceError(
-                f"{self._port}: expected sensor {self.info.device_id:08X}, got {info.device_id:08X}"
-            )
-        self.info = info
 
 
 def record(
     port: str,
-    path: str | os.PathLike[str],
+    path: PathLike,
     settings: DeviceSettings | None = None,
     append: bool = False,
     interval_s: float = 0.25,

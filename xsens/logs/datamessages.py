@@ -4,33 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
-from xsens.logs.parts import (
-    Hints,
-    Orientations,
-    Parts,
-    from_quaternions,
-    nwu_from,
-    on_clock,
-    only,
-    orientations_of,
-)
+from xsens.logs.parts import Hints, Parts, of_unit_length, on_clock, only, oriented
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.messages.control import Configuration, MessageId, UnitConfiguration
+from xsens.logs.worlds import Claim
+from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
-from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings, Values
+from xsens.messages.mtdata import DataLayout, OutputMode, Values
 from xsens.messages.mtdata2 import Column, columns, name_of, world_of
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
 
 _Read = TypeVar("_Read")
+
+_STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
+"""Messages after which the sensor's counter may have begun anew."""
+
+
+def _stretches(frames: Frames, which: IntArray) -> Stamps:
+    """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
+    at = np.flatnonzero(np.isin(frames.mid, _STARTS))
+    after = np.searchsorted(which, at)
+    at, after = at[after < which.size], after[after < which.size]
+    starts = np.zeros(which.size, dtype=bool)
+    starts[after] = True
+    utc = frames.mid[at] == MessageId.UTC_TIME
+    computer_s = np.full(which.size, np.nan) if utc.any() else None
+    if computer_s is not None:
+        for i, message in dict(zip(after[utc].tolist(), at[utc].tolist(), strict=True)).items():
+            computer_s[i] = utc_time_s(frames.message(message))
+    return Stamps(starts=starts, computer_s=computer_s)
+
 
 # -- legacy MTData
 
@@ -43,32 +55,7 @@ _ENOUGH = 10_000
 """Messages that show where the counter is."""
 
 
-@dataclass(frozen=True)
-class _Slice:
-    """One unit's part of every payload: its layout, the payload's size, and its bytes (None: all)."""
-
-    layout: DataLayout
-    size: int
-    columns: IntArray | None = None
-
-    def of(self, frames: Frames) -> Iterator[tuple[slice, Values]]:
-        """Values of some thousand messages at a time, with their places among all."""
-        for first in range(0, len(frames), _SOME):
-            some = slice(first, first + _SOME)
-            payloads = frames[some].payloads()
-            yield some, self.layout.decode(payloads if self.columns is None else payloads[:, self.columns])
-
-    def all_of(self, frames: Frames, names: tuple[str, ...]) -> Values:
-        """Values of those fields that are there, of all messages."""
-        counts = {field.name: field.count for field in self.layout.fields if field.name in names}
-        values = {name: np.empty((len(frames), count)) for name, count in counts.items()}
-        for some, decoded in self.of(frames):
-            for name, column in values.items():
-                column[some] = decoded[name]
-        return values
-
-
-def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hints: Hints) -> ImuLog:
+def legacy_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> ImuLog:
     """Read the samples of the MTData messages at indices `which`.
 
     Raises
@@ -82,37 +69,43 @@ def legacy_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hi
     blocks = np.flatnonzero(frames.mid == MessageId.EMTS)
     blocks = blocks[frames[blocks].payload_size == BLOCK_SIZE]
     calibration = hints.calibration or _last(frames, blocks, RawCalibration.from_message)
-    data = frames[which]
-    part = _slice(data, configuration, hints)
-    fits = data.payload_size == part.size
+    layout = _layout(frames[which], configuration)
+    fits = frames[which].payload_size == layout.size
     if not fits.any():
-        raise InvalidInputError(f"expected data messages of {part.size} bytes, as configured, got none")
+        raise InvalidInputError(f"expected data messages of {layout.size} bytes, as configured, got none")
     if not fits.all():
         parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
-    data = only(data, fits)
-    raw = part.layout.mode & _RAW
+    which = only(which, fits)
+    data = frames[which]
+    if not layout.mode & _RAW:
+        read = partial(_as_sent, layout, data, parts, hints)
+    elif calibration is not None:
+        read = partial(_in_units, layout, data, calibration, parts)
+    else:
+        raise InvalidInputError("expected a calibration block before raw counts, got none")
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
-    if raw:
-        if calibration is None:
-            raise InvalidInputError("expected a calibration block before raw counts, got none")
-        read = partial(_in_units, part, data, calibration, parts)
-    else:
-        nwu_from(hints.world or part.layout.frame)
-        read = partial(_as_sent, part, data, parts, hints)
-    starts, computer_s = only(stamps.starts, fits), only(stamps.computer_s, fits)
-    # Made in the call, so that nothing holds the counter once the times are known.
-    return on_clock(
-        replace(stamps, counter=_counter(part, data), starts=starts, computer_s=computer_s),
-        len(data),
-        read,
-        replace(hints, rate_hz=rate_hz),
-    )
+    counts = _all_of(layout, data, ("counter",))
+    counter = counts["counter"][:, 0].astype(np.int64) if counts else None
+    stamps = replace(_stretches(frames, which), counter=counter)
+    return on_clock(stamps, len(data), read, replace(hints, rate_hz=rate_hz))
 
 
-def _counter(part: _Slice, data: Frames) -> IntArray | None:
-    counts = part.all_of(data, ("counter",))
-    return counts["counter"][:, 0].astype(np.int64) if counts else None
+def _decoded(layout: DataLayout, frames: Frames) -> Iterator[tuple[slice, Values]]:
+    """Values of some thousand messages at a time, with their places among all."""
+    for first in range(0, len(frames), _SOME):
+        some = slice(first, first + _SOME)
+        yield some, layout.decode(frames[some].payloads())
+
+
+def _all_of(layout: DataLayout, frames: Frames, names: tuple[str, ...]) -> Values:
+    """Values of those fields that are there, of all messages."""
+    counts = {field.name: field.count for field in layout.fields if field.name in names}
+    values = {name: np.empty((len(frames), count)) for name, count in counts.items()}
+    for some, decoded in _decoded(layout, frames) if counts else ():
+        for name, column in values.items():
+            column[some] = decoded[name]
+    return values
 
 
 def _last(frames: Frames, which: IntArray, read: Callable[[Message], _Read]) -> _Read | None:
@@ -123,45 +116,20 @@ def _last(frames: Frames, which: IntArray, read: Callable[[Message], _Read]) -> 
     return None
 
 
-def _slice(data: Frames, configuration: Configuration | None, hints: Hints) -> _Slice:
-    if hints.layout is not None:
-        return _Slice(hints.layout, hints.layout.size)
+def _layout(data: Frames, configuration: Configuration | None) -> DataLayout:
+    """Layout as configured, or of raw counts; their counter is first or last, whichever rises by one."""
     units = configuration.units if configuration is not None else ()
     if len(units) > 1:
-        return _of_unit(units, hints.unit)
+        raise InvalidInputError(f"expected the log of one unit, got that of a master of {len(units)}")
     if units and not units[0].output_mode & _RAW:
-        layout = DataLayout(units[0].output_mode, units[0].output_settings)
-        return _Slice(layout, layout.size)
-    return _raw(data)
-
-
-def _of_unit(units: tuple[UnitConfiguration, ...], unit: int | None) -> _Slice:
-    """Part of one unit behind a master, which sends its counter, then each unit's data."""
-    if unit is None or not 0 <= unit < len(units):
-        names = ", ".join(f"{u.device_id:08X}" for u in units)
-        raise InvalidInputError(f"expected a choice among {len(units)} units (unit 0 is first: {names})")
-    chosen, sizes = units[unit], [u.data_length for u in units]
-    settings = chosen.output_settings | OutputSettings.COUNTER
-    layout = DataLayout(chosen.output_mode, settings, counter_first=True)
-    first = 2 + sum(sizes[:unit])
-    if layout.size != 2 + sizes[unit]:
-        raise InvalidInputError(
-            f"unit {unit}: expected {layout.size - 2} bytes by its output mode, got {sizes[unit]} configured"
-        )
-    columns = np.concatenate(([0, 1], np.arange(first, first + sizes[unit])))
-    return _Slice(layout, 2 + sum(sizes), columns)
-
-
-def _raw(data: Frames) -> _Slice:
-    """Part of raw counts; the counter is first or last, whichever number rises by one."""
+        return DataLayout(units[0].output_mode, units[0].output_settings)
     start = data.payload_start[data.payload_size == _RAW_WITH_COUNTER]
     if 2 * start.size <= len(data):
         raise InvalidInputError(
             "expected a configuration before data messages that are not raw counts with a counter, got none"
         )
     first, last = (_share_counting(data, start[:_ENOUGH] + at) for at in (0, _RAW_WITH_COUNTER - 2))
-    layout = DataLayout(OutputMode.MT9) if first >= last else DataLayout(OutputMode.RAW)
-    return _Slice(layout, layout.size)
+    return DataLayout(OutputMode.MT9 if first >= last else OutputMode.RAW)
 
 
 def _share_counting(frames: Frames, at: IntArray) -> float:
@@ -170,25 +138,19 @@ def _share_counting(frames: Frames, at: IntArray) -> float:
     return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
 
 
-def _in_units(part: _Slice, data: Frames, calibration: RawCalibration, parts: Parts) -> Parts:
+def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration, parts: Parts) -> Parts:
     names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
     vectors = np.empty((3, len(data), 3))
-    for some, values in part.of(data):
+    for some, values in _decoded(layout, data):
         vectors[:, some] = calibration.to_units(np.stack([values[name] for name in names], axis=1))
     return replace(parts.noting(NOT_COMPENSATED), vectors=tuple(vectors))
 
 
-def _as_sent(part: _Slice, data: Frames, parts: Parts, hints: Hints) -> Parts:
-    values = part.all_of(data, (*VECTORS, "quaternion_wxyz", "matrix", "euler_deg"))
-    vectors = tuple(map(values.get, VECTORS))
-    orientations, notes = orientations_of(
-        hints.world or part.layout.frame,
-        vectors[0],
-        values.get("quaternion_wxyz"),
-        values.get("matrix"),
-        values.get("euler_deg"),
-    )
-    return replace(parts.noting(*notes), vectors=vectors, orientations=orientations)
+def _as_sent(layout: DataLayout, data: Frames, parts: Parts, hints: Hints) -> Parts:
+    notations = ("quaternion_wxyz", "matrix", "euler_deg")
+    values = _all_of(layout, data, (*VECTORS, *notations))
+    parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
+    return oriented(parts, Claim(layout.frame, "as configured"), hints, *map(values.get, notations))
 
 
 # -- MTData2
@@ -198,16 +160,15 @@ _NOTATIONS = {
     "rotation_matrix_by_column": "matrices",
     "euler_deg": "angles_deg",
 }
-"""Parameter of `orientations_of` by the name of the item."""
+"""Parameter of `oriented` by the name of the item."""
 
 _STAMPS = ("packet_counter", "sample_time_fine")
-_TICK_S = 1e-4
 
-Table = dict[int, Column]
+_Table = dict[int, Column]
 """Numbers by the identifier of the item."""
 
 
-def mtdata2_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, hints: Hints) -> ImuLog:
+def mtdata2_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> ImuLog:
     """Read the samples of the MTData2 messages at indices `which`.
 
     Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.
@@ -220,36 +181,34 @@ def mtdata2_log(frames: Frames, which: IntArray, stamps: Stamps, parts: Parts, h
     table, damaged = columns(frames[which])
     if damaged:
         parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
-    rows = _sample_rows(table, which.size)
+    told = [_filled(table, name, which.size) for name in _STAMPS]
+    rows = np.zeros(which.size, dtype=bool)
+    for identifier, column in table.items():
+        rows[column.rows] |= name_of(identifier) not in _STAMPS
+    for values in told:
+        rows &= True if values is None else np.isfinite(values[:, 0])
     if not rows.any():
         raise InvalidInputError(
             f"expected measurements with a time in {which.size} MTData2 messages, got none"
         )
     if not rows.all():
         parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
-    measured = _measured(table, rows, parts, hints)
-    stamps = _stamped(table, rows, stamps)
-    return _per_second(on_clock(stamps, int(rows.sum()), lambda: measured, hints), table)
+    counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
+    others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
+    stamps = replace(_stretches(frames, only(which, rows)), counter=counter, ticks=ticks, others=others)
+    log = on_clock(stamps, int(rows.sum()), partial(_measured, table, rows, parts, hints), hints)
+    if log.accelerometer_m_s2 is not None and not _named(table, "acceleration_m_s2"):
+        log = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 * log.rate_hz)
+    if log.gyroscope_rad_s is not None and not _named(table, "rate_of_turn_rad_s"):
+        log = replace(log, gyroscope_rad_s=log.gyroscope_rad_s * log.rate_hz)
+    return log
 
 
-def _sample_rows(table: Table, size: int) -> BoolArray:
-    """Mark messages that hold a measurement and every kind of time stamp that any message holds."""
-    rows = np.zeros(size, dtype=bool)
-    for identifier, column in table.items():
-        if name_of(identifier) not in _STAMPS:
-            rows[column.rows] = True
-    for stamp in _STAMPS:
-        told = _filled(table, stamp, size)
-        if told is not None:
-            rows &= np.isfinite(told[:, 0])
-    return rows
-
-
-def _named(table: Table, name: str) -> Table:
+def _named(table: _Table, name: str) -> _Table:
     return {identifier: column for identifier, column in table.items() if name_of(identifier) == name}
 
 
-def _filled(table: Table, name: str, size: int) -> FloatArray | None:
+def _filled(table: _Table, name: str, size: int) -> FloatArray | None:
     """The item called `name` for every message, shape (size, count), NaN where it is missing."""
     found = list(_named(table, name).values())
     if not found:
@@ -262,59 +221,26 @@ def _filled(table: Table, name: str, size: int) -> FloatArray | None:
     return values
 
 
-def _stamped(table: Table, rows: BoolArray, stamps: Stamps) -> Stamps:
-    told = (_filled(table, name, rows.size) for name in _STAMPS)
-    counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
-    # A new start before a message that is no sample is one before the next sample.
-    at = np.flatnonzero(rows)
-    starts = np.zeros(at.size, dtype=bool)
-    computer_s = None if stamps.computer_s is None else np.full(at.size, np.nan)
-    if stamps.starts is not None:
-        for i in np.flatnonzero(stamps.starts):
-            after = int(np.searchsorted(at, i))
-            if after < at.size:
-                starts[after] = True
-                if computer_s is not None and stamps.computer_s is not None:
-                    computer_s[after] = stamps.computer_s[i]
-    others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
-    return Stamps(counter, ticks, tick_s=_TICK_S, others=others, starts=starts, computer_s=computer_s)
+def _measured(table: _Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
+    """Readings, or increments in their place, and the orientation whose identifier most messages have."""
 
-
-def _measured(table: Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
-    def vectors(name: str) -> Any:
+    def item(name: str) -> Any:
         return only(_filled(table, name, rows.size), rows)
 
-    acceleration, rate = vectors("acceleration_m_s2"), vectors("rate_of_turn_rad_s")
-    orientations, notes = _orientations(table, rows, acceleration, hints)
-    if acceleration is None and (acceleration := vectors("delta_v_m_s")) is not None:
-        notes = (*notes, "acceleration is the sensor's velocity increments over its sampling period")
-    if rate is None and (turns := vectors("delta_q_wxyz")) is not None:
-        turned = from_quaternions(turns, "NWU")
-        rate = np.where(turned.there[:, None], turned.world_from_sensor.as_rotvec(), np.nan)
-        notes = (*notes, "rate of turn is the sensor's orientation increments over its sampling period")
-    measured = (acceleration, rate, vectors("magnetic_field_au"))
-    return replace(parts.noting(*notes), vectors=measured, orientations=orientations)
-
-
-def _per_second(log: ImuLog, table: Table) -> ImuLog:
-    """Divide increments by the clock's period where there are only increments."""
-    if log.accelerometer_m_s2 is not None and not _named(table, "acceleration_m_s2"):
-        log = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 * log.rate_hz)
-    if log.gyroscope_rad_s is not None and not _named(table, "rate_of_turn_rad_s"):
-        log = replace(log, gyroscope_rad_s=log.gyroscope_rad_s * log.rate_hz)
-    return log
-
-
-def _orientations(
-    table: Table, rows: BoolArray, acceleration: FloatArray | None, hints: Hints
-) -> tuple[Orientations | None, tuple[str, ...]]:
-    """Orientations in the first notation that is there, of the identifier (world) that most messages have."""
-    for name in _NOTATIONS:
+    acceleration, rate = item("acceleration_m_s2"), item("rate_of_turn_rad_s")
+    if acceleration is None and (acceleration := item("delta_v_m_s")) is not None:
+        parts = parts.noting("acceleration is the sensor's velocity increments over its sampling period")
+    if rate is None and (turns := item("delta_q_wxyz")) is not None:
+        unit = of_unit_length(turns)[:, None]
+        turned = Rotation.from_quat(np.where(unit, turns, 1.0), scalar_first=True)
+        rate = np.where(unit, turned.as_rotvec(), np.nan)
+        parts = parts.noting("rate of turn is the sensor's orientation increments over its sampling period")
+    parts = replace(parts, vectors=(acceleration, rate, item("magnetic_field_au")))
+    for name, notation in _NOTATIONS.items():
         if found := _named(table, name):
             most = max(found, key=lambda i: found[i].rows.size)
             values = only(_filled({most: found[most]}, name, rows.size), rows)
-            if name == "rotation_matrix_by_column":
-                values = np.swapaxes(values.reshape(-1, 3, 3), 1, 2)
-            world = hints.world or world_of(most)
-            return orientations_of(world, acceleration, **{_NOTATIONS[name]: values})
-    return None, ()
+            if notation == "matrices":
+                values = np.swapaxes(values.reshape(-1, 3, 3), 1, 2).reshape(-1, 9)
+            return oriented(parts, Claim(world_of(most), "as its messages say"), hints, **{notation: values})
+    return parts

@@ -11,22 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.constants import g
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import Stamps, Timeline, timeline
-from xsens.logs.samples import ImuLog
-from xsens.messages.mtdata import DataLayout
+from xsens.logs.clocks import Stamps, Timeline, require_rate, timeline
+from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.worlds import Claim, nwu_from, settle, upright_part
 from xsens.messages.rawcounts import RawCalibration
-
-WORLDS = {
-    "NWU": Rotation.identity(),
-    "ENU": Rotation.from_euler("z", -90.0, degrees=True),
-    "NED": Rotation.from_euler("x", 180.0, degrees=True),
-}
-"""``nwu_from_world`` of each world that the sensors know."""
 
 _ABSURD = 1e6
 """Larger values, in any of the units, are damage: the sensors' ranges end at 160 m/s² and 35 rad/s."""
@@ -37,10 +28,8 @@ any number format (1e-6), far below the effect of damage."""
 
 _WORST_ANGLE_DEG = 720.0
 
-_AT_REST_M_S2 = 0.5
-"""How far from gravity an acceleration may be and still show where up is."""
-
-_CLEARLY_BETTER = 0.5
+_CLEARLY_LESS = 0.25
+"""Ratio of what misses to upright, by which columns must be better than rows: half the angle."""
 
 
 @dataclass(frozen=True)
@@ -51,58 +40,45 @@ class Hints:
     ----------
     rate_hz : float, optional
         Samples per second, for logs with a counter but no clock.
-    layout : DataLayout, optional
-        Of legacy data messages without their configuration.
     calibration : RawCalibration, optional
         Of raw counts without their calibration block, from another log of the same unit.
     world : str, optional
-        Of the sensor's own orientation, ENU, NED or NWU, if the log does not name it.
-    unit : int, optional
-        Which of several units behind a master, from 0.
+        Of the sensor's own orientation, ENU, NED or NWU.
+    as_stated : bool
+        Take the world that the log states or its program's default, whatever its readings show: too few
+        samples of a live stream show nothing.
 
     Raises
     ------
     InvalidInputError
-        If the rate is not positive.
+        If no sensor has such a rate, or there is no such world.
     """
 
     rate_hz: float | None = None
-    layout: DataLayout | None = None
     calibration: RawCalibration | None = None
     world: str | None = None
-    unit: int | None = None
+    as_stated: bool = False
 
     def __post_init__(self) -> None:
-        if self.rate_hz is not None and not 0.0 < self.rate_hz < float("inf"):
-            raise InvalidInputError(f"rate_hz: expected a number above 0, got {self.rate_hz:g}")
-
-
-@dataclass(frozen=True)
-class Orientations:
-    """The sensor's own orientation of every sample; some samples may lack it.
-
-    Attributes
-    ----------
-    world_from_sensor : Rotation, length m
-        The identity where `there` is false.
-    there : ndarray of bool, shape (m,)
-    """
-
-    world_from_sensor: Rotation
-    there: BoolArray
+        if self.rate_hz is not None:
+            require_rate(self.rate_hz, "rate_hz")
+        if self.world is not None:
+            nwu_from(self.world)
 
 
 @dataclass(frozen=True)
 class Parts:
     """Samples before their clock is known: as in `ImuLog`, one row for each message or line.
 
-    `vectors` are the readings of accelerometer, gyroscope and magnetometer.
+    `vectors` are the readings of accelerometer, gyroscope and magnetometer; `orientations` the sensor's own,
+    meaningless where `there` is false.
     """
 
     source: str
     notes: tuple[str, ...] = ()
     vectors: tuple[FloatArray | None, ...] = (None, None, None)
-    orientations: Orientations | None = None
+    orientations: Rotation | None = None
+    there: BoolArray | None = None
 
     def noting(self, *notes: str) -> Parts:
         """The same parts with more notes."""
@@ -133,56 +109,44 @@ def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hi
     """
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
-    if stamps.counter is not None or stamps.ticks is not None:
-        line = timeline(stamps)
+    counted = stamps.counter is not None or stamps.ticks is not None
+    if not counted and stamps.period_s > 0.0:
+        stamps = replace(stamps, counter=np.arange(samples), counter_span=1 << 62)
+    line = timeline(stamps)
+    if counted:
         del stamps
         return assembled(line, parts())
-    if hints.rate_hz is None:
-        raise InvalidInputError("expected samples with a clock or a counter, or a sampling rate, got neither")
-    line = timeline(replace(stamps, counter=np.arange(samples)))
     note = "samples have no counter: losses cannot be found"
     return replace(assembled(line, parts().noting(note)), counter=None)
 
 
 def assembled(line: Timeline, parts: Parts) -> ImuLog:
     """Build the log of the samples that the timeline keeps."""
-    turned = parts.orientations
-    missing = 0 if turned is None else int((~turned.there).sum())
-    lacking = (f"{missing} samples lack the sensor's own orientation",) if missing else ()
-    oriented = turned is not None and bool(turned.there.any())
-    acceleration, rate, field = (_sane(vectors, line.kept) for vectors in parts.vectors)
+    there = None if parts.there is None or not parts.there.any() else parts.there
+    notes = list(parts.notes)
+    sane = []
+    for name, vectors in zip(VECTORS, parts.vectors, strict=True):
+        rows: FloatArray | None = only(vectors, line.kept)
+        if rows is not None and not _within(rows):
+            good = np.asarray((np.abs(rows) < _ABSURD).all(axis=1))
+            if wrong := int((np.abs(rows) >= _ABSURD).any(axis=1).sum()):
+                notes.append(f"{wrong} {name.split('_')[0]} readings out of range were left out")
+            rows = np.where(good[:, None], rows, np.nan) if good.any() else None
+        sane.append(rows)
+    if parts.there is not None and not parts.there.all():
+        notes.append(f"{int((~parts.there).sum())} samples lack the sensor's own orientation")
     return ImuLog(
         line.time_s,
-        acceleration,
-        rate,
-        field,
-        only(turned.world_from_sensor, line.kept) if turned is not None and oriented else None,
+        sane[0],
+        sane[1],
+        sane[2],
+        None if there is None else only(parts.orientations, line.kept),
         line.counter,
         line.gaps,
-        (*parts.notes, *_out_of_range(parts, line.kept), *lacking, *line.notes),
+        (*notes, *line.notes),
         parts.source,
-        turned.there[line.kept] if turned is not None and oriented else np.zeros(0, dtype=bool),
+        np.zeros(0, dtype=bool) if there is None else there[line.kept],
     )
-
-
-def _out_of_range(parts: Parts, kept: BoolArray) -> tuple[str, ...]:
-    """Notes of readings that `_sane` leaves out although they are numbers."""
-    notes = []
-    for name, vectors in zip(("accelerometer", "gyroscope", "magnetometer"), parts.vectors, strict=True):
-        if vectors is None or _within(vectors):
-            continue
-        if count := int((np.abs(vectors[kept]) >= _ABSURD).any(axis=1).sum()):
-            notes.append(f"{count} {name} readings out of range were left out")
-    return tuple(notes)
-
-
-def _sane(vectors: FloatArray | None, kept: BoolArray) -> FloatArray | None:
-    """Kept rows, NaN where they cannot be a measurement; None if none can."""
-    rows: FloatArray | None = only(vectors, kept)
-    if rows is None or _within(rows):
-        return rows
-    good = np.asarray((np.abs(rows) < _ABSURD).all(axis=1))
-    return np.where(good[:, None], rows, np.nan) if good.any() else None
 
 
 def _within(rows: FloatArray) -> bool:
@@ -193,62 +157,58 @@ def _within(rows: FloatArray) -> bool:
 # -- the sensor's own orientation
 
 
-def nwu_from(world: str) -> Rotation:
-    """Rotation from a world by name; raises `InvalidInputError` if there is none of that name."""
-    if world.upper() not in WORLDS:
-        raise InvalidInputError(f"world: expected {', '.join(WORLDS)}, got {world!r}")
-    return WORLDS[world.upper()]
-
-
-def orientations_of(
-    world: str,
-    accelerometer_m_s2: FloatArray | None,
+def oriented(
+    parts: Parts,
+    claim: Claim,
+    hints: Hints,
     quaternions: FloatArray | None = None,
     matrices: FloatArray | None = None,
     angles_deg: FloatArray | None = None,
-) -> tuple[Orientations | None, tuple[str, ...]]:
-    """The sensor's own orientation from the first notation that is there, and notes on it.
+) -> Parts:
+    """Add the sensor's own orientation from the first notation that is there.
 
     Parameters
     ----------
-    world : str
-        ENU, NED or NWU.
-    accelerometer_m_s2 : ndarray, shape (m, 3), or None
-        Tells whether matrices were written by rows or by columns.
+    parts : Parts
+        Their accelerometer and magnetometer show the world, and whether matrices were written by rows.
+    claim : Claim
+        World as stated.
+    hints : Hints
     quaternions : ndarray, shape (m, 4), optional
+        Those that are not of unit length count as missing.
     matrices : ndarray, shape (m, 9), optional
         Row after row.
     angles_deg : ndarray, shape (m, 3), optional
     """
-    if quaternions is not None:
-        return from_quaternions(quaternions, world), ()
-    if matrices is not None:
-        by_rows, turned = _rows_or_columns(matrices.reshape(-1, 3, 3), accelerometer_m_s2)
-        note = "matrices were taken by columns: so they turn gravity upright"
-        return _from_matrices(by_rows, world), ((note,) if turned else ())
-    return (None if angles_deg is None else from_angles(angles_deg, world)), ()
+    wxyz, acceleration, field = quaternions, parts.vectors[0], parts.vectors[2]
+    if wxyz is None and matrices is not None:
+        wxyz = _quaternions(matrices)
+        turned = _quaternions(matrices.reshape(-1, 3, 3).swapaxes(1, 2))
+        as_is, by_columns = (1.0 - abs(upright_part(q, acceleration) or 0.0) for q in (wxyz, turned))
+        if by_columns < _CLEARLY_LESS * as_is:
+            wxyz, parts = turned, parts.noting("matrices were taken by columns: so they turn gravity upright")
+    elif wxyz is None and angles_deg is not None:
+        good = np.asarray((np.abs(angles_deg) <= _WORST_ANGLE_DEG).all(axis=1))
+        wxyz = np.full((good.size, 4), np.nan)
+        if good.any():
+            turns = Rotation.from_euler("xyz", angles_deg[good], degrees=True)
+            wxyz[good] = turns.as_quat(scalar_first=True)
+    if wxyz is None:
+        return parts
+    there = of_unit_length(wxyz)
+    if hints.world is not None:
+        claim = Claim(hints.world, "as given", final=True)
+    world = claim.world.upper()
+    if not hints.as_stated and there.any():
+        world, told = settle(claim, *(only(rows, there) for rows in (wxyz, acceleration, field)))
+        parts = parts.noting(*told)
+    return replace(parts, orientations=_seen_from_north(wxyz, there, world), there=there)
 
 
-def from_quaternions(wxyz: FloatArray, world: str) -> Orientations:
-    """Orientations of quaternions, shape (m, 4); those that are not of unit length count as missing."""
-    there = np.asarray(np.abs(_length(wxyz) - 1.0) < _WORST_NORM)
-    usable = wxyz if there.all() else np.where(there[:, None], wxyz, [1.0, 0.0, 0.0, 0.0])
-    return _seen_from_north(usable, there, world)
-
-
-def from_angles(roll_pitch_yaw_deg: FloatArray, world: str) -> Orientations:
-    """Orientations of angles in degrees, shape (m, 3)."""
-    there = np.asarray((np.abs(roll_pitch_yaw_deg) <= _WORST_ANGLE_DEG).all(axis=1))
-    usable = np.where(there[:, None], roll_pitch_yaw_deg, 0.0)
-    quaternions = Rotation.from_euler("xyz", usable, degrees=True).as_quat(scalar_first=True)
-    return _seen_from_north(quaternions, there, world)
-
-
-def _from_matrices(matrices: FloatArray, world: str) -> Orientations:
-    """Orientations of matrices, shape (m, 3, 3); those that are not rotations count as missing."""
-    there = are_rotations(matrices)
-    usable = np.where(there[:, None, None], matrices, np.eye(3))
-    return _seen_from_north(Rotation.from_matrix(usable).as_quat(scalar_first=True), there, world)
+def of_unit_length(wxyz: FloatArray) -> BoolArray:
+    """Mark quaternions, shape (m, 4), that are no damage."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.abs(np.sqrt(np.einsum("ij,ij->i", wxyz, wxyz)) - 1.0) < _WORST_NORM)
 
 
 def are_rotations(matrices: FloatArray) -> BoolArray:
@@ -258,38 +218,21 @@ def are_rotations(matrices: FloatArray) -> BoolArray:
     return np.asarray((off < _WORST_NORM) & (np.linalg.det(finite) > 0.0))
 
 
-def _rows_or_columns(matrices: FloatArray, accelerometer_m_s2: FloatArray | None) -> tuple[FloatArray, bool]:
-    """Choose the matrices or their transposes: those that turn the acceleration at rest straight up.
-
-    Returns
-    -------
-    ndarray, shape (m, 3, 3)
-    bool
-        Whether they were transposed; never without samples at rest.
-    """
-    if accelerometer_m_s2 is None:
-        return matrices, False
-    rest = np.abs(_length(accelerometer_m_s2) - g) < _AT_REST_M_S2
-    rest &= are_rotations(matrices)
-    as_is, turned = (
-        np.linalg.norm(np.einsum(how, matrices[rest], accelerometer_m_s2[rest]) - [0, 0, g], axis=1)
-        for how in ("mij,mj->mi", "mji,mj->mi")
-    )
-    if rest.any() and np.median(turned) < _CLEARLY_BETTER * np.median(as_is):
-        return np.swapaxes(matrices, 1, 2), True
-    return matrices, False
+def _quaternions(matrices: FloatArray) -> FloatArray:
+    """Quaternions of matrices, row after row; NaN of those that are no rotations."""
+    matrices = matrices.reshape(-1, 3, 3)
+    good = are_rotations(matrices)
+    wxyz = np.full((good.size, 4), np.nan)
+    if good.any():
+        wxyz[good] = Rotation.from_matrix(matrices[good]).as_quat(scalar_first=True)
+    return wxyz
 
 
-def _length(vectors: FloatArray) -> FloatArray:
-    with np.errstate(over="ignore"):
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))
-
-
-def _seen_from_north(wxyz: FloatArray, there: BoolArray, world: str) -> Orientations:
+def _seen_from_north(wxyz: FloatArray, there: BoolArray, world: str) -> Rotation:
     """``nwu_from_world`` times the rotations, as one product of matrices: many times faster than SciPy's."""
     w, x, y, z = nwu_from(world).as_quat(scalar_first=True)
     product = np.array([[x, w, -z, y], [y, z, w, -x], [z, -y, x, w], [w, -x, -y, -z]])
     xyzw = np.einsum("ij,mj->mi", product, wxyz)
     if not there.all():
         xyzw[~there] = [0.0, 0.0, 0.0, 1.0]
-    return Orientations(Rotation.from_quat(xyzw), there)
+    return Rotation.from_quat(xyzw)

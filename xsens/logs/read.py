@@ -5,17 +5,18 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader, TextIOWrapper
 
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
-from xsens.logs.clocks import Stamps
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from xsens.logs.datamessages import legacy_log, mtdata2_log
 from xsens.logs.parts import Hints, Parts
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
-from xsens.messages.control import MessageId, utc_time_s
+from xsens.messages.control import MessageId
 from xsens.messages.framing import Frames, find_frames
 
 PathLike = str | os.PathLike[str]
@@ -49,8 +50,6 @@ _BEGINNINGS = (
 """First bytes of files that are no log of the sensor, so that an error can name what was given instead."""
 
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
-_STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
-"""Messages after which the sensor's counter may have begun anew."""
 
 
 def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
@@ -85,15 +84,20 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     >>> len(log), log.lost
     (4, 2)
     """
-    data = read_bounded(path, MOST_BYTES)
-    if not data:
-        raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
-    if (other := _other_kind(data)) is not None:
-        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
-    if _is_text(data):
-        text = data.decode("utf-16" if data.startswith(_WIDE) else "utf-8-sig", errors="replace")
-        del data
-        return parse_text(text, hints, str(path))
+    with _opened(path, MOST_BYTES) as (file, size):
+        head = file.read(_SNIFFED)
+        file.seek(0)
+        if not size:
+            raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
+        if (other := next((kind for first, kind in _BEGINNINGS if head.startswith(first)), None)) is not None:
+            raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
+        if _is_text(head):
+            encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
+            with TextIOWrapper(file, encoding, errors="replace") as text:
+                return parse_text(text, hints, str(path))
+        data = file.read(size)
+    if not data.strip(b"\0"):
+        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got nothing but zeros")
     return parse_stream(data, hints, str(path))
 
 
@@ -105,6 +109,13 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
     FileError
         If the file cannot be read, is no file, or is larger than `most_bytes`.
     """
+    with _opened(path, most_bytes) as (file, size):
+        return file.read(size)
+
+
+@contextmanager
+def _opened(path: PathLike, most_bytes: int) -> Iterator[tuple[BufferedReader, int]]:
+    """A file and its size, refused as `read_bounded` does."""
     try:
         # A pipe is opened without waiting for its writer.
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
@@ -113,25 +124,19 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
                 raise FileError(f"{path}: expected a file, got something else")
             if found.st_size > most_bytes:
                 raise FileError(f"{path}: expected at most {most_bytes} bytes, got {found.st_size}")
-            return file.read(found.st_size)
-    except FileError:
+            yield file, found.st_size
+    except Speckle3DError:
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FileError(f"{path}: cannot be read: {reason}") from error
 
 
-def _is_text(data: bytes) -> bool:
+def _is_text(first: bytes) -> bool:
     """Whether hardly any byte is a control character and the bytes hold no message of the sensor."""
-    head = np.frombuffer(data[:_SNIFFED], dtype=np.uint8)
+    head = np.frombuffer(first, dtype=np.uint8)
     controls = int((_TEXT_CONTROLS[head]).sum())
-    return (data.startswith(_WIDE) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
-
-
-def _other_kind(data: bytes) -> str | None:
-    """Kind of a file that is clearly no log, in words; None if it may be one."""
-    zeros = "nothing but zeros" if not data.strip(b"\0") else None
-    return next((kind for beginning, kind in _BEGINNINGS if data.startswith(beginning)), zeros)
+    return (first.startswith(_WIDE) or controls <= _DAMAGED * head.size) and not len(find_frames(head))
 
 
 # -- the sensor's own bytes
@@ -159,7 +164,7 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
         which = _of_one_kind(frames)
         parts = Parts(source, tuple(_passed_over(frames, which)))
         read = legacy_log if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_log
-        return read(frames, which, _stretches(frames, which), parts, hints or Hints())
+        return read(frames, which, parts, hints or Hints())
 
 
 def _of_one_kind(frames: Frames) -> IntArray:
@@ -180,23 +185,3 @@ def _passed_over(frames: Frames, which: IntArray) -> Iterator[str]:
         yield f"{size} bytes in {len(runs)} places, first at byte {runs[0][0]}, belong to no message"
     if others := int(np.isin(frames.mid, _DATA).sum()) - which.size:
         yield f"{others} data messages of another kind or unit were left out"
-
-
-def _stretches(frames: Frames, which: IntArray) -> Stamps:
-    """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
-    starts = np.zeros(which.size, dtype=bool)
-    utc = np.flatnonzero(frames.mid == MessageId.UTC_TIME)
-    computer_s = np.full(which.size, np.nan) if utc.size else None
-    starts[_next_data(np.flatnonzero(np.isin(frames.mid, _STARTS)), which)[0]] = True
-    if computer_s is not None:
-        for after, i in zip(*_next_data(utc, which), strict=True):
-            computer_s[after] = utc_time_s(frames.message(int(i)))
-    return Stamps(starts=starts, computer_s=computer_s)
-
-
-def _next_data(messages: IntArray, which: IntArray) -> tuple[IntArray, IntArray]:
-    """Positions in `which` of the first data after each of `messages`, and the last message before those."""
-    after = np.searchsorted(which, messages)
-    after, messages = after[after < which.size], messages[after < which.size]
-    last = np.append(after[1:] != after[:-1], True)[: after.size]
-    return after[last], messages[last]

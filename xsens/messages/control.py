@@ -1,4 +1,4 @@
-"""Message ids, and the content of control messages: errors, device ids, configurations.
+"""Message ids, and the content of control messages: errors, configurations, the time.
 
 Measured data are in `xsens.messages.mtdata` (legacy) and `xsens.messages.mtdata2`; framing is in
 `xsens.messages.framing`.
@@ -18,25 +18,21 @@ from xsens.messages.framing import Message
 BASE_RATE_HZ = 115200
 """Ticks per second of the sampling period."""
 
-NOT_OUTPUT_BUT_ASKED_FOR = 0xFFFF
-"""Skip factor with which the sensor sends data only in answer to `MessageId.REQ_DATA`."""
+_ON_REQUEST = 0xFFFF
+"""Skip factor of a sensor that sends data only when it is asked for them."""
 
 
 class MessageId(IntEnum):
-    """Message ids of requests, replies and data; a reply's is its request's plus one."""
+    """Ids of requests and data, and of those replies that are read; a reply's is its request's plus one."""
 
     REQ_DID = 0x00
-    DEVICE_ID = 0x01
-    INIT_MT_RESULTS = 0x03
     PERIOD = 0x04
     REQ_CONFIGURATION = 0x0C
     CONFIGURATION = 0x0D
     GO_TO_MEASUREMENT = 0x10
     GO_TO_MEASUREMENT_ACK = 0x11
     GO_TO_CONFIG = 0x30
-    GO_TO_CONFIG_ACK = 0x31
     MT_DATA = 0x32
-    REQ_DATA = 0x34
     MT_DATA2 = 0x36
     WAKE_UP = 0x3E
     WAKE_UP_ACK = 0x3F
@@ -44,9 +40,7 @@ class MessageId(IntEnum):
     UTC_TIME = 0x61
     REQ_EMTS = 0x90
     EMTS = 0x91
-    RESET_ORIENTATION = 0xA4
     OUTPUT_CONFIGURATION = 0xC0
-    OUTPUT_CONFIGURATION_ACK = 0xC1
     OUTPUT_MODE = 0xD0
     OUTPUT_SETTINGS = 0xD2
     SKIP_FACTOR = 0xD4
@@ -63,40 +57,28 @@ _ERRORS = {
 }
 
 
+def rate_of(period: int) -> float:
+    """Rate in Hz by a period in ticks; NaN if it is zero."""
+    return BASE_RATE_HZ / period if period else float("nan")
+
+
 def error_of(message: Message) -> str:
     """Text of an error message of the sensor."""
-    code = _payload(message, 1)[0]
+    code = message.payload[0] if message.payload else -1
     return f"error {code}: {_ERRORS.get(code, 'not documented')}"
 
 
-def device_id(message: Message) -> int:
-    """Serial number of the unit, from a message that begins with it (DeviceID, configuration)."""
-    return int.from_bytes(_payload(message, 4, at_least=True)[:4], "big")
+class UnitConfiguration(NamedTuple):
+    """Output mode and settings of a unit: see `xsens.messages.mtdata.DataLayout`."""
 
-
-@dataclass(frozen=True)
-class UnitConfiguration:
-    """Output of one unit.
-
-    Attributes
-    ----------
-    device_id : int
-    data_length : int
-        Bytes of the unit's part of an MTData message.
-    output_mode, output_settings : int
-        See `xsens.messages.mtdata`.
-    """
-
-    device_id: int
-    data_length: int
     output_mode: int
     output_settings: int
 
 
-_HEAD = struct.Struct(">IHH88xH")
-"""Device, period, skip factor; synchronisation, date and time, which are not read; number of units."""
+_HEAD = struct.Struct(">4xHH88xH")
+"""Period, skip factor, number of units; serial number, synchronisation, date and time are not read."""
 
-_UNIT = struct.Struct(">IHHI8x")
+_UNIT = struct.Struct(">6xHI8x")
 
 
 @dataclass(frozen=True)
@@ -105,64 +87,27 @@ class Configuration:
 
     Attributes
     ----------
-    device_id : int
-        Of the unit, or of the master if there are several units.
-    period : int
-        Sampling period, in 1/115200 s.
-    skip_factor : int
-        Samples left out between two that are sent.
+    rate_hz : float
+        Messages per second; NaN if they are sent only on request.
     units : tuple of UnitConfiguration
+        More than one behind a master.
     """
 
-    device_id: int
-    period: int
-    skip_factor: int
+    rate_hz: float
     units: tuple[UnitConfiguration, ...]
-
-    @property
-    def rate_hz(self) -> float:
-        """Messages per second; NaN if they are sent only on request."""
-        if self.period == 0 or self.skip_factor == NOT_OUTPUT_BUT_ASKED_FOR:
-            return float("nan")
-        return BASE_RATE_HZ / (self.period * (self.skip_factor + 1))
 
     @classmethod
     def from_message(cls, message: Message) -> Configuration:
         """Decode; raises `InvalidInputError` if the length does not suit the number of units."""
-        number, period, skip, count = _HEAD.unpack_from(_payload(message, _HEAD.size, at_least=True))
-        payload = _payload(message, _HEAD.size + count * _UNIT.size)
-        units = tuple(UnitConfiguration(*fields) for fields in _UNIT.iter_unpack(payload[_HEAD.size :]))
-        return cls(number, period, skip, units)
-
-
-class OutputItem(NamedTuple):
-    """One line of an MTData2 sensor's output configuration.
-
-    Attributes
-    ----------
-    identifier : int
-        See `xsens.messages.mtdata2`.
-    rate_hz : int
-        65535 for as often as there is a message.
-    """
-
-    identifier: int
-    rate_hz: int
-
-
-def output_configuration(message: Message) -> tuple[OutputItem, ...]:
-    """Items that an MTData2 sensor is configured to send, from its answer or a request."""
-    if len(message.payload) % 4:
-        raise InvalidInputError(
-            f"output configuration: expected whole items of 4 bytes, got {len(message.payload)} bytes"
-        )
-    return tuple(map(OutputItem._make, struct.iter_unpack(">HH", message.payload)))
-
-
-def set_output_configuration(items: tuple[OutputItem, ...]) -> Message:
-    """Request that sets the items an MTData2 sensor sends; without items, one that asks for them."""
-    payload = b"".join(struct.pack(">HH", *item) for item in items)
-    return Message(MessageId.OUTPUT_CONFIGURATION, payload)
+        payload = message.payload
+        period, skip, count = _HEAD.unpack_from(payload.ljust(_HEAD.size, b"\0"))
+        if len(payload) != _HEAD.size + count * _UNIT.size:
+            raise InvalidInputError(
+                f"configuration: expected {_HEAD.size} bytes and {_UNIT.size} for each of {count} units, "
+                f"got {len(payload)}"
+            )
+        units = map(UnitConfiguration._make, _UNIT.iter_unpack(payload[_HEAD.size :]))
+        return cls(rate_of(0 if skip == _ON_REQUEST else period * (skip + 1)), tuple(units))
 
 
 _UTC = struct.Struct(">IH6B")
@@ -186,12 +131,3 @@ def utc_time_s(message: Message) -> float:
         return float(whole.timestamp() + nanosecond * 1e-9)
     except (ValueError, OverflowError):
         return float("nan")
-
-
-def _payload(message: Message, size: int, at_least: bool = False) -> bytes:
-    """Payload of a message; raise unless it is of that size."""
-    found = len(message.payload)
-    if found < size or (found > size and not at_least):
-        least = "at least " if at_least else ""
-        raise InvalidInputError(f"message {message.mid:#04x}: expected {least}{size} bytes, got {found}")
-    return message.payload

@@ -14,14 +14,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from speckle3d.core.arrays import BoolArray, ByteArray, IntArray
+from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 
 PREAMBLE = 0xFA
-MASTER = 0xFF
-"""Bus id of a single sensor, or of the master among several."""
 
 MOST_PAYLOAD = 8192
 """Longest payload that the vendor's own software accepts; no sensor sends more than 2048 bytes. Lengths
@@ -43,19 +40,18 @@ class Message:
     payload : bytes
         At most `MOST_PAYLOAD` bytes.
     bid : int
-        Bus id, 0 to 255.
+        Bus id, 0 to 255; 255 is a single sensor, or the master among several.
     """
 
     mid: int
     payload: bytes = b""
-    bid: int = MASTER
+    bid: int = 0xFF
 
     def __post_init__(self) -> None:
-        if not (0 <= self.mid <= 255 and 0 <= self.bid <= 255):
-            raise InvalidInputError(f"message: expected ids of one byte, got {self.mid} and {self.bid}")
-        if len(self.payload) > MOST_PAYLOAD:
+        if not (0 <= self.mid <= 255 and 0 <= self.bid <= 255 and len(self.payload) <= MOST_PAYLOAD):
             raise InvalidInputError(
-                f"message {self.mid:#04x}: expected at most {MOST_PAYLOAD} bytes, got {len(self.payload)}"
+                f"message: expected ids of one byte and at most {MOST_PAYLOAD} bytes of payload, got ids "
+                f"{self.mid} and {self.bid} and {len(self.payload)} bytes"
             )
 
 
@@ -104,8 +100,9 @@ class Frames:
     def __len__(self) -> int:
         return int(self.start.size)
 
-    def __getitem__(self, which: BoolArray | npt.NDArray[np.integer] | slice) -> Frames:
-        if isinstance(which, np.ndarray) and which.dtype != bool and which.size and _without_a_hole(which):
+    def __getitem__(self, which: Any) -> Frames:
+        listed = isinstance(which, np.ndarray) and which.dtype != bool and which.size > 0
+        if listed and (np.diff(which) == 1).all():
             which = slice(int(which[0]), int(which[-1]) + 1)  # of which NumPy makes no copy
         return Frames(self.data, self.start[which], self.end[which])
 
@@ -133,9 +130,7 @@ class Frames:
     def payloads(self) -> ByteArray:
         """Payloads as rows, shape (n, size); all must be as long as the first."""
         size = int(self.payload_size[0]) if len(self) else 0
-        if not size:
-            return np.zeros((len(self), size), dtype=np.uint8)
-        return np.asarray(np.lib.stride_tricks.sliding_window_view(self.data, size)[self.payload_start])
+        return rows_at(self.data, self.payload_start, size)
 
     def message(self, index: int) -> Message:
         """The message at `index`."""
@@ -154,11 +149,13 @@ class Frames:
         return list(zip(before[there].tolist(), size[there].tolist(), strict=True))
 
 
-def _without_a_hole(indices: npt.NDArray[Any]) -> bool:
-    """Whether indices rise by one: for those that rise at all, their ends show it."""
-    if int(indices[-1]) - int(indices[0]) + 1 != indices.size:
-        return False
-    return bool((indices[1:] > indices[:-1]).all())
+def rows_at(data: ByteArray, start: IntArray, size: int) -> ByteArray:
+    """The `size` bytes from each of `start` on, shape (n, size)."""
+    if not size:
+        return np.zeros((len(start), 0), dtype=np.uint8)
+    # As single values of so many bytes, which NumPy copies in half the time of a row of bytes.
+    windows = np.ndarray(data.size - size + 1, f"V{size}", buffer=data, strides=(1,))
+    return windows[start].view(np.uint8).reshape(-1, size)
 
 
 def find_frames(data: bytes | ByteArray) -> Frames:
@@ -166,27 +163,21 @@ def find_frames(data: bytes | ByteArray) -> Frames:
 
     Time and memory are proportional to the size of `data`, whatever lengths the bytes claim.
     """
-    array = np.frombuffer(data, dtype=np.uint8) if not isinstance(data, np.ndarray) else data
-    starts, ends, at = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], 0
-    while at < array.size:
-        block = array[at : at + _BLOCK]
-        start, end, used = _scan(block, at + _BLOCK >= array.size)
-        starts.append(start + at)
-        ends.append(end + at)
-        at += used
+    array = data if isinstance(data, np.ndarray) else np.frombuffer(data, dtype=np.uint8)
+    array = np.ascontiguousarray(array)
     # Positions take as much memory as short messages: half of it where they fit.
     place = np.int32 if array.size < np.iinfo(np.int32).max else np.int64
-    start, end = (np.concatenate([part.astype(place) for part in parts]) for parts in (starts, ends))
-    return Frames(array, start, end)
+    starts, ends, at = [np.zeros(0, place)], [np.zeros(0, place)], 0
+    while at < array.size:
+        start, end, used = _scan(array[at : at + _BLOCK], at + _BLOCK >= array.size)
+        starts.append((start + at).astype(place))
+        ends.append((end + at).astype(place))
+        at += used
+    return Frames(array, np.concatenate(starts), np.concatenate(ends))
 
 
 class Framer:
     """Find messages in a live stream that arrives in pieces of any size.
-
-    Attributes
-    ----------
-    skipped_bytes : int
-        Bytes so far that belonged to no message.
 
     Examples
     --------
@@ -199,108 +190,59 @@ class Framer:
     """
 
     def __init__(self) -> None:
-        self.skipped_bytes = 0
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Message]:
         """Messages that `data` completes; the bytes of an unfinished one are kept for the next call."""
-        return self._take(self._rest + data, False)
-
-    def close(self) -> list[Message]:
-        """Messages inside an apparent longer one that the end of the stream leaves unfinished."""
-        return self._take(self._rest, True)
-
-    def _take(self, data: bytes, final: bool) -> list[Message]:
+        data = self._rest + data
         array = np.frombuffer(data, dtype=np.uint8)
-        start, end, used = _scan(array, final)
+        start, end, used = _scan(array, False)
         self._rest = data[used:]
-        self.skipped_bytes += used - int((end - start).sum())
         return list(Frames(array, start, end).messages())
 
 
 def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
     """First and end bytes of messages in `data`, and how many bytes need not be scanned again.
 
-    Unless `final`, a message that later bytes may complete is not counted among the latter.
+    Unless `final`, a possible message that later bytes may complete, and all after it, is left for later.
     """
-    start, end, whole = _candidates(data)
-    unfinished = np.zeros(0, dtype=np.int64) if final else start[~whole]
-    start, end = start[whole], end[whole]
-    valid = _checksum_holds(data, start, end)
-    return _chain(start[valid], end[valid], unfinished, data.size)
-
-
-def _candidates(data: ByteArray) -> tuple[IntArray, IntArray, BoolArray]:
-    """First and end bytes of possible messages, and whether `data` holds all of their bytes."""
     start = np.flatnonzero(data == PREAMBLE)
-    last = data.size - 1
-    length = data[np.minimum(start + 3, last)].astype(np.int64)
-    extended = (length == _EXTENDED) & (start + 3 <= last)
-    at = np.minimum(start[extended] + 4, last)
-    length[extended] = 256 * data[at].astype(np.int64) + data[np.minimum(at + 1, last)]
-    end = start + 5 + 2 * extended + length
-    header = start + 4 + 2 * extended <= data.size
-    plausible = ~header | (length <= MOST_PAYLOAD)
-    return start[plausible], end[plausible], (header & (end <= data.size))[plausible]
-
-
-def _checksum_holds(data: ByteArray, start: IntArray, end: IntArray) -> BoolArray:
+    padded = np.append(data, np.zeros(5, dtype=np.uint8))
+    length = padded[start + 3].astype(np.int64)
+    extended = np.flatnonzero(length == _EXTENDED)
+    at = start[extended]
+    length[extended] = 256 * padded[at + 4].astype(np.int64) + padded[at + 5]
+    end = start + 5 + length
+    end[extended] += 2
+    plausible = length <= MOST_PAYLOAD
+    start, end = start[plausible], end[plausible]
+    whole = end <= data.size  # without the whole head it is not, as what is missing is taken for zeros
+    unfinished = start[~whole]
+    start, end = start[whole], end[whole]
     summed = np.cumsum(data, dtype=np.uint8)
-    return np.asarray(summed[end - 1] == summed[start])
+    valid = summed[end - 1] == summed[start]
+    start, end = _without_overlaps(start[valid], end[valid])
+    if final or not unfinished.size:
+        return start, end, data.size
+    before = np.append(0, end)[np.searchsorted(start, unfinished)]
+    waiting = unfinished[before <= unfinished]  # not inside an accepted one
+    used = int(waiting[0]) if waiting.size else data.size
+    settled = start < used
+    return start[settled], end[settled], used
 
 
-def _chain(start: IntArray, end: IntArray, unfinished: IntArray, size: int) -> tuple[IntArray, IntArray, int]:
-    """Choose among messages that may overlap; also where the first still unfinished one begins."""
-    counts = _clear(start, end, unfinished)
-    rest = np.flatnonzero(~counts)
-    if rest.size:
-        next_ = np.minimum(np.searchsorted(start, end[rest]), start.size - 1)
-        followed = start[next_] == end[rest]
-        chosen = _choose(start[rest].tolist(), end[rest].tolist(), followed.tolist(), unfinished.tolist())
-        counts[rest[chosen]] = True
-    start, end = start[counts], end[counts]
-    waiting = unfinished[unfinished >= (end[-1] if end.size else 0)]
-    return start, end, int(waiting[0]) if waiting.size else size
-
-
-def _clear(start: IntArray, end: IntArray, unfinished: IntArray) -> BoolArray:
-    """Mark messages that overlap no other and no unfinished one: nearly all, and they need no choice."""
+def _without_overlaps(start: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
+    """Messages without those that begin inside another, or hold the beginning of one followed by another."""
     if not start.size:
-        return np.zeros(0, dtype=bool)
-    reach = np.maximum.accumulate(end)
-    opens = np.concatenate(([True], start[1:] >= reach[:-1], [True]))
-    clear = opens[:-1] & opens[1:]
-    if unfinished.size:
-        clear &= reach <= unfinished[0]
-    return np.asarray(clear)
-
-
-def _choose(start: list[int], end: list[int], followed: list[bool], unfinished: list[int]) -> list[int]:
-    """Indices of the accepted ones among messages that overlap, one after the other."""
-    chosen: list[int] = []
-    free = wait = i = 0
-    while i < len(start):
-        if start[i] < free:
-            i += 1
-            continue
-        while wait < len(unfinished) and unfinished[wait] < free:
-            wait += 1
-        better = i if followed[i] else _followed_within(i, start, end, followed)
-        if better > i:
-            i = better
-            continue
-        if not followed[i] and wait < len(unfinished) and unfinished[wait] < start[i]:
-            break  # it may lie inside the unfinished one
-        chosen.append(i)
-        free = end[i]
-    return chosen
-
-
-def _followed_within(i: int, start: list[int], end: list[int], followed: list[bool]) -> int:
-    """Index of the first message that begins inside message `i` and is followed by another; else `i`."""
-    j = i + 1
-    while j < len(start) and start[j] < end[i]:
-        if followed[j]:
-            return j
-        j += 1
-    return i
+        return start, end
+    opens = np.concatenate(([True], start[1:] >= np.maximum.accumulate(end)[:-1], [True]))
+    kept = opens[:-1] & opens[1:]  # nearly all overlap no other
+    rest = np.flatnonzero(~kept)
+    followed = start[np.minimum(np.searchsorted(start, end[rest]), start.size - 1)] == end[rest]
+    better = np.where(followed, start[rest], np.iinfo(np.int64).max)
+    better = np.minimum.accumulate(better[::-1])[::-1]  # the next that is followed
+    free = 0
+    for i in rest[followed | (better >= end[rest])].tolist():
+        if start[i] >= free:
+            kept[i], free = True, end[i]
+    return start[kept], end[kept]

@@ -1,54 +1,40 @@
 """Decode the legacy data message MTData, and the number formats it shares with MTData2.
 
 The message does not describe its own layout: output mode and settings do, known from the configuration or
-from whoever set them. A unit on a bus with a master, and the MT9-B, put the counter first instead of last.
+from whoever set them. The MT9-B puts the counter first instead of last.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntFlag
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from speckle3d.core.arrays import ByteArray, FloatArray
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 
 Values = dict[str, FloatArray]
 """Field name to values, shape (n, count); whole numbers are exact."""
 
+REAL = (">f4", ">i4", ">u4,>i2", ">f8")
+"""NumPy types of real numbers by the vendor's two-bit fields; all values are exact as float64.
 
-class NumberFormat(IntEnum):
-    """Formats of real numbers, all big-endian; the values are those of the vendor's two-bit fields.
-
-    FP12.20 is a 32-bit integer over 2**20; FP16.32 a 48-bit integer over 2**32, its 32 bits of fraction
-    before its 16 bits of integer. Every value of each format is exact as float64.
-    """
-
-    FLOAT32 = 0
-    FP12_20 = 1
-    FP16_32 = 2
-    FLOAT64 = 3
-
-    @property
-    def size(self) -> int:
-        """Bytes of one number."""
-        return (4, 4, 6, 8)[self]
+The second is over 2**20; the third a 48-bit integer over 2**32, its fraction before its whole part.
+"""
 
 
-def numbers_from_bytes(rows: ByteArray, form: NumberFormat) -> FloatArray:
-    """Decode rows of bytes, shape (n, k * size), as float64, shape (n, k)."""
-    packed = np.ascontiguousarray(rows)
-    if form in (NumberFormat.FLOAT32, NumberFormat.FLOAT64):
-        with np.errstate(invalid="ignore"):  # signalling NaNs, which damage can make
-            return packed.view(f">f{form.size}").astype(np.float64)
-    if form is NumberFormat.FP12_20:
-        return packed.view(">i4") / 2.0**20
-    parts = packed.reshape(len(rows), -1, 6)
-    fraction = np.ascontiguousarray(parts[..., :4]).view(">u4")[..., 0]
-    whole = np.ascontiguousarray(parts[..., 4:]).view(">i2")[..., 0]
-    return np.asarray(whole + fraction / 2.0**32)
+def as_floats(numbers: npt.NDArray[Any]) -> FloatArray:
+    """Float64 of numbers of one of the types in `REAL`, or of unsigned whole numbers."""
+    if numbers.dtype == REAL[1]:
+        return np.asarray(numbers / 2.0**20)
+    if numbers.dtype == np.dtype(REAL[2]):
+        return np.asarray(numbers["f1"] + numbers["f0"] / 2.0**32)
+    with np.errstate(invalid="ignore"):  # signalling NaNs, which damage can make
+        return numbers.astype(np.float64)
 
 
 class OutputMode(IntFlag):
@@ -76,8 +62,6 @@ class OutputSettings(IntFlag):
     NO_ACCELEROMETER = 0x10
     NO_GYROSCOPE = 0x20
     NO_MAGNETOMETER = 0x40
-    FP12_20 = 0x100
-    FP16_32 = 0x200
     NO_ANALOG_1 = 0x400
     NO_ANALOG_2 = 0x800
     NED = 0x80000000
@@ -85,23 +69,36 @@ class OutputSettings(IntFlag):
 
 @dataclass(frozen=True)
 class Field:
-    """A run of values in a message: `kind` is real, or a NumPy type of big-endian whole numbers."""
+    """A run of values in a message, of a NumPy type; an empty one is real, in the message's format."""
 
     name: str
     count: int
-    kind: str = "real"
+    whole: str = ""
 
 
-_U2, _U1 = ">u2", ">u1"
 _RAW = (
-    Field("raw_accelerometer", 3, _U2),
-    Field("raw_gyroscope", 3, _U2),
-    Field("raw_magnetometer", 3, _U2),
-    Field("raw_temperature", 1, _U2),
+    Field("raw_accelerometer", 3, ">u2"),
+    Field("raw_gyroscope", 3, ">u2"),
+    Field("raw_magnetometer", 3, ">u2"),
+    Field("raw_temperature", 1, ">u2"),
 )
-_COUNTER = Field("counter", 1, _U2)
-_UTC = Field("utc", 12, _U1)
+_COUNTER = Field("counter", 1, ">u2")
 _ORIENTATION = (Field("quaternion_wxyz", 4), Field("euler_deg", 3), Field("matrix", 9))
+_MEASURED = (
+    (OutputMode.TEMPERATURE, 0, Field("temperature_c", 1)),
+    (OutputMode.CALIBRATED, OutputSettings.NO_ACCELEROMETER, Field("accelerometer_m_s2", 3)),
+    (OutputMode.CALIBRATED, OutputSettings.NO_GYROSCOPE, Field("gyroscope_rad_s", 3)),
+    (OutputMode.CALIBRATED, OutputSettings.NO_MAGNETOMETER, Field("magnetometer_au", 3)),
+    (OutputMode.ORIENTATION, 0, None),
+    (OutputMode.AUXILIARY, OutputSettings.NO_ANALOG_1, Field("analog_1", 1, ">u2")),
+    (OutputMode.AUXILIARY, OutputSettings.NO_ANALOG_2, Field("analog_2", 1, ">u2")),
+    (OutputMode.POSITION, 0, Field("position", 3)),
+    (OutputMode.VELOCITY, 0, Field("velocity_m_s", 3)),
+    (OutputMode.STATUS, 0, Field("status", 1, ">u1")),
+)
+"""Part, the setting that leaves the field out, and the field (None: by the settings), in order."""
+
+_KNOWN = sum(OutputMode)
 
 
 @dataclass(frozen=True)
@@ -111,38 +108,28 @@ class DataLayout:
     Attributes
     ----------
     mode, settings : int
-        See `OutputMode` and `OutputSettings`.
-    counter_first : bool
-        True for a unit behind a master; mode `OutputMode.MT9` always begins with the counter.
+        See `OutputMode` and `OutputSettings`; bits 2 and 3 of the settings choose quaternion, Euler angles or
+        matrix, bits 8 and 9 the type of real numbers (`REAL`).
 
     Raises
     ------
     InvalidInputError
-        If the mode has no part, or raw counts together with another part.
+        If mode or settings are not possible, or leave no field.
     """
 
     mode: int
     settings: int = OutputSettings.COUNTER
-    counter_first: bool = False
 
     def __post_init__(self) -> None:
         raw = self.mode & (OutputMode.RAW | OutputMode.MT9)
-        known = sum(OutputMode)
-        if self.mode & known == 0 or self.mode & ~known or (raw and self.mode not in tuple(OutputMode)):
+        if not self.mode or self.mode & ~_KNOWN or (raw and self.mode not in tuple(OutputMode)):
             raise InvalidInputError(
                 f"output mode: expected raw counts alone or any of the others, got {self.mode:#06x}"
             )
-        if (self.settings >> 2) & 3 == 3:
+        if (self.settings >> 2) & 3 == 3 or not self.fields:
             raise InvalidInputError(
-                f"output settings: expected orientation as 0, 1 or 2, got 3 in {self.settings:#x}"
+                f"output settings: expected some output, orientation as 0, 1 or 2, got {self.settings:#x}"
             )
-        if not self.fields:
-            raise InvalidInputError(f"output settings: expected some output, got {self.settings:#x}")
-
-    @property
-    def number_format(self) -> NumberFormat:
-        """Format of real numbers."""
-        return NumberFormat((self.settings >> 8) & 3)
 
     @property
     def frame(self) -> str:
@@ -155,56 +142,30 @@ class DataLayout:
         if self.mode == OutputMode.MT9:
             return (_COUNTER, *_RAW)
         counter = (_COUNTER,) if self.settings & OutputSettings.COUNTER else ()
-        utc = (_UTC,) if self.settings & OutputSettings.UTC else ()
-        body = _RAW if self.mode == OutputMode.RAW else tuple(self._measured())
-        return (*counter, *body, *utc) if self.counter_first else (*body, *counter, *utc)
+        utc = (Field("utc", 12, ">u1"),) if self.settings & OutputSettings.UTC else ()
+        body = _RAW if self.mode == OutputMode.RAW else self._measured()
+        return (*body, *counter, *utc)
 
-    def _measured(self) -> list[Field]:
-        calibrated, analog = OutputMode.CALIBRATED, OutputMode.AUXILIARY
-        parts = (
-            (OutputMode.TEMPERATURE, 0, Field("temperature_c", 1)),
-            (calibrated, OutputSettings.NO_ACCELEROMETER, Field("accelerometer_m_s2", 3)),
-            (calibrated, OutputSettings.NO_GYROSCOPE, Field("gyroscope_rad_s", 3)),
-            (calibrated, OutputSettings.NO_MAGNETOMETER, Field("magnetometer_au", 3)),
-            (OutputMode.ORIENTATION, 0, _ORIENTATION[(self.settings >> 2) & 3]),
-            (analog, OutputSettings.NO_ANALOG_1, Field("analog_1", 1, _U2)),
-            (analog, OutputSettings.NO_ANALOG_2, Field("analog_2", 1, _U2)),
-            (OutputMode.POSITION, 0, Field("position", 3)),
-            (OutputMode.VELOCITY, 0, Field("velocity_m_s", 3)),
-            (OutputMode.STATUS, 0, Field("status", 1, _U1)),
+    def _measured(self) -> tuple[Field, ...]:
+        orientation = _ORIENTATION[(self.settings >> 2) & 3]
+        return tuple(
+            field or orientation
+            for part, off, field in _MEASURED
+            if self.mode & part and not self.settings & off
         )
-        return [field for part, off, field in parts if self.mode & part and not self.settings & off]
-
-    def _width(self, field: Field) -> int:
-        one = self.number_format.size if field.kind == "real" else np.dtype(field.kind).itemsize
-        return one * field.count
 
     @cached_property
+    def dtype(self) -> np.dtype[np.void]:
+        """The payload as a NumPy structure."""
+        real = REAL[(self.settings >> 8) & 3]
+        return np.dtype([(field.name, field.whole or real, (field.count,)) for field in self.fields])
+
+    @property
     def size(self) -> int:
         """Bytes of the payload."""
-        return sum(self._width(field) for field in self.fields)
+        return self.dtype.itemsize
 
-    def decode(self, payloads: bytes | ByteArray) -> Values:
-        """Values of one payload, or of many of them as rows of bytes, shape (n, size).
-
-        Raises
-        ------
-        MismatchError
-            If the payload is not `size` bytes long.
-        """
-        rows = np.atleast_2d(np.frombuffer(payloads, np.uint8) if isinstance(payloads, bytes) else payloads)
-        if rows.shape[1] != self.size:
-            raise MismatchError(
-                f"MTData of mode {self.mode:#06x}: expected {self.size} bytes, got {rows.shape[1]}"
-            )
-        values, at = {}, 0
-        for field in self.fields:
-            width = self._width(field)
-            values[field.name] = self._decoded(field, rows[:, at : at + width])
-            at += width
-        return values
-
-    def _decoded(self, field: Field, rows: ByteArray) -> FloatArray:
-        if field.kind == "real":
-            return numbers_from_bytes(rows, self.number_format)
-        return np.ascontiguousarray(rows).view(field.kind).astype(np.float64)
+    def decode(self, payloads: ByteArray) -> Values:
+        """Values of payloads, rows of bytes of shape (n, size)."""
+        rows = np.ascontiguousarray(payloads).view(self.dtype)[:, 0]
+        return {field.name: as_floats(rows[field.name]) for field in self.fields}

@@ -7,7 +7,6 @@ on temperature: expect an error of about 1 % of gravity.
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.messages.control import BASE_RATE_HZ, MessageId
+from xsens.messages.control import MessageId, rate_of
 from xsens.messages.framing import Message
 
 BLOCK_SIZE = 168
@@ -26,12 +25,11 @@ NOT_COMPENSATED = (
     "nor the housing's alignment applied"
 )
 
-_ID, _PERIOD, _OFFSETS, _GAINS = 0, 81, 87, 105
-_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER, _HOUSING = 8, 26, 132, 150
+_ACCELEROMETER, _GYROSCOPE, _PERIOD, _OFFSETS, _GAINS, _MAGNETOMETER = 8, 26, 81, 87, 105, 132
+"""First bytes in the block."""
+
 _ROWS = 2048
 """Rows converted at a time: they stay in the cache, and are too few for BLAS to wake a team of threads."""
-
-_Q14, _Q8 = 2.0**14, 2.0**8
 
 
 @dataclass(frozen=True)
@@ -40,17 +38,14 @@ class RawCalibration:
 
     Attributes
     ----------
-    device_id : int
-    period : int
-        Sampling period, in 1/115200 s.
+    rate_hz : float
+        Samples per second; NaN if the block does not hold the period.
     offsets : ndarray, shape (3, 3)
         Counts at zero of accelerometer, gyroscope and magnetometer, each x, y, z.
     gains : ndarray, shape (3, 3)
         Counts per m/s², rad/s and unit of field.
     misalignments : ndarray, shape (3, 3, 3)
         ``sensing axes from sensor axes`` of each of the three sensors.
-    housing : ndarray, shape (3, 3)
-        Alignment with the housing, not applied.
 
     Raises
     ------
@@ -58,12 +53,10 @@ class RawCalibration:
         If a gain is zero or a misalignment cannot be inverted.
     """
 
-    device_id: int
-    period: int
+    rate_hz: float
     offsets: FloatArray
     gains: FloatArray
     misalignments: FloatArray
-    housing: FloatArray
 
     def __post_init__(self) -> None:
         if not (self.gains > 0.0).all():
@@ -74,11 +67,6 @@ class RawCalibration:
             raise InvalidInputError(
                 f"calibration block: expected axes nearly square, got determinant {worst:.2g}"
             )
-
-    @property
-    def rate_hz(self) -> float:
-        """Samples per second; NaN if the block does not hold the period."""
-        return BASE_RATE_HZ / self.period if self.period else float("nan")
 
     @classmethod
     def from_message(cls, message: Message) -> RawCalibration:
@@ -95,11 +83,13 @@ class RawCalibration:
                 f"calibration block: expected message {MessageId.EMTS:#04x} of {BLOCK_SIZE} bytes, "
                 f"got {message.mid:#04x} of {len(data)}"
             )
-        number, period = struct.unpack_from(">I", data, _ID)[0], struct.unpack_from(">H", data, _PERIOD)[0]
-        matrices = [_matrix(data, at) for at in (_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER)]
+        sensors = (_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER)
+        matrices = [np.frombuffer(data, ">i2", 9, at).reshape(3, 3) / 2.0**14 for at in sensors]
         offsets = np.frombuffer(data, ">u2", 9, _OFFSETS).reshape(3, 3).astype(float)
-        gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [65536.0, 256.0, 1.0] / _Q8
-        return cls(number, period, offsets, gains, np.stack(matrices), _matrix(data, _HOUSING))
+        gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [256.0, 1.0, 1.0 / 256.0]
+        return cls(
+            rate_of(int.from_bytes(data[_PERIOD : _PERIOD + 2], "big")), offsets, gains, np.stack(matrices)
+        )
 
     def to_units(self, counts: npt.ArrayLike) -> FloatArray:
         """Acceleration in m/s², rate of turn in rad/s and field in arbitrary units.
@@ -121,7 +111,3 @@ class RawCalibration:
             some = slice(at, at + _ROWS)
             np.matmul(rows[some] - self.offsets.ravel(), mixing.reshape(9, 9).T, out=values[some])
         return np.moveaxis(values.reshape(-1, 3, 3), 1, 0)
-
-
-def _matrix(data: bytes, at: int) -> FloatArray:
-    return np.frombuffer(data, ">i2", 9, at).reshape(3, 3) / _Q14

@@ -1,3 +1,4 @@
+import itertools
 import re
 
 import numpy as np
@@ -50,12 +51,12 @@ class TestPairErrors:
         sensor = reference * some(seed + 3, n, 20.0) * calibrations[0].inv()
         found = pair_errors(sensor, reference, calibrations)
         assert found.error_rad.shape == (k, n * (n - 1) // 2, 3)
-        for p, (i, j) in enumerate(zip(found.first, found.second, strict=True)):
+        for p, (i, j) in enumerate(itertools.combinations(range(n), 2)):
             right = (reference[i].inv() * reference[j]).as_rotvec()
             np.testing.assert_allclose(found.reference_rad[p], right[::-1], atol=1e-12)
             for c in range(k):
                 first, second = sensor[i] * calibrations[c], sensor[j] * calibrations[c]
-                relative = Rotation.from_rotvec(found.measured_rad[c, p, ::-1])
+                relative = Rotation.from_rotvec((found.reference_rad + found.error_rad)[c, p, ::-1])
                 assert (relative.inv() * first.inv() * second).magnitude() < 1e-9
 
     @given(seed=st.integers(0, 2**32 - 1))
@@ -109,18 +110,23 @@ class TestPairErrors:
 class TestTable:
     def test_mean_and_deviation_over_all_pairs_and_calibrations(self):
         error = np.deg2rad([[[1.0, 0.0, -2.0], [3.0, 0.0, -2.0]], [[1.0, 2.0, -2.0], [3.0, 2.0, -2.0]]])
-        errors = PairErrors(np.array([0, 0]), np.array([1, 2]), np.zeros((2, 3)), error)
-        (row,) = AccuracyTable.of({"bench": errors}).rows
-        np.testing.assert_allclose(np.rad2deg(row.mean_rad), [2.0, 1.0, -2.0])
-        np.testing.assert_allclose(np.rad2deg(row.sd_rad), [1.0, 1.0, 0.0], atol=1e-12)
-        np.testing.assert_allclose(np.rad2deg(row.rms_rad), [5**0.5, 2**0.5, 2.0])
-        np.testing.assert_allclose(np.rad2deg(row.worst_rad), [3.0, 2.0, 2.0])
-        np.testing.assert_allclose(np.rad2deg(row.calibration_sd_rad), [0.0, 1.0, 0.0], atol=1e-12)
-        assert (row.frames, row.calibrations, row.errors) == (3, 2, 4)
+        errors = PairErrors(2, np.zeros((2, 3)), error)
+        found = AccuracyTable.of({"bench": errors}).statistics["bench"]
+        expected = {
+            "mean": [2.0, 1.0, -2.0],
+            "standard deviation": [1.0, 1.0, 0.0],
+            "RMS": [5**0.5, 2**0.5, 2.0],
+            "largest": [3.0, 2.0, 2.0],
+            "standard deviation with the calibration": [0.0, 1.0, 0.0],
+        }
+        assert found.keys() == expected.keys()
+        for what, degrees in expected.items():
+            np.testing.assert_allclose(np.rad2deg(found[what]), degrees, atol=1e-12)
+        assert (errors.frames, len(errors)) == (2, 4)
 
     def test_reads_like_table_2(self):
         error = np.deg2rad([[[-0.3651, -1.35200, -0.1017], [0.2465, 0.4254, 0.2299]]])
-        errors = PairErrors(np.array([0, 0]), np.array([1, 2]), np.zeros((2, 3)), error)
+        errors = PairErrors(2, np.zeros((2, 3)), error)
         head, *_, row = AccuracyTable.of({"Tilt-yaw rotation": errors}).text().splitlines()
         assert head.split() == ["degrees", "Roll", "Yaw", "Tilt"]
         cells = ["-0.0593 ± 0.3058", "-0.4633 ± 0.8887", "+0.0641 ± 0.1658"]
@@ -222,9 +228,9 @@ class TestMechanism:
             ("tilt,roll\n1,2\n", r"settings.csv:1: .*tilt, roll"),
             ("tilt,yaw,tilt\n1,2,3\n", ":1: .*tilt, yaw, tilt"),
             ("1,2,3,4\n", ":1: .* 4$"),
-            ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: .* 2 .* 3$"),
-            ("tilt,yaw\n1,x\n", ":2: .*'x'"),
-            ("tilt,yaw\n1,inf\n", ":2: .*'inf'"),
+            ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: .* 2 .*'1, 2, 3'"),
+            ("tilt,yaw\n1,x\n", ":2: .*'1, x'"),
+            ("tilt,yaw\n1,inf\n", ":2: .*'1, inf'"),
             ("tilt,yaw,until_s\n1,2,3\n", "until_s: .*time_s"),
             (
                 "tilt,yaw,time_s,until_s\n1,2,3,4\n1,2,5,4\n",
@@ -295,8 +301,12 @@ class TestFigure:
     def test_turns_are_frames_that_differ_in_one_angle_only(self):
         experiments = {"near iron": self.errors(1.3), "clear": self.errors(1.0)}
         tilting = turns_about("tilt", experiments)
-        assert {turn.frame.size for turn in tilting} <= {9, 10, 11}  # at least three quarters of a column
-        full = [turn for turn in tilting if turn.frame.size == 11]
+        assert {turn.reference_rad.size for turn in tilting} <= {
+            9,
+            10,
+            11,
+        }  # at least three quarters of a column
+        full = [turn for turn in tilting if turn.reference_rad.size == 11]
         assert len(full) == 2 * 7  # a column of the grid at each yaw and experiment
         for turn in full:
             np.testing.assert_allclose(np.rad2deg(turn.reference_rad), TILTS_DEG - TILTS_DEG[0], atol=1e-9)

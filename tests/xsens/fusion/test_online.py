@@ -72,8 +72,8 @@ def test_the_orientation_is_that_of_the_last_sample_between_increments_too():
         online.push(1 / RATE_HZ, log.gyroscope_rad_s[k], log.accelerometer_m_s2[k], log.magnetometer_au[k])
         if k > 300:
             errors.append((online.state.world_from_sensor * truth[k].inv()).as_rotvec())
-    # From sample to sample the error moves by gyroscope noise (0.006 degrees) and corrections alone: at 1 rad/s
-    # a field's heading is known to about a degree in a bin, of which a correction takes a fifth.
+    # From sample to sample the error moves by gyroscope noise (0.006 degrees) and corrections alone: a
+    # quarter of a second's field shows the heading to about a degree, of which a correction takes a fifth.
     assert np.rad2deg(np.abs(np.diff(errors, axis=0)).max()) < 0.3
 
 

@@ -28,7 +28,7 @@ from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream, read_log
 from xsens.logs.samples import Gap, ImuLog
 from xsens.logs.textlogs import write_csv
-from xsens.messages.control import Configuration, MessageId, UnitConfiguration, utc_message
+from xsens.messages.control import MessageId, utc_message
 from xsens.messages.framing import Message, encode
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
@@ -134,12 +134,10 @@ def test_matrices_are_turned_if_gravity_says_so(s):
     assert any("taken by columns" in note for note in log.notes)
 
 
-def test_legacy_data_without_configuration_need_a_layout(s):
-    layout = DataLayout(EVERYTHING, COUNTED)
-    data = b"".join(legacy_messages(s, layout))
+def test_legacy_data_need_their_configuration(s):
+    data = b"".join(legacy_messages(s, DataLayout(EVERYTHING, COUNTED)))
     with pytest.raises(InvalidInputError, match="configuration"):
         parse_stream(data)
-    assert_same_samples(parse_stream(data, Hints(layout=layout, rate_hz=100.0)), s)
 
 
 def test_legacy_data_without_a_counter_say_so(s):
@@ -159,20 +157,11 @@ def test_messages_not_as_long_as_configured_are_left_out(s):
     assert any(note.startswith("1 data messages") for note in log.notes)
 
 
-def test_one_of_several_units_behind_a_master(s):
-    alone = DataLayout(OutputMode.CALIBRATED, OutputSettings.NO_MAGNETOMETER)
-    values = legacy_values(s, alone, first=7)
-    far = {name: 2.0 * np.asarray(v) for name, v in values.items()}
-    counter = mtdata_payloads(DataLayout(OutputMode.RAW, COUNTED), raw_values(s, UNIT, 7))[:, -2:]
-    payloads = np.concatenate((counter, mtdata_payloads(alone, values), mtdata_payloads(alone, far)), axis=1)
-    units = tuple(UnitConfiguration(0x100 + i, alone.size, alone.mode, alone.settings) for i in range(2))
-    data = encode(configuration_message(Configuration(0x1, 1152, 0, units))) + b"".join(framed(payloads))
-    with pytest.raises(InvalidInputError, match="00000100, 00000101"):
-        parse_stream(data)
-    for unit, factor in ((0, 1.0), (1, 2.0)):
-        log = parse_stream(data, Hints(unit=unit))
-        np.testing.assert_allclose(log.accelerometer_m_s2, factor * s["accelerometer_m_s2"], atol=2e-6)
-        assert log.counter[0] == 7
+def test_several_units_behind_a_master_are_refused(s):
+    layout = DataLayout(EVERYTHING, COUNTED)
+    data = encode(configuration_message([(layout.mode, layout.settings)] * 2))
+    with pytest.raises(InvalidInputError, match=r"one unit.*master of 2"):
+        parse_stream(data + b"".join(legacy_messages(s, layout)))
 
 
 # Self-describing data messages
@@ -313,7 +302,7 @@ def test_plain_files_come_back_exactly(s, tmp_path):
     assert turned.magnitude().max() < 1e-15
     text = (tmp_path / "log.csv").read_text(encoding="utf-8")
     assert text.startswith("# source: a log\n")
-    assert text.splitlines()[4].startswith("time_s,counter,accelerometer_x_m_s2,")
+    assert text.splitlines()[5].startswith("time_s,counter,accelerometer_x_m_s2,")
 
 
 def test_plain_files_appear_whole_or_not_at_all(s, tmp_path, monkeypatch):

@@ -6,14 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from imu_messages import Item, bytes_from_numbers, items_payload, mtdata_payloads
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Message, decode, encode, find_frames
-from xsens.messages.mtdata import DataLayout, NumberFormat, OutputMode, OutputSettings, numbers_from_bytes
+from xsens.messages.mtdata import REAL, DataLayout, OutputMode, OutputSettings, as_floats
 from xsens.messages.mtdata2 import KINDS, columns, kind_of, world_of
 
 FEW = settings(deadline=None, max_examples=60)
-FORMATS = list(NumberFormat)
 
 
 def rows(data):
@@ -25,20 +24,18 @@ def rows(data):
 
 def test_fixed_point_numbers_of_a_real_packet():
     """Latitude of a recording, in both formats, and a negative one whose fraction comes first."""
-    np.testing.assert_allclose(
-        numbers_from_bytes(rows("039adf03"), NumberFormat.FP12_20), 57.67944622, 0, 1e-8
-    )
-    two = numbers_from_bytes(rows("adf052980039f63fcaf0ffff"), NumberFormat.FP16_32)
+    np.testing.assert_allclose(as_floats(rows("039adf03").view(REAL[1])), 57.67944622, 0, 1e-8)
+    two = as_floats(rows("adf052980039f63fcaf0ffff").view(REAL[2]))
     np.testing.assert_allclose(two, [[57.67944828, -0.03808910]], 0, 5e-9)
 
 
 @FEW
-@given(st.binary(min_size=24, max_size=24), st.sampled_from(FORMATS))
+@given(st.binary(min_size=24, max_size=24), st.integers(0, 3))
 def test_bytes_of_numbers_come_back(data, form):
-    packed = np.frombuffer(data, dtype=np.uint8)[None, : 24 // form.size * form.size]
-    values = numbers_from_bytes(packed, form)
+    packed = np.frombuffer(data, dtype=np.uint8)[None]
+    values = as_floats(packed.view(REAL[form]))
     again = bytes_from_numbers(np.nan_to_num(values, nan=0.5, posinf=0.5, neginf=-0.5), form)
-    whole = np.isfinite(values).repeat(form.size, axis=1)
+    whole = np.isfinite(values).repeat(np.dtype(REAL[form]).itemsize, axis=1)
     assert (again == packed)[whole].all()
 
 
@@ -47,7 +44,7 @@ def test_bytes_of_numbers_come_back(data, form):
 
 def test_a_record_of_a_real_mt9():
     (message,) = decode(bytes.fromhex("faff32168553716c8580ac7e7f4e7f377f26631489d776b0205040"))
-    values = DataLayout(OutputMode.MT9).decode(message.payload)
+    values = DataLayout(OutputMode.MT9).decode(rows(message.payload.hex()))
     assert values["counter"] == 34131
     assert values["raw_accelerometer"].tolist() == [[29036, 34176, 44158]]
     assert values["raw_gyroscope"].tolist() == [[32590, 32567, 32550]]
@@ -57,7 +54,7 @@ def test_a_record_of_a_real_mt9():
 
 def test_a_quaternion_with_its_counter_last():
     (message,) = decode(bytes.fromhex("faff32123f000000bf0000003f0000003f00000001023e"))
-    values = DataLayout(OutputMode.ORIENTATION, OutputSettings.COUNTER).decode(message.payload)
+    values = DataLayout(OutputMode.ORIENTATION, OutputSettings.COUNTER).decode(rows(message.payload.hex()))
     assert values["quaternion_wxyz"].tolist() == [[0.5, -0.5, 0.5, 0.5]]
     assert values["counter"] == 258
 
@@ -90,14 +87,14 @@ settings_ = st.builds(
 
 
 @settings(deadline=None, max_examples=150)
-@given(modes, settings_, st.booleans(), st.integers(0, 2**32 - 1))
-def test_every_mode_and_manner_comes_back(mode, manner, counter_first, seed):
-    layout = DataLayout(mode, manner, counter_first)
+@given(modes, settings_, st.integers(0, 2**32 - 1))
+def test_every_mode_and_manner_comes_back(mode, manner, seed):
+    layout = DataLayout(mode, manner)
     rng = np.random.default_rng(seed)
     values = {}
     for field in layout.fields:
-        real = field.kind == "real"
-        most = 1000 if real else np.iinfo(field.kind).max
+        real = not field.whole
+        most = 1000 if real else np.iinfo(field.whole).max
         drawn = (
             rng.uniform(-most, most, (4, field.count)) if real else rng.integers(0, most, (4, field.count))
         )
@@ -116,7 +113,7 @@ def test_sizes_of_legacy_data():
     assert DataLayout(OutputMode.CALIBRATED, OutputSettings.COUNTER).size == 38
     assert DataLayout(OutputMode.CALIBRATED, OutputSettings.NO_MAGNETOMETER).size == 24
     assert DataLayout(OutputMode.ORIENTATION, OutputSettings.MATRIX).size == 36
-    assert DataLayout(OutputMode.ORIENTATION, OutputSettings.EULER | OutputSettings.FP16_32).size == 18
+    assert DataLayout(OutputMode.ORIENTATION, 0x4 | 0x200).size == 18
     assert DataLayout(OutputMode.RAW, OutputSettings.COUNTER).size == 22
     assert DataLayout(OutputMode.TEMPERATURE | OutputMode.STATUS, OutputSettings.UTC).size == 4 + 1 + 12
 
@@ -129,12 +126,6 @@ def test_modes_that_cannot_be_are_refused():
         DataLayout(OutputMode.ORIENTATION, 0xC)
     with pytest.raises(InvalidInputError, match="0x70"):
         DataLayout(OutputMode.CALIBRATED, 0x70)
-
-
-def test_a_payload_of_another_length_is_refused():
-    layout = DataLayout(OutputMode.ORIENTATION, OutputSettings.COUNTER)
-    with pytest.raises(MismatchError, match=r"18 .*17"):
-        layout.decode(bytes(17))
 
 
 # Self-describing data
@@ -167,9 +158,7 @@ def mixed(count, seed=0):
         for identifier, kind in KINDS.items():
             if rng.random() < 0.3 and not kind.whole:
                 bits = int(rng.integers(4) | rng.integers(3) << 2)
-                items.append(
-                    Item(identifier | bits, tuple(np.round(rng.normal(size=kind.numbers) * 64) / 64))
-                )
+                items.append(Item(identifier | bits, tuple(np.round(rng.normal(size=kind.count) * 64) / 64)))
         for odd in (0x7777, 0x201C, 0x4040, 0x4020, 0x1060):
             if rng.random() < 0.1:
                 items.insert(int(rng.integers(len(items))), Item(odd, bytes(int(rng.integers(13, 200)))))
@@ -177,9 +166,7 @@ def mixed(count, seed=0):
     return sent
 
 
-@pytest.mark.parametrize("most", [1, 32])
-def test_columns_are_what_was_sent(monkeypatch, most):
-    monkeypatch.setattr("xsens.messages.mtdata2._MOST_ARRANGEMENTS", most)
+def test_columns_are_what_was_sent():
     sent = mixed(300)
     data = b"".join(encode(Message(MessageId.MT_DATA2, items_payload(items))) for items in sent)
     table, damaged = columns(find_frames(data))

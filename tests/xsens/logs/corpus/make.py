@@ -10,7 +10,7 @@ sys.path.insert(0, str(HERE.parents[2]))
 from imu_logs import calibration, configured, items_of, legacy_messages, mt9_bin, mtdata2_messages, samples  # noqa: E402
 from imu_messages import Item, configuration_message, items_payload  # noqa: E402
 
-from xsens.messages.control import Configuration, MessageId, UnitConfiguration  # noqa: E402
+from xsens.messages.control import MessageId  # noqa: E402
 from xsens.messages.framing import Message, encode  # noqa: E402
 from xsens.messages.mtdata import DataLayout  # noqa: E402
 
@@ -24,7 +24,6 @@ def inputs():
     calibrated = DataLayout(6, 0x201)
     signalling = struct.pack(">3I", 0x7F800001, 0x7FBFFFFF, 0xFF800001)
     bad_world = Item(0x201C, bytes(16))
-    several = tuple(UnitConfiguration(i, 0xFFFF, 2, 1) for i in range(3))
     yield "mt9_truncated_record", mt9_bin(s, calibration(), first=65533)
     yield "legacy_fixed_point", configured(calibrated) + b"".join(legacy_messages(s, calibrated))
     yield "mtdata2_ned_euler", b"".join(mtdata2_messages(s, form=1, world="NED", orientation="euler"))
@@ -38,7 +37,7 @@ def inputs():
     )
     yield (
         "units_of_impossible_size",
-        encode(configuration_message(Configuration(1, 0, 0xFFFF, several))) + bytes(40),
+        encode(configuration_message([(2, 1)] * 3, 0, 0xFFFF, 0xFFFF)) + bytes(40),
     )
     yield "settings_not_known", configured(calibrated)[:-20] + b"\xff" * 40
     yield "calibration_of_zeros", encode(Message(0x91, bytes(168))) + mt9_bin(s, calibration())[173:]
@@ -56,5 +55,6 @@ def inputs():
     yield "text_of_large_counter", b"counter,sampletimefine,acc_x,acc_y,acc_z\n" + b"9e15,9e15,0,0,9.8\n" * 3
 
 
-for name, data in inputs():
-    (HERE / f"{name}.bin").write_bytes(data)
+if __name__ == "__main__":
+    for name, data in inputs():
+        (HERE / f"{name}.bin").write_bytes(data)
