@@ -20,7 +20,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S
-from xsens.logs.parts import nwu_from
+from xsens.logs.worlds import nwu_from
 
 if TYPE_CHECKING:
     from vqf import VQF
