@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,12 +13,9 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
 from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
-from xsens.fusion.samples import Samples
+from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.logs.samples import ImuLog
-
-if TYPE_CHECKING:
-    from xsens.fusion.stretch import Estimate
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -170,4 +166,4 @@ def _joined(results: list[Estimate]) -> Estimate:
     if len(results) == 1:
         return results[0]
     columns = zip(*(vars(each).values() for each in results), strict=True)
-    return type(results[0])(*map(np.concatenate, columns))
+    return Estimate(*map(np.concatenate, columns))

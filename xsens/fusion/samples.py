@@ -1,10 +1,10 @@
-"""`Samples`: readings of one stretch without a pause, ready for the filter."""
+"""Readings of one stretch without a pause, ready for the filter, and what is found of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -31,3 +31,24 @@ class Samples:
 
     def __getitem__(self, part: slice) -> Samples:
         return Samples(self.step_s[part], self.rate_rad_s[part], self.force_m_s2[part], self.field_au[part])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Orientation of one stretch, a row per sample.
+
+    Attributes
+    ----------
+    xyzw : ndarray, shape (m, 4)
+        World from sensor, scalar last.
+    sd_rad : ndarray, shape (m, 3)
+        About the world's axes.
+    bias_rad_s : ndarray, shape (m, 3)
+    disturbed, resting : ndarray of bool, shape (m,)
+    """
+
+    xyzw: FloatArray
+    sd_rad: FloatArray
+    bias_rad_s: FloatArray
+    disturbed: BoolArray
+    resting: BoolArray

@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from xsens.fusion.heading import HeadingBank, Headings, bins_of, smooth_headings, steps_per_bin
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
-from xsens.fusion.samples import Samples
+from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Orientation of one stretch, a row per sample; quaternions scalar last."""
-
-    xyzw: FloatArray
-    sd_rad: FloatArray
-    bias_rad_s: FloatArray
-    disturbed: BoolArray
-    resting: BoolArray
 
 
 class StretchFilter:

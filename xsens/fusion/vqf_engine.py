@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.fusion.samples import Samples
+from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import BRIDGED_S
 from xsens.logs.worlds import nwu_from
 
