@@ -35,6 +35,7 @@ from speckle3d.kernels.heading_arrays import (
     MOVED,
     OF_LAG,
     OF_PLACE,
+    OF_SKEW,
     OF_STRAY,
     OUTLIER,
     PLACE,
@@ -47,6 +48,8 @@ from speckle3d.kernels.heading_arrays import (
     ROOM,
     ROOM_WALK,
     SEEN,
+    SHARES,
+    SKEW,
     SPAN,
     STATES,
     STEEPEST,
@@ -136,6 +139,7 @@ def _begin(
         _forget(x, p, IRON, 3, model[IRON_PRIOR])
         _forget(x, p, LEVEL_FIELD, 2, shared[ROOM])
         _forget(x, p, OF_LAG, 1, shared[LAG_S])
+        _forget(x, p, OF_SKEW, 9, shared[SKEW])
         x[LEVEL_FIELD], x[DOWN_FIELD] = math.hypot(row[READING], row[READING + 1]), row[READING + 2]
     _forget(x, p, TURN, 1, math.pi)
     _forget(x, p, GYRO_BIAS, 3, math.sqrt(row[BIAS_VARIANCE]))
@@ -207,28 +211,31 @@ def _iron_changes(p: FloatArray, flag: FloatArray, model: FloatArray, shared: Fl
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _expect(x: FloatArray, row: FloatArray, shared: FloatArray, rows: FloatArray, off: FloatArray) -> None:
-    """Fill the derivatives of the field in the world's axes, and how far it is from that expected."""
+    """Fill the derivatives of the field in the level axes, and how far it is from that expected.
+
+    Place and stray are of the level axes, too: their directions are random, so that turned by the heading they
+    are as likely; in the world's axes, a linear filter would take them for knowledge of it.
+    """
     c, s = math.cos(x[TURN]), math.sin(x[TURN])
     for i in range(3):
-        off[i] = row[READING + i] - row[LATE + i] * x[OF_LAG]
-        for j in range(3):
-            off[i] -= row[POSE + 3 * i + j] * x[IRON + j]
         for j in range(STATES):
             rows[i, j] = 0.0
         rows[i, OF_PLACE + i] = rows[i, OF_STRAY + i] = 1.0
-    across, along = c * off[0] - s * off[1], s * off[0] + c * off[1]
-    off[0] = across - x[LEVEL_FIELD] - x[OF_PLACE] - x[OF_STRAY]
-    off[1] = along - x[OF_PLACE + 1] - x[OF_STRAY + 1]
-    off[2] -= x[DOWN_FIELD] + x[OF_PLACE + 2] + x[OF_STRAY + 2]
-    if abs(x[LEVEL_FIELD]) > shared[STEEPEST]:
-        rows[0, TURN], rows[1, TURN] = along, -across
-    for j in range(4):
-        to = IRON + j if j < 3 else OF_LAG
-        at, stride = (POSE + j, 3) if j < 3 else (LATE, 1)
-        east, north = row[at], row[at + stride]
-        rows[0, to], rows[1, to] = c * east - s * north, s * east + c * north
-        rows[2, to] = row[at + 2 * stride]
-    rows[0, LEVEL_FIELD] = rows[2, DOWN_FIELD] = 1.0
+        rows[i, OF_LAG] = row[LATE + i]
+        off[i] = row[READING + i] - row[LATE + i] * x[OF_LAG] - x[OF_PLACE + i] - x[OF_STRAY + i]
+        for j in range(3):
+            rows[i, IRON + j] = row[POSE + 3 * i + j]
+            off[i] -= row[POSE + 3 * i + j] * x[IRON + j]
+        for j in range(9):
+            rows[i, OF_SKEW + j] = row[SHARES + 9 * i + j]
+            off[i] -= row[SHARES + 9 * i + j] * x[OF_SKEW + j]
+    level = x[LEVEL_FIELD]
+    off[0] -= c * level
+    off[1] += s * level
+    off[2] -= x[DOWN_FIELD]
+    rows[0, LEVEL_FIELD], rows[1, LEVEL_FIELD], rows[2, DOWN_FIELD] = c, -s, 1.0
+    if abs(level) > shared[STEEPEST]:
+        rows[0, TURN], rows[1, TURN] = -s * level, -c * level
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

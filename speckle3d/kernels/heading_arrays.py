@@ -2,11 +2,12 @@
 
 # -- a bin: a quarter of a second of steps
 
-SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE = 0, 1, 2, 3, 4, 5, 8, 11, 20
-BIN = 23
+SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE, SHARES = 0, 1, 2, 3, 4, 5, 8, 11, 20, 23
+BIN = 50
 """s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
 change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
-from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three)."""
+from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three), and by the elements of the magnetometer's
+error of scale and axes (three times nine)."""
 
 # -- a model of the field
 
@@ -19,17 +20,17 @@ sensor must have moved before the field is used."""
 # -- what all models share
 
 PLACE, FIRST_PLACE, WHITE, GYRO, GYRO_SCALE, BIAS_S, ROOM, ROOM_WALK, REST_GYRO = 0, 1, 2, 3, 4, 5, 6, 7, 8
-FREEDOM, LAG_S, OUTLIER, HOLD_S, STEEPEST = 9, 10, 11, 12, 13
-SHARED = 14
+FREEDOM, LAG_S, OUTLIER, HOLD_S, STEEPEST, SKEW = 9, 10, 11, 12, 13, 14
+SHARED = 15
 """See `xsens.fusion.heading`."""
 
 # -- state of a model's filter
 
-TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG = 0, 1, 4, 7, 8, 9, 12, 15
-STATES = 16
+TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG, OF_SKEW = 0, 1, 4, 7, 8, 9, 12, 15, 16
+STATES = 25
 """Angle from the level axes to north; what is left of the gyroscope's bias (sensor axes); the field of iron
 (sensor axes); the room's field, horizontal and upward; what the place adds to it, and the stray (world axes);
-the magnetometer's lag, s."""
+the magnetometer's lag, s, and its error of scale and axes (nine)."""
 
 BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
 FLAGS = 5

@@ -86,6 +86,9 @@ BIAS_S = 20.0
 ROOM = 0.05
 """Deviation of the room's field from its first reading, as a fraction."""
 
+SKEW = 0.01
+"""Error of the magnetometer's scales and axes, with iron that the field magnetises: what calibrations leave."""
+
 ROOM_WALK_SQRT_S = 0.0003
 """Its random walk: 1 % in twenty minutes."""
 
@@ -170,6 +173,7 @@ def bins_of(
             np.einsum("kij,kj->ki", level, field),
             level.reshape(-1, 9),
             np.einsum("kij,kj->ki", level, np.cross(rate, field)),
+            np.einsum("kai,kj->kaij", level, field).reshape(-1, 27),
         ]
     )
     firsts = np.arange(0, len(duration), steps_per_bin(settings))
@@ -261,7 +265,7 @@ class HeadingBank:
             self._norm = float(np.linalg.norm(first))
         if self._norm > 0.0:
             rows[:, at.READING : at.READING + 3] /= self._norm
-            rows[:, at.LATE : at.LATE + 3] /= self._norm
+            rows[:, at.LATE :] /= self._norm
         found = np.empty((len(rows), len(self.models), at.FOUND))
         wide = (0, len(self.models), at.STATES, at.STATES)
         into = kept or (np.empty(wide[:3]), np.empty(wide), np.empty(wide))
@@ -318,6 +322,7 @@ def _shared(s: FusionSettings) -> FloatArray:
         (at.OUTLIER, OUTLIER),
         (at.HOLD_S, HOLD_S),
         (at.STEEPEST, STEEPEST),
+        (at.SKEW, SKEW),
     ):
         shared[place] = value
     return shared
