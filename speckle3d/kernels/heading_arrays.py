@@ -2,7 +2,18 @@
 
 # -- a bin: a quarter of a second of steps
 
-SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE, SHARES = 0, 1, 2, 3, 4, 5, 8, 11, 20, 23
+SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE, SHARES = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    8,
+    11,
+    20,
+    23,
+)
 BIN = 50
 """s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
 change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
@@ -26,7 +37,17 @@ SHARED = 15
 
 # -- state of a model's filter
 
-TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG, OF_SKEW = 0, 1, 4, 7, 8, 9, 12, 15, 16
+TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG, OF_SKEW = (
+    0,
+    1,
+    4,
+    7,
+    8,
+    9,
+    12,
+    15,
+    16,
+)
 STATES = 25
 """Angle from the level axes to north; what is left of the gyroscope's bias (sensor axes); the field of iron
 (sensor axes); the room's field, horizontal and upward; what the place adds to it, and the stray (world axes);

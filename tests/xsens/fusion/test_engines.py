@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from broad import east_first, errors_deg, read_trial
+from broad import coverage, east_first, errors_deg, estimate, read_trial, trials_in
 from scipy.spatial.transform import Rotation
 from vqf import VQF, offlineVQF
 
@@ -214,3 +214,19 @@ def test_a_trial_of_broad(realdata, method):
     found = east_first(orient(log, method=method).rotations.world_from_sensor)
     # Without a constant heading, measured: 0.8 and 1.1, off-line and on-line VQF 0.9 and 1.2 degrees.
     assert errors_deg(found, true, moving, steady=True)[0] < 1.5
+
+
+@pytest.mark.realdata
+@pytest.mark.slow
+@pytest.mark.parametrize("method", VQFS)
+def test_what_is_claimed_of_vqf_fits_its_errors(realdata, method):
+    held = []
+    for name in trials_in(realdata / "broad"):
+        log, true, moving = read_trial(realdata / "broad", name)
+        held.append(coverage(estimate(log, method), true, moving & (np.arange(len(log)) % 4 == 0)))
+    means = np.mean(held, axis=0)
+    # 68 % of normal errors are within one sigma; a dozen trials tell it to 8.
+    assert 0.6 <= means[0] <= 0.76
+    assert 0.6 <= means[2] <= 0.76
+    # RMS error over RMS sigma of the worst trial, of heading and inclination.
+    assert np.max(held, axis=0)[[1, 3]].max() <= 2.0
