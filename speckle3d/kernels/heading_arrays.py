@@ -2,23 +2,11 @@
 
 # -- a bin: a quarter of a second of steps
 
-SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE, SHARES = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    8,
-    11,
-    20,
-    23,
-)
-BIN = 50
+SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE = 0, 1, 2, 3, 4, 5, 8, 11, 20
+BIN = 23
 """s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
 change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
-from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three), and by the elements of the magnetometer's
-error of scale and axes (three times nine)."""
+from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three)."""
 
 # -- a model of the field
 
@@ -31,27 +19,17 @@ sensor must have moved before the field is used."""
 # -- what all models share
 
 PLACE, FIRST_PLACE, WHITE, GYRO, GYRO_SCALE, BIAS_S, ROOM, ROOM_WALK, REST_GYRO = 0, 1, 2, 3, 4, 5, 6, 7, 8
-FREEDOM, LAG_S, OUTLIER, HOLD_S, STEEPEST, SKEW = 9, 10, 11, 12, 13, 14
-SHARED = 15
+FREEDOM, LAG_S, OUTLIER, HOLD_S = 9, 10, 11, 12
+SHARED = 13
 """See `xsens.fusion.heading`."""
 
 # -- state of a model's filter
 
-TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG, OF_SKEW = (
-    0,
-    1,
-    4,
-    7,
-    8,
-    9,
-    12,
-    15,
-    16,
-)
-STATES = 25
-"""Angle from the level axes to north; what is left of the gyroscope's bias (sensor axes); the field of iron
-(sensor axes); the room's field, horizontal and upward; what the place adds to it, and the stray (world axes);
-the magnetometer's lag, s, and its error of scale and axes (nine)."""
+OF_ROOM, GYRO_BIAS, IRON, OF_PLACE, OF_STRAY, OF_LAG = 0, 3, 6, 9, 12, 15
+STATES = 16
+"""The room's field (level axes); what is left of the gyroscope's bias (sensor axes); the field of iron (sensor
+axes); what the place adds to the room's, and the stray (level axes); the magnetometer's lag, s. All fields are
+fractions of the first reading's norm."""
 
 BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
 FLAGS = 5
@@ -62,4 +40,5 @@ still being put on, s; how long the sensor has moved in this stretch, s."""
 
 FOUND_TURN, FOUND_VARIANCE, EVIDENCE, TRUST = 0, 1, 2, 3
 FOUND = 4
-"""Angle and its variance; logarithm of the reading's density, NaN where there is none; its weight, 0 to 1."""
+"""Angle from the level axes to north, and its variance; logarithm of the reading's density, NaN where there is
+none; its weight, 0 to 1."""
