@@ -234,7 +234,10 @@ def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArra
 
 
 def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline: bool) -> FloatArray:
-    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3)."""
+    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3).
+
+    On line it is the mean of the past, or what it is now if that is more.
+    """
     stride = max(1, round(_COMPARED_S / step_s))
     one, two = (Rotation.from_quat(each[::stride]) for each in (xyzw, other))
     square = (one * two.inv()).as_rotvec() ** 2
@@ -244,4 +247,5 @@ def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline:
     else:
         keep = math.exp(-1.0 / averaged)
         mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
+        mean = np.maximum(mean, square)  # the mean of the past is late
     return np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(xyzw)]
