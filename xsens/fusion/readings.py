@@ -88,22 +88,22 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if against is not None:
         notes.append(against)
     step_s = np.concatenate([[np.median(steps)], steps])
-    return used, Samples(step_s, _bridging(rate, step_s), force, field), notes
+    return used, Samples(step_s, _bridging(rate, step_s), _bridging(force, step_s), field), notes
 
 
-def _bridging(rate_rad_s: FloatArray, step_s: FloatArray) -> FloatArray:
-    """Mean rate since the sample before, shape (m, 3), where samples between the two were lost.
+def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
+    """Mean reading since the sample before, shape (m, 3), where samples between the two were lost.
 
-    A reading tells the last usual step alone; before that the rate is taken for the mean of the two readings.
+    A reading tells the last usual step alone; before that it is taken for the mean of the two.
     """
     usual = float(np.median(step_s))
     late = np.flatnonzero((step_s > _LOST * usual) & (step_s <= BRIDGED_S))
     if not late.size:
-        return rate_rad_s
+        return readings
     told = (usual / step_s[late])[:, None]
-    rates = rate_rad_s.copy()
-    rates[late] = 0.5 * ((1.0 + told) * rate_rad_s[late] + (1.0 - told) * rate_rad_s[late - 1])
-    return rates
+    means = readings.copy()
+    means[late] = 0.5 * ((1.0 + told) * readings[late] + (1.0 - told) * readings[late - 1])
+    return means
 
 
 def _plain(values: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import BRIDGED_S
-from xsens.logs.worlds import nwu_from
+from xsens.logs.worlds import nwu_from, turned
 
 if TYPE_CHECKING:
     from vqf import VQF
@@ -121,40 +121,33 @@ class VqfEngine:
         magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
         field = [_field_carried(stretch, own.xyzw, offline)] if magnetic else []
         even = _even_clock([stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s)
-        self._uneven += 0 if even.place is None else len(stretch)
-        vectors = [np.ascontiguousarray(values, dtype=float) for values in even.vectors]
         find = self._offline if offline else self._online
-        found = find(vectors, even.step_s, pause_s)
-        wxyz = found["quat9D" if magnetic else "quat6D"]
-        found = {name: found[name] for name in ("bias", "restDetected", "magDistDetected") if name in found}
-        first = Rotation.from_quat(wxyz[0], scalar_first=True)
-        start = Rotation.from_quat(own.xyzw[0]) * first.inv()
-        xyzw = _turned_about_up(wxyz, nwu_from("ENU") if magnetic else start)
-        del wxyz
+        found = find(even.vectors, even.step_s, pause_s)
+        wxyz = found.pop("quat9D" if magnetic else "quat6D")
+        start = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(wxyz[0], scalar_first=True).inv()
+        xyzw = turned(nwu_from("ENU") if magnetic else _about_up(start), wxyz)
+        at: IntArray | slice = slice(None)
         if even.place is not None:
+            self._uneven += len(stretch)
             xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(even.place).as_quat()
-        at = _nearest(even.place, len(stretch))
-        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)), offline)
-        disturbed = found["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
+            at = np.rint(even.place).astype(np.int64)
+        disturbed = np.zeros(len(stretch), dtype=bool)
         if magnetic:
+            disturbed = found["magDistDetected"][at]
             self._fields.append(not disturbed.all())
-        return Estimate(
-            xyzw,
-            np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi),
-            found["bias"][at],
-            disturbed,
-            found["restDetected"][at],
-        )
+        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)), offline)
+        sd = np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi)
+        return Estimate(xyzw, sd, found["bias"][at], disturbed, found["restDetected"][at])
 
     def _offline(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
         """A prior of the bias cannot be given: what is known is taken off the rate and put back after."""
-        params = {}
+        params: dict[str, float] = {}
         if self._bias is not None:
             vectors = [vectors[0] - self._bias.rad_s, *vectors[1:]]
             # VQF never takes the bias for less certain than at the start: leave it room to wander.
             params["biasSigmaInit"] = max(np.rad2deg(self._bias.sd_after(pause_s)), _WANDERS_DEG_S)
         field = vectors[2] if len(vectors) == 3 else None
-        found = dict(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s, params))
+        found = _wanted(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s, params))
         if self._bias is not None:
             found["bias"] += self._bias.rad_s
         self._bias = _Bias(found["bias"][-1].copy(), float(found["biasSigma"][-1]))
@@ -166,17 +159,20 @@ class VqfEngine:
             now.setBiasEstimate(self._bias.rad_s, self._bias.sd_after(pause_s))
         if before is not None:
             now.setMagRef(before.getMagRefNorm(), before.getMagRefDip())
-        found = dict(now.updateBatch(*vectors))
+        found = _wanted(now.updateBatch(*vectors))
         self._last, self._bias = now, _Bias(*now.getBiasEstimate())
         return found
 
 
-def _turned_about_up(wxyz: FloatArray, turn: Rotation) -> FloatArray:
-    """Quaternions, shape (m, 4), scalar last, turned by that part of a rotation that is about up."""
-    half = np.arctan2(*turn.as_quat()[2:])
-    s, c = np.sin(half), np.cos(half)
-    w, x, y, z = wxyz.T
-    return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+def _wanted(found: dict[str, Any]) -> dict[str, Any]:
+    """What VQF found, without what nobody asks for: half of it."""
+    unwanted = ("delta", "quat6D") if "quat9D" in found else ()
+    return {name: values for name, values in found.items() if name not in unwanted}
+
+
+def _about_up(turn: Rotation) -> Rotation:
+    """That part of a rotation that is about up."""
+    return Rotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(*turn.as_quat()[2:])])
 
 
 # -- what VQF wants
@@ -234,15 +230,14 @@ def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArra
     return np.column_stack([np.interp(grid_s, time_s, axis) for axis in values.T])
 
 
-def _nearest(place: FloatArray | None, count: int) -> IntArray | slice:
-    return slice(0, count) if place is None else np.rint(place).astype(np.int64)
-
-
 # -- uncertainty
 
 
 def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline: bool) -> FloatArray:
-    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3)."""
+    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3).
+
+    On line it is the mean of the past, or what it is now if that is more.
+    """
     stride = max(1, round(_COMPARED_S / step_s))
     one, two = (Rotation.from_quat(each[::stride]) for each in (xyzw, other))
     square = (one * two.inv()).as_rotvec() ** 2
@@ -252,4 +247,5 @@ def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline:
     else:
         keep = math.exp(-1.0 / averaged)
         mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
+        mean = np.maximum(mean, square)  # the mean of the past is late
     return np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(xyzw)]

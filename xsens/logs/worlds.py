@@ -61,6 +61,16 @@ def nwu_from(world: str) -> Rotation:
     return WORLDS[world.upper()]
 
 
+def turned(turn: Rotation, wxyz: FloatArray) -> FloatArray:
+    """One rotation times quaternions, shape (m, 4), scalar first; the product is scalar last.
+
+    One product of matrices: many times faster than SciPy's.
+    """
+    w, x, y, z = turn.as_quat(scalar_first=True)
+    product = np.array([[x, w, -z, y], [y, z, w, -x], [z, -y, x, w], [w, -x, -y, -z]])
+    return np.asarray(np.einsum("ij,mj->mi", product, wxyz))
+
+
 def settle(
     claim: Claim, wxyz: FloatArray, acceleration: FloatArray | None, field: FloatArray | None
 ) -> tuple[str, tuple[str, ...]]:
