@@ -80,9 +80,8 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     start_s, end_s = table.get("time_s"), table.get("until_s")
     if start_s is not None and end_s is not None and (less := end_s < start_s).any():
         k = less.argmax()
-        raise InvalidInputError(
-            f"{path}: setting {k + 1}: expected until_s no less than time_s, {start_s[k]:g} s, got {end_s[k]:g} s"
-        )
+        expected = f"expected until_s no less than time_s, {start_s[k]:g} s"
+        raise InvalidInputError(f"{path}: setting {k + 1}: {expected}, got {end_s[k]:g} s")
     return MechanismSettings(rotation, start_s, end_s)
 
 
