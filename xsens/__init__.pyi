@@ -9,6 +9,7 @@ from .accuracy.figures import figure_turns as figure_turns
 from .accuracy.mechanism import MechanismSettings as MechanismSettings
 from .accuracy.mechanism import read_mechanism_csv as read_mechanism_csv
 from .accuracy.mechanism import readings_at as readings_at
+from .fusion.methods import Method as Method
 from .fusion.online import OnlineFilter as OnlineFilter
 from .fusion.online import OnlineState as OnlineState
 from .fusion.orient import Orientation as Orientation

@@ -14,6 +14,7 @@ import typer
 from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
+from xsens.fusion.methods import DEFAULT_METHOD, Method
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -56,18 +57,22 @@ WorldOption = Annotated[
 ]
 
 
-class Method(StrEnum):
-    """Source of an orientation."""
+class Source(StrEnum):
+    """Source of an orientation: the engines of `xsens.orient`, or the sensor itself."""
 
-    smoother = "smoother"
-    filter = "filter"
+    smoother = Method.smoother.value
+    filter = Method.filter.value
+    vqf = Method.vqf.value
+    vqf_online = Method.vqf_online.value
     sensor = "sensor"
 
 
+DEFAULT_SOURCE = Source(DEFAULT_METHOD.value)
 MethodOption = Annotated[
-    Method,
+    Source,
     typer.Option(
-        help="smoother: from all of the log; filter: as it would be live; sensor: the sensor's own."
+        help="smoother: from all of the log; filter: as it would be live; vqf, vqf-online: the same by VQF "
+        "(Laidig and Seel 2023); sensor: the sensor's own."
     ),
 ]
 Magnetometer = Annotated[
@@ -126,7 +131,7 @@ def imu_orient(
     out: Annotated[
         Path | None, typer.Option("-o", "--output", help="CSV of the log with this orientation.")
     ] = None,
-    method: MethodOption = Method.smoother,
+    method: MethodOption = DEFAULT_SOURCE,
     magnetometer: Magnetometer = True,
     time_offset_s: Annotated[
         float | None,
@@ -168,7 +173,7 @@ def imu_orient(
     if as_json:
         emit_json({name: value for name, value, _ in rows})
         return
-    emit_rows([(name, f"{value:.5g}", unit) for name, value, unit in rows], as_json)
+    emit_rows([(name, _shown(value), unit) for name, value, unit in rows], as_json)
 
 
 @imu.command("record")
@@ -219,12 +224,14 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
 
+    held = None
     inside = _inside_probe(path)
+    if inside is None and (held := _ridden_along(path)) is not None:
+        inside = log_of(held, path.name)
     if inside is not None:
+        if world is not None:
+            note("--world is not used: it is for logs, and the world of a recording's stream is known")
         return inside
-    held = _ridden_along(path)
-    if held is not None:
-        return log_of(held, path.name)
     return read_log(path, Hints(rate_hz=rate_hz, world=world))
 
 
@@ -301,15 +308,15 @@ def tell(log: ImuLog) -> None:
 
 
 def orientation_of(
-    log: ImuLog, method: Method, magnetometer: bool
+    log: ImuLog, source: Source, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
     """Find the orientation of a log; the second result is None for the sensor's own orientation."""
-    if method is Method.sensor:
+    if source is Source.sensor:
         return log.rotations(), None
     from xsens.fusion.orient import orient
     from xsens.fusion.settings import FusionSettings
 
-    found = orient(log, FusionSettings(use_magnetometer=magnetometer), smooth=method is Method.smoother)
+    found = orient(log, FusionSettings(use_magnetometer=magnetometer), source.value)
     for text in found.notes:
         note(text)
     return found.rotations, found
@@ -391,12 +398,21 @@ def _cover(sweep_file: Path, sensor: OrientationSensor, replace_stream: bool) ->
     return f": {covered}"
 
 
+def _shown(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.5g}"
+
+
 def _orientation_rows(
     log: ImuLog, rotations: TimedRotations, found: Orientation | None
-) -> list[tuple[str, float, str]]:
+) -> list[tuple[str, float | str, str]]:
     import numpy as np
 
-    rows = [("samples", float(len(rotations)), ""), ("duration", log.duration_s, "s")]
+    method = Source.sensor if found is None else found.method
+    rows: list[tuple[str, float | str, str]] = [
+        ("method", method.value, ""),
+        ("samples", float(len(rotations)), ""),
+        ("duration", log.duration_s, "s"),
+    ]
     if found is not None:
         heading = found.standard_deviation_rad[:, 2]
         inclination = np.linalg.norm(found.standard_deviation_rad[:, :2], axis=1) / np.sqrt(2.0)

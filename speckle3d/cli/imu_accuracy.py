@@ -9,9 +9,9 @@ import typer
 
 from speckle3d.cli.common import Json, emit, emit_rows, note
 from speckle3d.cli.imu import (
+    DEFAULT_SOURCE,
     Log,
     Magnetometer,
-    Method,
     MethodOption,
     RateHz,
     WorldOption,
@@ -19,6 +19,7 @@ from speckle3d.cli.imu import (
     orientation_of,
     read,
     require_finite_offset,
+    tell,
 )
 from speckle3d.core.errors import InvalidInputError, naming
 
@@ -58,7 +59,7 @@ def imu_accuracy(
     time_offset_s: Annotated[
         float, typer.Option(help="A reading of the sensor at t belongs to the tracker's time t + this.")
     ] = 0.0,
-    method: MethodOption = Method.smoother,
+    method: MethodOption = DEFAULT_SOURCE,
     magnetometer: Magnetometer = True,
     figure: Annotated[
         Path | None, typer.Option(help="PNG of single turns, as Figure 5 of the paper.")
@@ -75,6 +76,7 @@ def imu_accuracy(
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
     require_finite_offset(time_offset_s)
     log = read(log_file, rate_hz, world)
+    tell(log)
     mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
     if not mountings:
         note("no --calibration: the sensor's axes are taken for the image's")
@@ -141,4 +143,6 @@ def _tracked(path: Path) -> TimedRotations:
     if is_tum(path):
         poses = read_tum(path)
         return TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
-    return read(path).rotations()
+    log = read(path)
+    tell(log)
+    return log.rotations()

@@ -1,11 +1,10 @@
-"""Smoothing an orientation backward, and its heading: loops over steps, laid out in `orientation_arrays`.
+"""Smoothing an orientation backward: a loop over steps, laid out in `orientation_arrays`.
 
 `xsens.fusion.smoothing` says what is done and why.
 """
 
 import math
 
-import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
@@ -16,9 +15,8 @@ from speckle3d.kernels.orientation_arrays import (
     NOISE,
     PREDICTED,
     PREDICTED_SPEED,
-    RATE,
     RESTED,
-    SMOOTHED,
+    SIZE,
     STEP_BIAS,
     STEP_SPEED,
     TURN,
@@ -32,9 +30,6 @@ from speckle3d.kernels.rotations import (
     turn_into,
     vector_of,
 )
-
-HEADING_STATES = 5
-"""Angle to north, what is left of the bias (sensor axes), and the field's own stray."""
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -121,7 +116,7 @@ def smooth_steps(
         Buffers.
     """
     n = steps.shape[0]
-    wide, gain, predicted = work[:SMOOTHED], work[SMOOTHED : 2 * SMOOTHED], work[2 * SMOOTHED : 3 * SMOOTHED]
+    wide, gain, predicted = work[:SIZE], work[SIZE : 2 * SIZE], work[2 * SIZE : 3 * SIZE]
     off, error, turn, velocity = work[27], work[28], work[29], work[30]
     last = steps[n - 1]
     for i in range(9):
@@ -132,7 +127,7 @@ def smooth_steps(
         step, after = steps[k], steps[k + 1]
         _rauch(
             transition[k + 1],
-            after[NOISE : NOISE + SMOOTHED],
+            after[NOISE : NOISE + SIZE],
             covariance[k],
             covariance[k + 1],
             gain,
@@ -145,9 +140,9 @@ def smooth_steps(
         for i in range(3):
             off[3 + i] = biases[k + 2, i] - step[STEP_BIAS + i]
             off[6 + i] = velocity[i] - off[6 + i]
-        for i in range(SMOOTHED):
+        for i in range(SIZE):
             total = 0.0
-            for j in range(SMOOTHED):
+            for j in range(SIZE):
                 total += gain[j, i] * off[j]
             error[i] = total
         turn_into(error[0], error[1], error[2], turn)
@@ -174,117 +169,3 @@ def smooth_steps(
             turn_into(x * step[DURATION], y * step[DURATION], z * step[DURATION], turn)
             product_into(step[TURN : TURN + 9], turn, turn)
             back_product_into(matrices[k + 1], turn, matrices[k])
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def middles_of(
-    steps: FloatArray, matrices: FloatArray, biases: FloatArray, middles: FloatArray, rates: FloatArray
-) -> None:
-    """Fill the orientation in the middle of each step, (n, 9), and the rate of turn without bias, (n,)."""
-    for k in range(steps.shape[0]):
-        step, turn = steps[k], middles[k]
-        x, y, z = step[RATE] - biases[k, 0], step[RATE + 1] - biases[k, 1], step[RATE + 2] - biases[k, 2]
-        half = 0.5 * step[DURATION]
-        turn_into(half * x, half * y, half * z, turn)
-        product_into(matrices[k], turn, turn)
-        rates[k] = math.sqrt(x * x + y * y + z * z)
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def smooth_heading(
-    steps: FloatArray,
-    matrices: FloatArray,
-    headings: FloatArray,
-    variances: FloatArray,
-    first_angle: float,
-    start_variance: FloatArray,
-    place_s: float,
-    field_sd_rad: float,
-    means: FloatArray,
-    covariances: FloatArray,
-    work: FloatArray,
-) -> None:
-    """Smooth the angle about up that turns a smoothed stretch to north.
-
-    Parameters
-    ----------
-    steps : ndarray, shape (n, STEP)
-    matrices : ndarray, shape (n + 1, 9)
-        The smoothed stretch.
-    headings, variances : ndarray, shape (n,)
-        North by the field at each step, and its variance; NaN where it is not trusted.
-    first_angle : float
-    start_variance : ndarray, shape (5,)
-    means, covariances : ndarray, shapes (n + 1, 5) and (n + 1, 5, 5)
-        Filled, that angle first.
-    work : ndarray, shape (23, 5)
-        Buffers.
-    """
-    n, size = steps.shape[0], HEADING_STATES
-    transition, wide, gain, predicted = work[:5], work[5:10], work[10:15], work[15:20]
-    noise, one, off = work[20], work[21], work[22]
-    for i in range(size):
-        means[0, i] = first_angle if i == 0 else 0.0
-        for j in range(size):
-            transition[i, j] = 1.0 if i == j else 0.0
-            covariances[0, i, j] = start_variance[i] if i == j else 0.0
-    for k in range(n):
-        x, p = means[k + 1], covariances[k + 1]
-        _heading_model(steps[k], matrices[k], place_s, field_sd_rad, transition, noise)
-        for i in range(size):
-            x[i] = 0.0
-            for j in range(size):
-                x[i] += transition[i, j] * means[k, j]
-                wide[i, j] = 0.0
-                for m in range(size):
-                    wide[i, j] += transition[i, m] * covariances[k, m, j]
-        for i in range(size):
-            for j in range(size):
-                p[i, j] = noise[i] if i == j else 0.0
-                for m in range(size):
-                    p[i, j] += wide[i, m] * transition[j, m]
-        if math.isnan(headings[k]):
-            continue
-        turned = headings[k] - (x[0] + x[4])
-        turned -= 2.0 * math.pi * np.rint(turned / (2.0 * math.pi))
-        total = p[0, 0] + p[0, 4] + p[4, 0] + p[4, 4] + variances[k]
-        for i in range(size):
-            one[i] = (p[i, 0] + p[i, 4]) / total
-            x[i] += one[i] * turned
-        for i in range(size):
-            for j in range(size):
-                wide[i, j] = p[i, j] - one[i] * (p[0, j] + p[4, j])
-        for i in range(size):
-            along = wide[i, 0] + wide[i, 4] - variances[k] * one[i]
-            for j in range(size):
-                p[i, j] = wide[i, j] - along * one[j]
-    for k in range(n - 1, -1, -1):
-        _heading_model(steps[k], matrices[k], place_s, field_sd_rad, transition, noise)
-        for i in range(size):
-            off[i] = means[k + 1, i]
-            for j in range(size):
-                off[i] -= transition[i, j] * means[k, j]
-        _rauch(transition, noise, covariances[k], covariances[k + 1], gain, predicted, wide)
-        for i in range(size):
-            for j in range(size):
-                means[k, i] += gain[j, i] * off[j]
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _heading_model(
-    step: FloatArray,
-    matrix: FloatArray,
-    place_s: float,
-    field_sd_rad: float,
-    transition: FloatArray,
-    noise: FloatArray,
-) -> None:
-    duration = step[DURATION]
-    for i in range(3):
-        transition[0, 1 + i] = 0.0 if step[RESTED] > 0.0 else -matrix[6 + i] * duration
-        noise[1 + i] = step[NOISE + 3 + i]
-    transition[4, 4], noise[4] = 1.0, 0.0
-    if step[RESTED] == 0.0:
-        transition[4, 4] = 1.0 - duration / place_s
-        noise[4] = 2.0 * field_sd_rad * field_sd_rad / place_s * duration
-    noise[0] = step[NOISE + 2]

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
+from xsens.fusion.methods import Method
+from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 
@@ -56,23 +58,47 @@ def test_a_log_is_converted_and_read_back(run, log_file, tmp_path):
     assert json.loads(out)[0]["value"] == "2000"
 
 
-@pytest.mark.parametrize("method", ["smoother", "filter", "sensor"])
+@pytest.mark.parametrize("command", ["info", "convert", "orient", "accuracy"])
+def test_the_world_that_is_given_is_beside_what_the_log_shows(run, refused, tmp_path, command):
+    """Text that does not name its world, NWU; taken for ENU, its orientation is turned by 90 degrees."""
+    truth, log = turning(5.0)
+    heads = [f"{name}_{axis}" for name in ("Acc", "Gyr", "Mag") for axis in "XYZ"]
+    heads = "\t".join([*heads, *(f"Quat_q{i}" for i in range(4))])
+    vectors = (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)
+    rows = np.column_stack([*vectors, truth.as_quat(scalar_first=True)])
+    np.savetxt(tmp_path / "log.txt", rows, "%.6f", "\t", header=heads, comments="// Update Rate: 100.0Hz\n")
+    out = tmp_path / "out.csv"
+    given = {
+        "info": (),
+        "convert": (out,),
+        "orient": ("-o", out, "--method", "sensor"),
+        "accuracy": ("--aligned", "--optical", log_as_reference(log, tmp_path), "--method", "sensor"),
+    }[command]
+    for world, said in ((None, "orientation: NWU by its own"), ("enu", "ENU, as given; by its own")):
+        asked = () if world is None else ("--world", world)
+        code, printed, err = run("imu", command, tmp_path / "log.txt", *given, *asked)
+        assert code == 0, err
+        assert said in " ".join((printed + err).split())
+        if out.exists():
+            turned = read_log(out).world_from_sensor * truth.inv()
+            expected = 0.0 if world is None else 90.0
+            np.testing.assert_allclose(np.rad2deg(turned.magnitude()), expected, atol=1e-3)
+    assert "--world" in refused("imu", command, tmp_path / "log.txt", *given, "--world", "EDN")
+
+
+def log_as_reference(log, folder):
+    write_csv(folder / "reference.csv", log)
+    return folder / "reference.csv"
+
+
+@pytest.mark.parametrize("method", [*Method, "sensor"])
 def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path, method):
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
-    code, _, err = run(
-        "imu",
-        "orient",
-        log_file,
-        "--into",
-        sweep_file,
-        "--replace",
-        "--method",
-        method,
-        "--time-offset-s",
-        "0.05",
-    )
+    into = ("--into", sweep_file, "--replace", "--time-offset-s", "0.05")
+    code, out, err = run("imu", "orient", log_file, *into, "--method", method, "--json")
     assert code == 0, err
+    assert json.loads(out)["method"] == method
     stream = load_sweep(sweep_file).orientation
     assert stream is not None
     assert stream.time_offset_s == 0.05

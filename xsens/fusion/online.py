@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from xsens.fusion.errorstate import ErrorStateFilter
-from xsens.fusion.increments import Samples, increments_of, turn_matrix
+from speckle3d.kernels.orientation import GOES_ON
+from xsens.fusion.heading import HeadingBank, bins_of, steps_per_bin
+from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
 from xsens.fusion.readings import FASTEST_RAD_S, real_field, require_metres
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 
 _JUDGED_S = 0.99
@@ -67,7 +70,10 @@ class OnlineFilter:
 
     def __init__(self, settings: FusionSettings | None = None) -> None:
         self._settings = settings or FusionSettings()
-        self._kalman: ErrorStateFilter | None = None
+        self._level, self._bank = fresh_filter(self._settings), HeadingBank(self._settings)
+        self._steps: list[FilterSteps] = []
+        self._last: FilterSteps | None = None
+        self._turn_rad, self._heading_sd_rad, self._disturbed = 0.0, math.pi, False
         self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
         self._pending_s = self._skipped_s = self._pause_s = 0.0
         self._force = np.full(3, np.nan)
@@ -109,21 +115,19 @@ class OnlineFilter:
     @property
     def state(self) -> OnlineState | None:
         """Estimate after the last sample; None before the first whole increment."""
-        kalman = self._kalman
-        if kalman is None:
+        last = self._last
+        if last is None:
             return None
-        matrix, bias = kalman.matrix, kalman.heading_bias
-        if not kalman.resting:
+        bias, resting = last.bias[0], bool(last.resting[0])
+        rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_matrix(last.matrix[0])
+        if not resting:
             for step_s, rate, _, _ in self._pending:
-                matrix = matrix @ turn_matrix((rate - bias) * step_s)
-        return OnlineState(
-            Rotation.from_matrix(matrix),
-            kalman.sd_rad,
-            bias.copy(),
-            kalman.disturbed,
-            kalman.resting,
-            kalman.started,
-        )
+                rotation *= Rotation.from_rotvec((rate - bias) * step_s)
+        sd_rad = last.sd_rad[0].copy()
+        if self._settings.use_magnetometer:
+            sd_rad[2] = self._heading_sd_rad
+        started = bool(last.started[0])
+        return OnlineState(rotation, sd_rad, bias.copy(), self._disturbed, resting, started)
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
         """Raise if the accelerometer is in other units, after a second of it."""
@@ -148,7 +152,7 @@ class OnlineFilter:
             return
         step_s += self._skipped_s
         self._skipped_s = 0.0
-        if step_s > BRIDGED_S and self._kalman is not None:
+        if step_s > BRIDGED_S and self._last is not None:
             self._advance()
             self._pause_s = step_s
         # The turn in a pause is not known, nor is the first sample's own step.
@@ -163,16 +167,31 @@ class OnlineFilter:
         """Make an increment of the pending samples."""
         if not self._pending:
             return
-        bias = np.zeros(3) if self._kalman is None else self._kalman.bias
-        columns = [np.array(column) for column in zip(*self._pending, strict=True)]
-        (increment,) = increments_of(Samples(*columns), len(self._pending), bias)
+        samples = Samples(*(np.array(column) for column in zip(*self._pending, strict=True)))
         self._pending, self._pending_s = [], 0.0
-        if self._kalman is None:
-            self._kalman = ErrorStateFilter(self._settings, increment)
-        elif self._pause_s:
-            self._kalman.resume(increment, self._pause_s)
+        pause_s = GOES_ON
+        if self._last is None or self._pause_s:
+            self._find_north()
+            self._bank.resume()
+            pause_s = self._pause_s
+        magnetic = self._settings.use_magnetometer
+        self._last = forward(samples, self._settings, self._level, pause_s, heading_apart=magnetic)
         self._pause_s = 0.0
-        self._kalman.advance(increment)
+        self._steps.append(self._last)
+        if len(self._steps) == steps_per_bin(self._settings):
+            self._find_north()
+
+    def _find_north(self) -> None:
+        """Make a bin of the increments since the last one."""
+        if not self._steps:
+            return
+        steps = joined(self._steps)
+        self._steps = []
+        if self._settings.use_magnetometer:
+            bins = bins_of(steps, steps.start, steps.bias, steps.bias_sd_rad_s, self._settings)
+            found = self._bank.follow(bins, steps.bias[-1:])
+            self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
+            self._disturbed = bool(found.disturbed[0])
 
 
 def _checked(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,13 +11,11 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
-from xsens.fusion.increments import Samples
+from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
 from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
+from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.logs.samples import ImuLog
-
-if TYPE_CHECKING:
-    from xsens.fusion.smoothing import FilterSteps, Smoothed
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -39,7 +36,8 @@ class Orientation:
     disturbed : ndarray of bool, shape (m,)
         Where the magnetic field was not trusted.
     resting : ndarray of bool, shape (m,)
-    smoothed : bool
+    method : Method
+        The engine that found it.
     notes : tuple of str
         What was missing or interpolated.
     magnetic : bool
@@ -51,7 +49,7 @@ class Orientation:
     gyro_bias_rad_s: FloatArray
     disturbed: BoolArray
     resting: BoolArray
-    smoothed: bool
+    method: Method
     notes: tuple[str, ...] = ()
     magnetic: bool = True
 
@@ -59,17 +57,9 @@ class Orientation:
         return len(self.rotations)
 
 
-class _Result(NamedTuple):
-    """Orientation of one stretch, a row per sample; quaternions scalar last."""
-
-    xyzw: FloatArray
-    sd_rad: FloatArray
-    bias_rad_s: FloatArray
-    disturbed: BoolArray
-    resting: BoolArray
-
-
-def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = True) -> Orientation:
+def orient(
+    log: ImuLog, settings: FusionSettings | None = None, method: Method | str = DEFAULT_METHOD
+) -> Orientation:
     """Estimate the orientation of a log.
 
     Parameters
@@ -77,20 +67,28 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     log : ImuLog
         With gyroscope and accelerometer. Without a magnetometer, the heading is relative to the start.
     settings : FusionSettings, optional
-    smooth : bool
-        Use the readings after each sample as well as those before; without, as a live filter would.
+        VQF takes `use_magnetometer` alone of them.
+    method : Method or str
+        smoother, or vqf: use the readings after each sample as well as those before; filter, or vqf-online:
+        as live.
 
     Raises
     ------
     InsufficientDataError
         If the log lacks a gyroscope or an accelerometer, or has fewer than two samples of them.
     InvalidInputError
-        If the times cannot be in s, the accelerometer in m/s^2 or the gyroscope in rad/s.
+        If the times cannot be in s, the accelerometer in m/s^2 or the gyroscope in rad/s, if there is no such
+        method, or if VQF is asked for and not installed.
 
     Notes
     -----
     How the sensor turned in a pause of more than 0.1 s is not known: up and north are found again after it;
     the bias and the field's reference are kept.
+
+    VQF claims no errors of the orientation. So its variance about each of the world's axes is that of the
+    smoother beside off-line VQF, or of the filter beside on-line VQF, plus the squared distance between the
+    two orientations, averaged over some seconds. Bias, rest and disturbance are VQF's own; it takes a field
+    that it has not yet come to know for disturbed.
 
     Examples
     --------
@@ -106,7 +104,7 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     """
     if not isinstance(log, ImuLog):
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
-    settings = settings or FusionSettings()
+    settings, method = settings or FusionSettings(), method_of(method)
     used, samples, notes = usable_samples(log)
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
         notes.append("no magnetometer: the heading is relative to the start")
@@ -114,8 +112,8 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
     breaks = np.flatnonzero(samples.step_s > BRIDGED_S)
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
-    results = _stretches(samples, breaks, settings, smooth)
-    joined = _Result(*map(np.concatenate, zip(*results, strict=True)))
+    results = _stretches(samples, breaks, settings, method, notes)
+    joined = _joined(results)
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
@@ -126,7 +124,7 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
         joined.bias_rad_s,
         joined.disturbed,
         joined.resting,
-        smooth,
+        method,
         tuple(notes),
         settings.use_magnetometer,
     )
@@ -136,48 +134,36 @@ def orient(log: ImuLog, settings: FusionSettings | None = None, smooth: bool = T
 
 
 def _stretches(
-    samples: Samples, breaks: IntArray, settings: FusionSettings, smoothing: bool
-) -> list[_Result]:
-    from xsens.fusion.smoothing import forward, fresh_filter, smooth, within_steps  # which loads numba
+    samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method, notes: list[str]
+) -> list[Estimate]:
+    """Each stretch by the method asked for, or by its on-line twin if it is short."""
+    from xsens.fusion.stretch import StretchFilter, smoothed  # which loads numba
 
-    results: list[_Result] = []
-    kept = fresh_filter(settings)
+    engine = None
+    if method.is_vqf:
+        from xsens.fusion.vqf_engine import VqfEngine
+
+        engine = VqfEngine(settings.use_magnetometer)
+    results: list[Estimate] = []
+    kept = StretchFilter(settings)
     step_s = float(np.median(samples.step_s))
-    edges = [0, *breaks.tolist(), len(samples)]
-    for first, last in pairwise(edges):
+    for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
         if first == last:
             continue
         stretch = samples[first:last]
         pause_s = float(stretch.step_s[0])
         if first:
             stretch = replace(stretch, step_s=np.concatenate([[step_s], stretch.step_s[1:]]))
-        if smoothing and stretch.step_s.sum() > _SHORTEST_S:
-            steps, found = smooth(stretch, settings)
-            nodes, biases = found.matrices, found.bias_rad_s
-            within = within_steps(steps, nodes[:-1], biases[:-1], nodes[1:])
-            results.append(_from_smoother(steps, found, within))
-        else:
-            steps = forward(stretch, settings, kept, pause_s)
-            results.append(_from_filter(steps, within_steps(steps, steps.start, steps.start_bias)))
+        offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
+        own = smoothed(stretch, settings) if offline else kept.run(stretch, pause_s)
+        results.append(own if engine is None else engine.run(stretch, own, offline, pause_s))
+    if engine is not None:
+        notes += engine.notes
     return results
 
 
-def _from_filter(steps: FilterSteps, xyzw: FloatArray) -> _Result:
-    return _each_sample(steps, xyzw, steps.sd_rad, steps.bias, steps.disturbed, steps.resting)
-
-
-def _from_smoother(steps: FilterSteps, found: Smoothed, xyzw: FloatArray) -> _Result:
-    return _each_sample(steps, xyzw, found.sd_rad[1:], found.bias_rad_s[1:], found.disturbed, found.resting)
-
-
-def _each_sample(
-    steps: FilterSteps,
-    xyzw: FloatArray,
-    sd_rad: FloatArray,
-    bias_rad_s: FloatArray,
-    disturbed: BoolArray,
-    resting: BoolArray,
-) -> _Result:
-    """Give every sample what was found for its step."""
-    each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
-    return _Result(xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], resting[each])
+def _joined(results: list[Estimate]) -> Estimate:
+    if len(results) == 1:
+        return results[0]
+    columns = zip(*(vars(each).values() for each in results), strict=True)
+    return Estimate(*map(np.concatenate, columns))

@@ -8,7 +8,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from xsens.fusion.increments import Samples
+from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S
 from xsens.logs.samples import ImuLog
 
@@ -31,6 +31,9 @@ _TURNING_RAD_S = 0.2
 _FOLLOWED = 0.3
 """Smallest fraction of the gyroscope's turn that gravity must show: it shows 1 if the unit is rad/s, 1/57 if
 it is deg/s, 0 if the two do not belong together."""
+
+_LOST = 1.5
+"""A step longer than so many usual ones holds lost samples."""
 
 _NEAR_REST_M_S2 = 1.0
 _FEWEST = 20
@@ -59,17 +62,18 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
         raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {_lacking(log)}")
     used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
-    force = log.accelerometer_m_s2[used]
+    part = slice(None) if used.size == len(log) else used
+    rate, force = (_plain(values[part]) for values in (log.gyroscope_rad_s, log.accelerometer_m_s2))
     there = np.isfinite(force).all(axis=1)
     if used.size < 2 or there.sum() < 2:
         raise InsufficientDataError(
             f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
         )
-    time_s, notes = log.time_s[used], []
+    time_s, notes = log.time_s[part], []
     steps = np.diff(time_s)
     _require_seconds(steps, source)
-    require_metres(force[there], source)
-    _require_radians(log.gyroscope_rad_s[used], source)
+    require_metres(force if there.all() else force[there], source)
+    _require_radians(rate, source)
     if used.size < len(log):
         notes.append(f"{len(log) - used.size} samples without gyroscope left out")
     if not there.all():
@@ -77,14 +81,34 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
     field = np.full((used.size, 3), np.nan)
     if log.magnetometer_au is not None:
-        field, zeros = real_field(log.magnetometer_au[used])
+        field, zeros = real_field(_plain(log.magnetometer_au[part]))
         if zeros:
             notes.append(f"magnetometer reads zero in {zeros} of {used.size} samples: left out")
-    against = _contradiction(time_s, log.gyroscope_rad_s[used], force)
+    against = _contradiction(time_s, rate, force)
     if against is not None:
         notes.append(against)
     step_s = np.concatenate([[np.median(steps)], steps])
-    return used, Samples(step_s, log.gyroscope_rad_s[used], force, field), notes
+    return used, Samples(step_s, _bridging(rate, step_s), force, field), notes
+
+
+def _bridging(rate_rad_s: FloatArray, step_s: FloatArray) -> FloatArray:
+    """Mean rate since the sample before, shape (m, 3), where samples between the two were lost.
+
+    A reading tells the last usual step alone; before that the rate is taken for the mean of the two readings.
+    """
+    usual = float(np.median(step_s))
+    late = np.flatnonzero((step_s > _LOST * usual) & (step_s <= BRIDGED_S))
+    if not late.size:
+        return rate_rad_s
+    told = (usual / step_s[late])[:, None]
+    rates = rate_rad_s.copy()
+    rates[late] = 0.5 * ((1.0 + told) * rate_rad_s[late] + (1.0 - told) * rate_rad_s[late - 1])
+    return rates
+
+
+def _plain(values: FloatArray) -> FloatArray:
+    """Values as kernels are compiled for, without a copy if they are so."""
+    return np.require(values, dtype=float, requirements=["C", "W"])
 
 
 def _lacking(log: ImuLog) -> str:
@@ -127,7 +151,7 @@ def real_field(field_au: FloatArray) -> tuple[FloatArray, int]:
     """The field, shape (m, 3), NaN where zero or not finite, and how many readings were exactly zero."""
     zero = (field_au == 0.0).all(axis=1)
     none = zero | ~np.isfinite(field_au).all(axis=1)
-    return np.where(none[:, None], np.nan, field_au), int(zero.sum())
+    return np.where(none[:, None], np.nan, field_au) if none.any() else field_au, int(zero.sum())
 
 
 def _contradiction(time_s: FloatArray, rate_rad_s: FloatArray, force_m_s2: FloatArray) -> str | None:

@@ -39,18 +39,17 @@ class FusionSettings:
         Standard deviation of a hand's speed about its mean, zero, and how long a speed persists.
     force_noise_m_s_sqrt_s : float
         Velocity random walk of the accelerometer, misalignment in quick movement included.
-    field_sd_rad, field_place_s : float
-        Standard deviation of the magnetic field's heading from place to place in a room, 4 deg, and how long
-        a moving sensor stays in one place.
-    field_noise_rad_sqrt_s : float
-        Noise of the field's heading within a place: 2 deg/sqrt(Hz).
-    field_off_s : float
-        How long a disturbance of norm and dip persists.
-    norm_tolerance, dip_tolerance_rad : float
-        A field that differs by more from the reference's norm (a fraction) or dip is disturbed; 0.1 and
-        10 deg are VQF's defaults (Laidig and Seel, Information Fusion 91, 2023).
-    field_memory_s : float
-        Time over which the reference follows an undisturbed field, and a changed field must persist.
+    moving_bias_rad_s : float
+        How far the bias in movement is from that at rest, 0.05 deg/s: an error of half the gyroscope's
+        resolution at rest, acceleration and vibration.
+    magnetometer_lag_s : float
+        Standard deviation of the magnetometer's delay behind the gyroscope: a chip that averages readings
+        and sends them at a lower rate is 10 to 20 ms late.
+    field_noise_sqrt_s : float
+        Noise of the magnetometer, as a fraction of the field's norm.
+    field_first_place, field_place : float
+        What a place adds to the room's field, as a fraction of its norm, per component: 2.5 %, or 4 degrees
+        of heading; north is that of the first place, to a fifth of it.
     rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
         The sensor rests if for the last of these neither reading differs by more from its mean of half a
         second.
@@ -75,13 +74,11 @@ class FusionSettings:
     speed_m_s: float = 0.5
     speed_time_s: float = 0.5
     force_noise_m_s_sqrt_s: float = 0.01
-    field_sd_rad: float = 4.0 * _DEG
-    field_place_s: float = 60.0
-    field_noise_rad_sqrt_s: float = 2.0 * _DEG
-    field_off_s: float = 5.0
-    norm_tolerance: float = 0.1
-    dip_tolerance_rad: float = 10.0 * _DEG
-    field_memory_s: float = 20.0
+    moving_bias_rad_s: float = 0.05 * _DEG
+    magnetometer_lag_s: float = 0.015
+    field_noise_sqrt_s: float = 0.002
+    field_first_place: float = 0.005
+    field_place: float = 0.025
     rest_rate_rad_s: float = 1.0 * _DEG
     rest_force_m_s2: float = 0.3
     rest_after_s: float = 1.5

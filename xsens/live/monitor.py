@@ -6,14 +6,12 @@ import time
 from collections import deque
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from xsens.fusion.online import OnlineFilter
-from xsens.fusion.settings import FusionSettings
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
@@ -21,8 +19,15 @@ from xsens.logs.samples import ImuLog
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Framer, Message, encode
 
+if TYPE_CHECKING:
+    from xsens.fusion.online import OnlineFilter
+
 RATE_OVER_S = 2.0
 """Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
+
+NORM_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
+"""A field that differs by more from the first second's is disturbed; defaults of VQF (Laidig and Seel,
+Information Fusion 91, 2023)."""
 
 REFERENCE_S = 1.0
 """Time at the start over which the reference field is averaged."""
@@ -75,9 +80,8 @@ class LiveState:
         """Whether the field differs from that at the start; None if there is none."""
         if not np.isfinite(self.field):
             return None
-        limits = FusionSettings()
-        norm_off = abs(self.field - 1.0) > limits.norm_tolerance
-        return bool(norm_off or abs(self.dip_change_rad) > limits.dip_tolerance_rad)
+        norm_off = abs(self.field - 1.0) > NORM_TOLERANCE
+        return bool(norm_off or abs(self.dip_change_rad) > DIP_TOLERANCE_RAD)
 
     def line(self) -> str:
         """The state in one line of text."""
@@ -182,7 +186,7 @@ class _Attitude:
     """Latest orientation: the sensor's own if it sends one, else the filter's."""
 
     def __init__(self, step_s: float) -> None:
-        self._filter = OnlineFilter()
+        self._filter: OnlineFilter | None = None
         self._step_s = step_s
 
     def follow(self, log: ImuLog, missing: int) -> Rotation | None:
@@ -195,6 +199,9 @@ class _Attitude:
         gyroscope, accelerometer = log.gyroscope_rad_s, log.accelerometer_m_s2
         if gyroscope is None or accelerometer is None or not np.isfinite(self._step_s):
             return None
+        from xsens.fusion.online import OnlineFilter  # which loads numba
+
+        self._filter = self._filter or OnlineFilter()
         steps = np.append(self._step_s * (1 + missing), steps)
         try:
             self._filter.push(steps, gyroscope, accelerometer, log.magnetometer_au)

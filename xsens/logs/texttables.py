@@ -22,6 +22,7 @@ _LONGEST_HEADER = 64
 
 _LONGEST_LINE = 1 << 16
 _MOST_COLUMNS = 256
+_MANY_WORDS = 100_000
 _COMMENT = "#"
 _DIGIT = re.compile("[0-9]")
 _AXES = frozenset("wxyzs")
@@ -124,7 +125,7 @@ class _Rows:
     def table(self, lines: Iterable[str], header: Names, names: Names, known: frozenset[str]) -> TextTable:
         """Read the table's known columns, or all if they have no names."""
         kept = tuple(dict.fromkeys(name for name in names if name in known))
-        rows = self._even(lines)
+        rows = self._even(lines, len(kept) or self.count)
         if (first := next(rows, None)) is None:
             raise InvalidInputError(f"expected lines of {self.count} numbers, got {self.left_out} others")
         values = np.loadtxt(
@@ -138,15 +139,19 @@ class _Rows:
         )
         return TextTable(header, names, kept, values, self.left_out, self.words)
 
-    def _even(self, lines: Iterable[str]) -> Iterator[str]:
+    def _even(self, lines: Iterable[str], columns: int) -> Iterator[str]:
+        rows = 0
         for line in lines:
             if not line.strip("\r\n"):
                 continue
             cells = line.count(self.separator) + 1 if self.separator else len(line.split())
             if cells != self.count or not _DIGIT.search(line):
                 self.left_out += 1
-            else:
-                yield line if self.separator == "," else line.replace(",", ".")
+                continue
+            rows += 1
+            if self.words > max(_MANY_WORDS, rows * columns / 2):
+                raise InvalidInputError(f"expected numbers, got words in {self.words} cells of {rows} lines")
+            yield line if self.separator == "," else line.replace(",", ".")
 
     def _number(self, cell: str) -> float:
         value = number(cell)

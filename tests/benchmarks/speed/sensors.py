@@ -10,11 +10,12 @@ from bench_image_calibration import displaced, prepared
 from bench_imu_reading import LOGS
 from calibration_examples import scan_plane
 from imu_logs import samples
-from vqf import VQF
+from vqf import VQF, offlineVQF
 
 from calibration.images.solver import ImageSettings, calibrate_from_sweeps
 from calibration.plane import _three_stages, calibrate_plane
 from speed.rows import Row, timed
+from xsens.fusion.methods import Method
 from xsens.fusion.orient import orient
 from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
@@ -81,20 +82,21 @@ def _bytes(log: ImuLog) -> int:
 
 
 def filtering(runs: int) -> list[Row]:
-    """Orientation of a recording, forward alone and smoothed, beside VQF forward and off line."""
+    """Orientation of a recording by every method, beside VQF alone, on line or off line as the method is."""
     made = samples(int(RATE_HZ * FILTERED_S), RATE_HZ)
     vectors = [made[name] for name in ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")]
     log = ImuLog(made["time_s"], vectors[1], vectors[0], vectors[2])
 
-    def forward() -> None:
-        VQF(1.0 / RATE_HZ).updateBatch(*vectors)
-
+    peers = {
+        False: ("VQF on line", lambda: VQF(1.0 / RATE_HZ).updateBatch(*vectors)),
+        True: ("VQF off line", lambda: offlineVQF(*vectors, 1.0 / RATE_HZ)),
+    }
     rows = []
-    for what, smooth in (("orientation filter", False), ("orientation smoother", True)):
-        ours = timed(lambda smooth=smooth: orient(log, smooth=smooth), runs).seconds
-        theirs = timed(forward, runs).seconds
-        rates = (len(log) / ours, "samples/s", "VQF, forward", len(log) / theirs)
-        rows.append(Row(f"{what}, {RATE_HZ:g} Hz", *rates, target=FILTERED))
+    for method in Method:
+        ours = timed(lambda method=method: orient(log, method=method), runs).seconds
+        peer, run = peers[method.offline]
+        rates = (len(log) / ours, "samples/s", peer, len(log) / timed(run, runs).seconds)
+        rows.append(Row(f"orientation {method}, {RATE_HZ:g} Hz", *rates, target=FILTERED))
     return rows
 
 

@@ -46,7 +46,7 @@ def apart_deg(one, other):
 
 def test_ends_where_the_filter_over_the_whole_log_ends():
     truth, log = moving()
-    whole = orient(log, smooth=False)
+    whole = orient(log, method="filter")
     state = pushed(log, len(log))
     # The log's filter sums two seconds with one bias and corrects to first order; that is all the difference.
     assert apart_deg(state.world_from_sensor, whole.rotations.world_from_sensor[-1]) < 0.02
@@ -72,8 +72,9 @@ def test_the_orientation_is_that_of_the_last_sample_between_increments_too():
         online.push(1 / RATE_HZ, log.gyroscope_rad_s[k], log.accelerometer_m_s2[k], log.magnetometer_au[k])
         if k > 300:
             errors.append((online.state.world_from_sensor * truth[k].inv()).as_rotvec())
-    # From sample to sample the error moves by gyroscope noise (0.006 degrees) and corrections alone.
-    assert np.rad2deg(np.abs(np.diff(errors, axis=0)).max()) < 0.15
+    # From sample to sample the error moves by gyroscope noise (0.006 degrees) and corrections alone: a
+    # quarter of a second's field shows the heading to about a degree, of which a correction takes a fifth.
+    assert np.rad2deg(np.abs(np.diff(errors, axis=0)).max()) < 0.3
 
 
 def test_after_a_pause_up_is_found_again():

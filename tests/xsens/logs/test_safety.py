@@ -293,6 +293,7 @@ HOSTILE = {
     "wide": b"time_s,counter" + b"," * 250 + b"\n" + repeated(b"," * 251 + b"\n"),
     "uneven lines": b"time_s,counter,acc_x,acc_y,acc_z\n" + repeated(b"1,2,3,4,5\n1,2\n"),
     "words": b"time_s,counter,acc_x,acc_y,acc_z\n" + repeated(b"a,b,c,d,e\n"),
+    "words beside numbers": b"time_s,counter,acc_x,acc_y,acc_z\n" + repeated(b"1,2,c,d,e\n"),
     "comments": repeated(b"#\n"),
     "huge numbers": b"time_s,counter,acc_x,acc_y,acc_z\n" + repeated(b"1e308,1e300,1e999,nan,-inf\n"),
 }

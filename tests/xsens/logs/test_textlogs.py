@@ -143,6 +143,19 @@ def test_the_world_may_be_told(s, world):
         parse_text(text, Hints(rate_hz=100.0, world="EDN"))
 
 
+@pytest.mark.parametrize("counted", [True, False])
+def test_a_rate_is_the_headers_or_given(counted):
+    """A program other than the vendor's wrote such files without a counter; both lack it at times."""
+    rows = [[f"{i:05d}"] * counted + ["0.1", "0.2", "9.8"] for i in range(20)]
+    names = ["PacketCounter"] * counted + ["Acc_X", "Acc_Y", "Acc_Z"]
+    text = "\n".join("\t".join(row) for row in [names, *rows]) + "\n"
+    with pytest.raises(InvalidInputError, match=r"give --rate-hz$"):
+        parse_text(text)
+    for log in (parse_text(text, Hints(rate_hz=50.0)), parse_text("// Update Rate: 50.0Hz\n" + text)):
+        assert (len(log), log.rate_hz, log.counter is not None) == (20, pytest.approx(50.0), counted)
+        assert ("samples have no counter: losses cannot be found" in log.notes) != counted
+
+
 # Xsens DOT's
 
 

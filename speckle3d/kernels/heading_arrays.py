@@ -1,0 +1,43 @@
+"""Places of numbers in the arrays of the heading's filter."""
+
+# -- a bin: a quarter of a second of steps
+
+SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE = 0, 1, 2, 3, 4, 5, 8, 11, 20
+BIN = 23
+"""s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
+change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
+from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three)."""
+
+# -- a model of the field
+
+STRAY, STRAY_S, IRON_PRIOR, IRON_JUMP, AFTER_S = 0, 1, 2, 3, 4
+MODEL = 5
+"""Deviation of the field from the place's, as a fraction of its norm, and how long it persists, s; deviation
+of the field of iron on the sensor at the start, and after it was put on or off (zero: never); how long the
+sensor must have moved before the field is used."""
+
+# -- what all models share
+
+PLACE, FIRST_PLACE, WHITE, GYRO, GYRO_SCALE, BIAS_S, ROOM, ROOM_WALK, REST_GYRO = 0, 1, 2, 3, 4, 5, 6, 7, 8
+FREEDOM, LAG_S, OUTLIER, HOLD_S, STEEPEST = 9, 10, 11, 12, 13
+SHARED = 14
+"""See `xsens.fusion.heading`."""
+
+# -- state of a model's filter
+
+TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG = 0, 1, 4, 7, 8, 9, 12, 15
+STATES = 16
+"""Angle from the level axes to north; what is left of the gyroscope's bias (sensor axes); the field of iron
+(sensor axes); the room's field, horizontal and upward; what the place adds to it, and the stray (world axes);
+the magnetometer's lag, s."""
+
+BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
+FLAGS = 5
+"""Whether the filter has begun in this stretch, and ever; whether the last bin was at rest; how long iron is
+still being put on, s; how long the sensor has moved in this stretch, s."""
+
+# -- what is found in a bin
+
+FOUND_TURN, FOUND_VARIANCE, EVIDENCE, TRUST = 0, 1, 2, 3
+FOUND = 4
+"""Angle and its variance; logarithm of the reading's density, NaN where there is none; its weight, 0 to 1."""

@@ -1,0 +1,386 @@
+"""Turn level axes, carried by the gyroscope, to magnetic north: a bank of filters with models of the field.
+
+The field that a moving sensor reads is the room's, plus what the place adds (another one for each stay at
+rest and for the movement between), plus a stray that changes as it moves on, plus the field of iron on the
+sensor, all as vectors. Norm and dip, which tell nothing of the heading, tell how large those are here: each
+model states other sizes, each filter's evidence tells how well its model explains the readings, and the
+headings are averaged with those weights. So a quiet room's field is followed closely and a poor one's hardly,
+iron that is put on the sensor is found by turning it, and the claimed deviation is that of the room at hand.
+Two properties of the sensor are found on the way: the lag of its magnetometer (its readings are older than
+the gyroscope's), and the gyroscope's bias in movement, which is not quite that at rest.
+
+North is the field's where the sensor was at first.
+
+References
+----------
+.. [1] D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE TAC 10, 1965 (the
+   bank).
+.. [2] M. Roth, E. Ozkan, F. Gustafsson, "A Student's t filter for heavy tailed process and measurement
+   noise", ICASSP 2013 (readings off the model).
+.. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", 1965.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.kernels import heading_arrays as at
+from speckle3d.kernels.heading import find_headings
+from xsens.fusion.settings import FusionSettings
+
+if TYPE_CHECKING:
+    from xsens.fusion.inclination import FilterSteps
+
+BIN_S = 0.25
+"""Readings are averaged over this time: the heading's error changes in seconds."""
+
+
+@dataclass(frozen=True)
+class FieldModel:
+    """One explanation of the field.
+
+    Attributes
+    ----------
+    stray : float
+        Deviation of the field from that of its place, as a fraction of the field's norm, per component.
+    stray_s : float
+        How long it persists while the sensor moves.
+    iron : float
+        Deviation of the field of iron on the sensor at the start, as a fraction.
+    iron_put_on : float
+        That of iron put on the sensor later; zero if none ever is.
+    after_s : float
+        How long the sensor must have moved before the field is used: the first place may be beside iron.
+    handicap : float
+        Logarithm of the evidence that the others must lack before this one is taken.
+    """
+
+    stray: float
+    stray_s: float = 1.5
+    iron: float = 0.0003
+    iron_put_on: float = 0.0
+    after_s: float = 0.0
+    handicap: float = 0.0
+
+
+MODELS = (
+    *(FieldModel(stray) for stray in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
+    *(FieldModel(stray, stray_s=8.0) for stray in (0.02, 0.05, 0.12)),
+    *(FieldModel(stray, after_s=3.0, handicap=300.0) for stray in (0.01, 0.03, 0.1)),
+    *(
+        FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=300.0)
+        for stray in (0.005, 0.01, 0.02, 0.04, 0.08)
+    ),
+)
+"""Rooms from a quiet one to a workshop. Iron on the sensor must be proved: a sensor that is turned while it
+is carried through an uneven field shows nearly the same."""
+
+BIAS_S = 20.0
+"""How long what is left of the gyroscope's bias persists."""
+
+ROOM = 0.05
+"""Deviation of the room's field from its first reading, as a fraction."""
+
+ROOM_WALK_SQRT_S = 0.0003
+"""Its random walk: 1 % in twenty minutes."""
+
+REST_GYRO_RAD_SQRT_S = math.radians(0.005)
+"""Random walk of a resting sensor's heading, which is not integrated."""
+
+FREEDOM = 5.0
+"""Of Student's distribution of the readings' errors."""
+
+OUTLIER = 25.0
+"""Squared misfit of a reading that shows iron put on or off: one in 10^5 with normal errors."""
+
+HOLD_S = 3.0
+"""How long putting it on takes."""
+
+STEEPEST = 0.05
+"""A field with a smaller horizontal fraction shows no heading: iron in the room turns it to any side."""
+
+MEMORY_S = 100.0
+"""Time over which models are weighed while samples arrive; a recording is weighed as a whole."""
+
+_DISTRUSTED = 0.5
+_ROUNDING = 1e-12
+"""Variance that keeps covariances invertible: (1 microradian)^2, a millionth of the field, 1 microsecond."""
+
+_NEGLIGIBLE = 5.0
+"""Models whose evidence is less by this, in logarithms, are not smoothed: their weight is below 1 %."""
+
+
+@dataclass(frozen=True)
+class Headings:
+    """Angle about up from level axes to north, at the end of each bin.
+
+    Attributes
+    ----------
+    turn_rad, sd_rad : ndarray, shape (n,)
+    disturbed : ndarray of bool, shape (n,)
+        Where the reading was hardly believed.
+    """
+
+    turn_rad: FloatArray
+    sd_rad: FloatArray
+    disturbed: BoolArray
+
+
+# -- bins
+
+
+def steps_per_bin(settings: FusionSettings) -> int:
+    """Steps of the filter in a bin."""
+    return max(1, round(BIN_S / settings.block_s))
+
+
+def bins_of(
+    steps: FilterSteps,
+    level: FloatArray,
+    bias_rad_s: FloatArray,
+    bias_sd_rad_s: FloatArray,
+    settings: FusionSettings,
+) -> FloatArray:
+    """Average the steps of each bin.
+
+    Parameters
+    ----------
+    steps : FilterSteps, length n
+    level : ndarray, shape (n, 3, 3)
+        Level axes from the sensor's at the start of each step.
+    bias_rad_s, bias_sd_rad_s : ndarray, shape (n, 3)
+        After each step.
+
+    Returns
+    -------
+    ndarray, shape (bins, BIN)
+        See `heading_arrays`; fields as they were read, not yet over their norm.
+    """
+    field, duration = steps.field_au, steps.duration_s
+    seen = np.asarray(np.isfinite(field).all(axis=1))
+    field = np.where(seen[:, None], field, 0.0)
+    rate = steps.rate_rad_s - bias_rad_s
+    columns = np.column_stack(
+        [
+            np.einsum("kij,kj->ki", level, field),
+            level.reshape(-1, 9),
+            np.einsum("kij,kj->ki", level, np.cross(rate, field)),
+        ]
+    )
+    firsts = np.arange(0, len(duration), steps_per_bin(settings))
+    counts = np.diff(firsts, append=len(duration))
+    fields = np.add.reduceat(seen.astype(float), firsts)
+    rows = np.zeros((len(firsts), at.BIN))
+    rows[:, at.SPAN] = np.add.reduceat(duration, firsts)
+    rows[:, at.RESTS] = np.logical_and.reduceat(steps.resting, firsts)
+    rows[:, at.SEEN] = fields > 0.0
+    rows[:, at.TURNING] = np.add.reduceat((rate**2).sum(axis=1), firsts) / counts
+    lasts = firsts + counts - 1
+    variance = (bias_sd_rad_s[lasts] ** 2).mean(axis=1)
+    rows[:, at.BIAS_VARIANCE] = variance + settings.moving_bias_rad_s**2
+    weight = np.where((fields > 0.0)[np.repeat(np.arange(len(firsts)), counts)], seen, 1.0)
+    sums = np.add.reduceat(weight[:, None] * columns, firsts)
+    rows[:, at.READING :] = sums / np.add.reduceat(weight, firsts)[:, None]
+    return rows
+
+
+# -- the bank
+
+
+class HeadingBank:
+    """The filters of all models, bin by bin.
+
+    Parameters
+    ----------
+    settings : FusionSettings
+    models : sequence of FieldModel
+    """
+
+    def __init__(self, settings: FusionSettings, models: tuple[FieldModel, ...] = MODELS) -> None:
+        self.models = models
+        self._table = np.array([[m.stray, m.stray_s, m.iron, m.iron_put_on, m.after_s] for m in models])
+        self._handicap = np.array([m.handicap for m in models])
+        self._shared = _shared(settings)
+        count = len(models)
+        self._means, self._flags = np.zeros((count, at.STATES)), np.zeros((count, at.FLAGS))
+        self._covariances = np.zeros((count, at.STATES, at.STATES))
+        self._scores = np.full(count, np.nan)
+        self._norm = math.nan
+        self._bias: FloatArray | None = None
+
+    def resume(self) -> None:
+        """Find north again after a pause; keep the room's field, iron and lag."""
+        self._flags[:, at.BEGUN] = 0.0
+        self._bias = None
+
+    def follow(self, bins: FloatArray, bias_rad_s: FloatArray) -> Headings:
+        """Take in bins; `bias_rad_s`, shape (n, 3), is the bias with which each one's steps ended."""
+        rows = bins.copy()
+        before = bias_rad_s[:1] if self._bias is None else self._bias[None]
+        rows[:, at.BIAS_CHANGE : at.BIAS_CHANGE + 3] = np.diff(bias_rad_s, axis=0, prepend=before)
+        self._bias = bias_rad_s[-1].copy()
+        found = self._run(rows)
+        turns, variances = found[..., at.FOUND_TURN], found[..., at.FOUND_VARIANCE]
+        weights = np.array(
+            [
+                self._weighed(row[at.SPAN], evidence)
+                for row, evidence in zip(rows, found[..., at.EVIDENCE], strict=True)
+            ]
+        )
+        return _mixed(turns, variances, found[..., at.TRUST], weights, rows[:, at.SEEN] > 0.0)
+
+    def evidence(self, bins: FloatArray) -> FloatArray:
+        """Logarithm of each model's evidence in all bins, less its handicap, shape (models,)."""
+        each = self._run(bins)[..., at.EVIDENCE]
+        running = np.cumsum(np.nan_to_num(each), axis=0)
+        begun = np.isfinite(each)
+        first = np.where(begun.any(axis=0), begun.argmax(axis=0), len(bins))
+        total = running[-1].copy()
+        early = first == first.min()
+        for late in np.flatnonzero(~early):
+            k = min(first[late], len(bins)) - 1
+            total[late] += running[k, early].max()
+        return np.asarray(total - self._handicap)
+
+    def kept(self, bins: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """States, covariances, those before the reading, and what was found, of every bin."""
+        n, m = len(bins), len(self.models)
+        wide = (n, m, at.STATES, at.STATES)
+        states, after, before = np.zeros(wide[:3]), np.zeros(wide), np.zeros(wide)
+        return states, after, before, self._run(bins, states, after, before)
+
+    def _run(self, bins: FloatArray, *kept: FloatArray) -> FloatArray:
+        rows = bins.copy()
+        if not math.isfinite(self._norm) and (rows[:, at.SEEN] > 0.0).any():
+            first = rows[int(np.argmax(rows[:, at.SEEN])), at.READING : at.READING + 3]
+            self._norm = float(np.linalg.norm(first))
+        if self._norm > 0.0:
+            rows[:, at.READING : at.READING + 3] /= self._norm
+            rows[:, at.LATE : at.LATE + 3] /= self._norm
+        found = np.empty((len(rows), len(self.models), at.FOUND))
+        wide = (0, len(self.models), at.STATES, at.STATES)
+        into = kept or (np.empty(wide[:3]), np.empty(wide), np.empty(wide))
+        table, shared = self._table, self._shared
+        find_headings(rows, table, shared, self._means, self._covariances, self._flags, found, *into)
+        return found
+
+    def _weighed(self, span_s: float, evidence: FloatArray) -> FloatArray:
+        """Weights of the models after one more bin."""
+        seen, known = np.isfinite(evidence), np.isfinite(self._scores)
+        late = seen & ~known
+        if late.any():
+            self._scores[late] = self._scores[known].max() if known.any() else 0.0
+        self._scores[seen] = math.exp(-span_s / MEMORY_S) * self._scores[seen] + evidence[seen]
+        return weights_of(self._scores - self._handicap)
+
+
+def weights_of(evidence: FloatArray) -> FloatArray:
+    """Weights of models by the logarithms of their evidence, NaN where a model has none."""
+    if not np.isfinite(evidence).any():
+        return np.full(len(evidence), 1.0 / len(evidence))
+    return np.asarray(
+        np.nan_to_num(np.exp(evidence - np.nanmax(evidence)))
+        / np.nansum(np.exp(evidence - np.nanmax(evidence)))
+    )
+
+
+def _mixed(
+    turns: FloatArray, variances: FloatArray, trusts: FloatArray, weights: FloatArray, seen: BoolArray
+) -> Headings:
+    """Mean and deviation of the models' angles, (n, models), by weights, (n, models)."""
+    best = np.take_along_axis(turns, weights.argmax(axis=1)[:, None], axis=1)
+    off = np.angle(np.exp(1j * (turns - best)))
+    mean = (weights * off).sum(axis=1)
+    variance = (weights * (variances + (off - mean[:, None]) ** 2)).sum(axis=1)
+    trust = (weights * trusts).sum(axis=1)
+    return Headings(best[:, 0] + mean, np.sqrt(variance), seen & (trust < _DISTRUSTED))
+
+
+def _shared(s: FusionSettings) -> FloatArray:
+    shared = np.full(at.SHARED, np.nan)
+    for place, value in (
+        (at.PLACE, s.field_place),
+        (at.FIRST_PLACE, s.field_first_place),
+        (at.WHITE, s.field_noise_sqrt_s),
+        (at.GYRO, s.gyro_noise_rad_sqrt_s),
+        (at.GYRO_SCALE, s.gyro_scale_noise_sqrt_s),
+        (at.BIAS_S, BIAS_S),
+        (at.ROOM, ROOM),
+        (at.ROOM_WALK, ROOM_WALK_SQRT_S),
+        (at.REST_GYRO, REST_GYRO_RAD_SQRT_S),
+        (at.FREEDOM, FREEDOM),
+        (at.LAG_S, s.magnetometer_lag_s),
+        (at.OUTLIER, OUTLIER),
+        (at.HOLD_S, HOLD_S),
+        (at.STEEPEST, STEEPEST),
+    ):
+        shared[place] = value
+    return shared
+
+
+# -- a recording
+
+
+def smooth_headings(bins: FloatArray, settings: FusionSettings) -> Headings:
+    """North over a whole stretch: the models that explain it, smoothed backward."""
+    evidence = HeadingBank(settings).evidence(bins)
+    chosen = np.flatnonzero(evidence > np.nanmax(evidence) - _NEGLIGIBLE)
+    models = tuple(MODELS[k] for k in chosen)
+    states, after, before, found = HeadingBank(settings, models).kept(bins)
+    turns, variances = np.empty((2, len(bins), len(models)))
+    for j, model in enumerate(models):
+        turns[:, j], variances[:, j] = _backward(
+            bins, model, states[:, j], after[:, j], before[:, j], settings
+        )
+    weights = np.tile(weights_of(evidence[chosen]), (len(bins), 1))
+    return _mixed(turns, variances, found[..., at.TRUST], weights, bins[:, at.SEEN] > 0.0)
+
+
+def _backward(
+    bins: FloatArray,
+    model: FieldModel,
+    states: FloatArray,
+    after: FloatArray,
+    before: FloatArray,
+    settings: FusionSettings,
+) -> tuple[FloatArray, FloatArray]:
+    """Angle and variance of one model, smoothed."""
+    from filterpy.kalman import KalmanFilter
+
+    first = int(np.argmax(after[:, at.TURN, at.TURN] > 0.0))
+    rows = bins[first:]
+    steps = _transitions(rows, model)
+    noise = before[first:] + _ROUNDING * np.eye(at.STATES)
+    noise[1:] -= steps[1:] @ after[first:-1] @ np.swapaxes(steps[1:], 1, 2)
+    smoother = KalmanFilter(dim_x=at.STATES, dim_z=3)
+    means, covariances, _, _ = smoother.rts_smoother(states[first:], after[first:], steps, noise)
+    turn, variance = means[:, at.TURN], covariances[:, at.TURN, at.TURN]
+    early = bins[1 : first + 1]  # the field was not used yet: back by the gyroscope
+    moving = early[:, at.RESTS] == 0.0
+    up = early[:, at.POSE + 6 : at.POSE + 9]
+    slip = moving * early[:, at.SPAN] * (up @ means[0, at.GYRO_BIAS : at.GYRO_BIAS + 3])
+    wander = settings.gyro_noise_rad_sqrt_s**2 + settings.gyro_scale_noise_sqrt_s**2 * early[:, at.TURNING]
+    spread = moving * early[:, at.SPAN] * (wander + early[:, at.SPAN] * early[:, at.BIAS_VARIANCE])
+    turn = np.concatenate([turn[0] + np.cumsum(slip[::-1])[::-1], turn])
+    variance = np.concatenate([variance[0] + np.cumsum(spread[::-1])[::-1], variance])
+    return turn, variance
+
+
+def _transitions(rows: FloatArray, model: FieldModel) -> FloatArray:
+    """Transition to each bin from the one before, shape (n, STATES, STATES)."""
+    steps = np.tile(np.eye(at.STATES), (len(rows), 1, 1))
+    span, moving = rows[:, at.SPAN], rows[:, at.RESTS] == 0.0
+    keep = np.exp(-span / BIAS_S)
+    fade = np.where(moving, np.exp(-span / model.stray_s), 1.0)
+    stays = np.concatenate([[1.0], rows[1:, at.RESTS] == rows[:-1, at.RESTS]])
+    for i in range(3):
+        steps[:, at.GYRO_BIAS + i, at.GYRO_BIAS + i] = keep
+        steps[:, at.TURN, at.GYRO_BIAS + i] = -rows[:, at.POSE + 6 + i] * span * keep * moving
+        steps[:, at.OF_STRAY + i, at.OF_STRAY + i] = fade
+        steps[:, at.OF_PLACE + i, at.OF_PLACE + i] = stays
+    return steps

@@ -1,0 +1,255 @@
+"""VQF (Laidig and Seel, Information Fusion 91, 2023) as an engine beside the filter of this package.
+
+VQF wants an even clock, a field at every sample, and gives no standard deviation of the orientation. Here its
+samples are brought to an even clock where the log's is not, missing fields are carried by the orientation of
+this package's own engine, and what that engine claims, and how far VQF is from it, become VQF's deviation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation, Slerp
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
+from xsens.fusion.samples import Estimate, Samples
+from xsens.fusion.settings import BRIDGED_S
+from xsens.logs.worlds import nwu_from
+
+if TYPE_CHECKING:
+    from vqf import VQF
+
+_EVEN = 0.05
+"""Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
+and 100 samples/s it is 0.15 degrees, and does not add up."""
+
+_COMPARED_S = 1.0 / 32.0
+"""How often VQF is compared with the other engine: as often as that one corrects itself."""
+
+_AVERAGED_S = 5.0
+"""Time over which their squared distance is averaged, so that it is not zero where the two cross."""
+
+_WANDERS_DEG_S = 0.1
+"""By so much a bias wanders in 100 s, as VQF has it; at the start it is 0.5."""
+
+
+class _Even(NamedTuple):
+    """Rate, force and field on an even clock; if it is another, where the samples lie on it, in steps."""
+
+    vectors: list[FloatArray]
+    step_s: float
+    place: FloatArray | None
+
+
+class _Bias(NamedTuple):
+    """A gyroscope's bias at the end of a stretch, and its standard deviation."""
+
+    rad_s: FloatArray
+    sd_rad_s: float
+
+    def sd_after(self, pause_s: float) -> float:
+        """Standard deviation after a pause, as VQF lets it grow to what it takes it for at first."""
+        grown = math.hypot(self.sd_rad_s, math.radians(_WANDERS_DEG_S) * math.sqrt(pause_s / 100.0))
+        return min(grown, math.radians(0.5))
+
+
+class VqfEngine:
+    """VQF over the stretches of a log, in order.
+
+    The gyroscope's bias and, on line, the reference of the magnetic field are kept from stretch to stretch.
+
+    Parameters
+    ----------
+    magnetic : bool
+        Let the magnetic field tell the heading.
+
+    Raises
+    ------
+    InvalidInputError
+        If VQF is not installed.
+    """
+
+    def __init__(self, magnetic: bool) -> None:
+        try:
+            import vqf
+        except ImportError as error:
+            raise InvalidInputError(
+                "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
+                "which may need a C++ compiler, or choose smoother or filter"
+            ) from error
+        self._vqf = vqf
+        self._magnetic = magnetic
+        self._last: VQF | None = None
+        self._bias: _Bias | None = None
+        self._uneven = 0
+        self._fields: list[bool] = []
+
+    @property
+    def notes(self) -> list[str]:
+        """What VQF made of the log, for those who see the orientation."""
+        notes = []
+        if self._uneven:
+            notes.append(
+                f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"
+            )
+        if self._fields and not any(self._fields):
+            notes.append(
+                "VQF came to know no magnetic field, for which it wants 5 s of turning by over 20 deg/s: it "
+                "takes all of it for disturbed"
+            )
+        return notes
+
+    def run(self, stretch: Samples, own: Estimate, offline: bool, pause_s: float = 0.0) -> Estimate:
+        """Find the orientation of a stretch.
+
+        Parameters
+        ----------
+        stretch : Samples
+        own : Estimate
+            The same by this package's engine: its variances, plus the squared distance of VQF from it about
+            each of the world's axes, averaged over some seconds, are VQF's variances.
+        offline : bool
+            Use later readings as well.
+        pause_s : float
+            Time since the stretch before.
+        """
+        magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
+        field = [_field_carried(stretch, own.xyzw, offline)] if magnetic else []
+        even = _even_clock([stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s)
+        self._uneven += 0 if even.place is None else len(stretch)
+        vectors = [np.ascontiguousarray(values, dtype=float) for values in even.vectors]
+        find = self._offline if offline else self._online
+        found = find(vectors, even.step_s, pause_s)
+        wxyz = found["quat9D" if magnetic else "quat6D"]
+        found = {name: found[name] for name in ("bias", "restDetected", "magDistDetected") if name in found}
+        first = Rotation.from_quat(wxyz[0], scalar_first=True)
+        start = Rotation.from_quat(own.xyzw[0]) * first.inv()
+        xyzw = _turned_about_up(wxyz, nwu_from("ENU") if magnetic else start)
+        del wxyz
+        if even.place is not None:
+            xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(even.place).as_quat()
+        at = _nearest(even.place, len(stretch))
+        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)), offline)
+        disturbed = found["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
+        if magnetic:
+            self._fields.append(not disturbed.all())
+        return Estimate(
+            xyzw,
+            np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi),
+            found["bias"][at],
+            disturbed,
+            found["restDetected"][at],
+        )
+
+    def _offline(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
+        """A prior of the bias cannot be given: what is known is taken off the rate and put back after."""
+        params = {}
+        if self._bias is not None:
+            vectors = [vectors[0] - self._bias.rad_s, *vectors[1:]]
+            # VQF never takes the bias for less certain than at the start: leave it room to wander.
+            params["biasSigmaInit"] = max(np.rad2deg(self._bias.sd_after(pause_s)), _WANDERS_DEG_S)
+        field = vectors[2] if len(vectors) == 3 else None
+        found = dict(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s, params))
+        if self._bias is not None:
+            found["bias"] += self._bias.rad_s
+        self._bias = _Bias(found["bias"][-1].copy(), float(found["biasSigma"][-1]))
+        return found
+
+    def _online(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
+        now, before = self._vqf.VQF(step_s), self._last
+        if self._bias is not None:
+            now.setBiasEstimate(self._bias.rad_s, self._bias.sd_after(pause_s))
+        if before is not None:
+            now.setMagRef(before.getMagRefNorm(), before.getMagRefDip())
+        found = dict(now.updateBatch(*vectors))
+        self._last, self._bias = now, _Bias(*now.getBiasEstimate())
+        return found
+
+
+def _turned_about_up(wxyz: FloatArray, turn: Rotation) -> FloatArray:
+    """Quaternions, shape (m, 4), scalar last, turned by that part of a rotation that is about up."""
+    half = np.arctan2(*turn.as_quat()[2:])
+    s, c = np.sin(half), np.cos(half)
+    w, x, y, z = wxyz.T
+    return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+
+
+# -- what VQF wants
+
+
+def _field_carried(stretch: Samples, xyzw: FloatArray, offline: bool) -> FloatArray:
+    """The field with its holes filled, shape (m, 3); zero, which VQF skips, where nothing tells it.
+
+    Off line it goes in the world from the reading before a hole to the one after; on line the last reading
+    stays in the world for as long as a pause is bridged, so that a slower magnetometer counts in full.
+    """
+    there = np.isfinite(stretch.field_au).all(axis=1)
+    if there.all():
+        return stretch.field_au
+    time_s = np.cumsum(stretch.step_s)
+    known, holes = np.flatnonzero(there), np.flatnonzero(~there)
+    world = Rotation.from_quat(xyzw[known]).apply(stretch.field_au[known])
+    if offline:
+        carried = np.column_stack([np.interp(time_s[holes], time_s[known], axis) for axis in world.T])
+    else:
+        last = np.searchsorted(known, holes) - 1
+        late = (last < 0) | (time_s[holes] - time_s[known[last]] > BRIDGED_S)
+        carried = np.where(late[:, None], 0.0, world[last])
+    field = stretch.field_au.copy()
+    field[holes] = Rotation.from_quat(xyzw[holes]).inv().apply(carried)
+    return field
+
+
+def _even_clock(vectors: list[FloatArray], steps_s: FloatArray) -> _Even:
+    """Rate, force and perhaps field of a stretch on an even clock: unchanged if theirs is one.
+
+    A gyroscope's reading is the mean rate since the sample before; on the new clock, too, so that the turn
+    from end to end stays what it was. Accelerometer and field are interpolated.
+    """
+    time_s, last = np.cumsum(steps_s) - steps_s[0], len(steps_s) - 1
+    if last == 0:
+        return _Even(vectors, float(steps_s[0]), None)
+    step_s = float(time_s[-1]) / last
+    off = np.abs(time_s / step_s - np.arange(last + 1)).max()
+    if off < _EVEN:
+        return _Even(vectors, step_s, None)
+    if off > 0.5:
+        # Samples were lost. A clock of bursts has a median step far below the mean: at most two for one.
+        last = max(1, round(float(time_s[-1]) / max(float(np.median(steps_s)), 0.5 * step_s)))
+        step_s = float(time_s[-1]) / last
+    grid_s = step_s * np.arange(last + 1.0)
+    rate = vectors[0]
+    angle = np.vstack([np.zeros(3), np.cumsum(rate[1:] * steps_s[1:, None], axis=0)])
+    mean = np.vstack([rate[:1], np.diff(_at(grid_s, time_s, angle), axis=0) / step_s])
+    others = [_at(grid_s, time_s, values) for values in vectors[1:]]
+    return _Even([mean, *others], step_s, np.minimum(time_s / step_s, last))
+
+
+def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArray:
+    return np.column_stack([np.interp(grid_s, time_s, axis) for axis in values.T])
+
+
+def _nearest(place: FloatArray | None, count: int) -> IntArray | slice:
+    return slice(0, count) if place is None else np.rint(place).astype(np.int64)
+
+
+# -- uncertainty
+
+
+def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline: bool) -> FloatArray:
+    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3)."""
+    stride = max(1, round(_COMPARED_S / step_s))
+    one, two = (Rotation.from_quat(each[::stride]) for each in (xyzw, other))
+    square = (one * two.inv()).as_rotvec() ** 2
+    averaged = _AVERAGED_S / (stride * step_s)
+    if offline:
+        mean = uniform_filter1d(square, max(1, round(averaged)), axis=0, mode="nearest")
+    else:
+        keep = math.exp(-1.0 / averaged)
+        mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
+    return np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(xyzw)]
