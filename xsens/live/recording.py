@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.parts import cannot_write
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor
@@ -138,7 +138,7 @@ class Recorder:
 
     def _prepared(self) -> Device:
         """The sensor, ready to measure; always the same one."""
-        with ExitStack() as undo:
+        with naming(self._port), ExitStack() as undo:
             device = connect(self._port, self._baud)
             undo.callback(device.close)
             info, before = prepare(device, self._settings), self._info.device_id
