@@ -22,8 +22,9 @@ from xsens.messages.framing import Framer, Message, encode
 if TYPE_CHECKING:
     from xsens.fusion.online import OnlineFilter
 
-RATE_OVER_S = 2.0
-"""Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
+_SEEN = 9
+"""States over which the rate is taken: two seconds if they come four times a second, long against the 16 ms
+between two deliveries of an adapter."""
 
 NORM_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
 """A field that differs by more from the first second's is disturbed; defaults of VQF (Laidig and Seel,
@@ -53,7 +54,7 @@ class LiveState:
     interruptions : int
         How often the connection was lost.
     rate_hz : float
-        Samples received per second over the last two seconds.
+        Samples received per second over the last eight states, or since measuring began.
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
@@ -114,7 +115,7 @@ class Monitor:
         self._header = b"".join(map(encode, info.header))
         self._hints = Hints(info.rate_hz if info.rate_hz > 0 else None, as_stated=True)
         self._framer, self._pending = Framer(), list[Message]()
-        self._arrivals = deque[tuple[float, int]](maxlen=1 << 12)
+        self._seen = deque([(time.monotonic(), self._now.samples)], maxlen=_SEEN)
         self._counter: int | None = None
         self._attitude = _Attitude(1.0 / info.rate_hz if info.rate_hz > 0 else _NAN)
 
@@ -133,7 +134,6 @@ class Monitor:
         with self._lock:
             data = [message for message in self._framer.feed(received) if message.mid in _DATA]
             self._set(samples=self._now.samples + len(data))
-            self._arrivals.append((time.monotonic(), self._now.samples))
             self._pending += data
             if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
                 self._digest()
@@ -149,17 +149,12 @@ class Monitor:
         """The state now."""
         with self._lock:
             self._digest()
-            rate_hz = self._rate_hz() if self._now.connected else 0.0
-            return replace(self._now, elapsed_s=time.monotonic() - self._since_s, rate_hz=rate_hz)
-
-    def _rate_hz(self) -> float:
-        """Samples after the oldest arrival that is kept, over the time since it."""
-        arrivals = self._arrivals
-        while len(arrivals) > 2 and arrivals[-1][0] - arrivals[0][0] > RATE_OVER_S:
-            arrivals.popleft()
-        first_s, before = arrivals[0] if arrivals else (0.0, 0)
-        span_s = time.monotonic() - first_s
-        return (self._now.samples - before) / span_s if len(arrivals) > 1 and span_s > 0 else 0.0
+            now_s = time.monotonic()
+            self._seen.append((now_s, self._now.samples))
+            first_s, first = self._seen[0]
+            span_s = now_s - first_s
+            rate_hz = (self._now.samples - first) / span_s if self._now.connected and span_s > 0 else 0.0
+            return replace(self._now, elapsed_s=now_s - self._since_s, rate_hz=rate_hz)
 
     def _digest(self) -> None:
         data, self._pending = b"".join(map(encode, self._pending)), []

@@ -33,16 +33,7 @@ RETRY_S = 0.1
 class RawFile:
     """A file to which bytes are appended, each piece handed to the operating system at once.
 
-    Parameters
-    ----------
-    path : path
-    append : bool
-        Continue an existing file instead of refusing it.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `append` is false, or it cannot be written.
+    Raises `FileError` if the file exists, unless told to `append`, or it cannot be written.
     """
 
     def __init__(self, path: PathLike, append: bool = False) -> None:
@@ -83,7 +74,7 @@ class Recorder:
         Name of the serial port.
     path : path
         New file, or an existing one to continue if `append`.
-    settings : DeviceSettings
+    settings : DeviceSettings, optional
     append : bool
 
     Raises
@@ -122,13 +113,7 @@ class Recorder:
         self._file.close()
 
     def state(self) -> LiveState:
-        """State of the recording, after writing all of it to the disk.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written any more.
-        """
+        """State, after writing all to the disk; raises `FileError` once the file cannot be written."""
         if self._failure is not None:
             raise self._failure
         if not (self._thread.is_alive() or self._stop.is_set()):
