@@ -79,13 +79,10 @@ class TestPairErrors:
         found = pair_errors(read, true, Rotation.identity())
         np.testing.assert_allclose(np.rad2deg(found.error_rad[0, 0]), [0.0, 0.4, 0.0], atol=1e-9)
 
-    def test_calibrations_come_as_one_rotation_as_many_or_as_a_list(self):
-        calibrations = some(2, 4)
-        sensor = some(7, 5)
+    def test_calibrations_come_as_one_rotation_or_as_many(self):
+        calibrations, sensor = some(2, 4), some(7, 5)
         together = pair_errors(sensor, grid()[:5], calibrations).error_rad
-        listed = pair_errors(sensor, grid()[:5], list(calibrations)).error_rad
         one = pair_errors(sensor, grid()[:5], calibrations[2]).error_rad
-        np.testing.assert_array_equal(together, listed)
         np.testing.assert_allclose(one[0], together[2], atol=1e-14)
 
     def test_the_papers_experiment_has_73150_pairs(self):
@@ -97,7 +94,6 @@ class TestPairErrors:
             (some(0, 3), some(1, 4), some(2, 1), MismatchError, "4 and 3"),
             (some(0, 1), some(1, 1), some(2, 1), InsufficientDataError, "got 1"),
             (some(0, 1)[0], some(1, 1)[0], some(2, 1), InsufficientDataError, "got 0"),
-            (some(0, 3), some(1, 3), [], InsufficientDataError, "sensor_from_image"),
             (some(0, 3), some(1, 3), some(2, 0), InsufficientDataError, "sensor_from_image"),
             (some(0, 3200), some(1, 3200), some(2, 1), InvalidInputError, "3200"),
         ],
