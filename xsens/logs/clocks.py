@@ -22,7 +22,7 @@ UNKNOWN_PAUSE_S = 1.0
 _RATES_HZ = (1e-3, 1e5)
 """Sampling rates that a sensor may have: they end at 2 kHz."""
 
-_TICK_SPAN = 1 << 32
+_WORD, _TICK_SPAN = 1 << 16, 1 << 32
 _RARE = 0.01
 _LONGER, _MUCH_LONGER = 1.6, 10.0
 """A clock step of more periods is a gap; the latter if the clock is irregular."""
@@ -102,12 +102,20 @@ def timeline(stamps: Stamps) -> Timeline:
         arrays: dict[str, Any] = {k: v[kept] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
         stamps = replace(stamps, **arrays)
     steps, counts = _steps(stamps)
-    origin = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
-    time_s = origin + np.concatenate(([0.0], np.cumsum(steps.seconds)))
-    counter = None
-    if stamps.counter is not None and counts is not None:
-        counter = stamps.counter[0] + np.concatenate(([0], np.cumsum(counts)))
-    return Timeline(kept, time_s, counter, steps.gaps(), steps.notes(kept, "came twice; the second was"))
+    told = steps.gaps(), steps.notes(kept, "came twice; the second was")
+    time_s = _risen(0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s, steps.seconds)
+    del steps  # a large log's arrays, of which few may be held at once
+    first = 0 if stamps.counter is None else int(stamps.counter[0])
+    return Timeline(kept, time_s, None if counts is None else _risen(first, counts), *told)
+
+
+def _risen(first: float, steps: Any) -> Any:
+    """Running sum of steps from `first` on, shape (steps + 1,)."""
+    sums = np.empty(steps.size + 1, dtype=steps.dtype)
+    sums[0] = 0
+    np.cumsum(steps, out=sums[1:])
+    sums += steps.dtype.type(first)
+    return sums
 
 
 def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Timeline:
@@ -146,10 +154,12 @@ class _Steps:
 
     def gaps(self) -> tuple[Gap, ...]:
         """Steps in which samples are missing, and pauses."""
-        missing = np.where(self.anew, 0, np.round(np.minimum(self.taken, _MOST_PERIODS)).astype(np.int64) - 1)
         long = (self.seconds > _LONGER * self.period_s) & (not self.irregular)
-        at = np.flatnonzero((missing > 0) | self.anew | long)
-        return tuple(Gap(int(i), int(missing[i]), float(self.seconds[i])) for i in at)
+        at = np.flatnonzero((self.taken > 1.5) | self.anew | long)
+        missing = np.where(self.anew[at], 0, np.round(np.minimum(self.taken[at], _MOST_PERIODS)) - 1)
+        return tuple(
+            Gap(int(i), int(lost), float(self.seconds[i])) for i, lost in zip(at, missing, strict=True)
+        )
 
     def notes(self, kept: BoolArray, why: str) -> tuple[str, ...]:
         """What was left out and why, an irregular clock, and new starts."""
@@ -181,15 +191,17 @@ def _steps(stamps: Stamps) -> tuple[_Steps, IntArray | None]:
         assert seconds is not None  # one of the two is there
         taken, irregular = _by_clock(seconds, anew)
     else:
-        taken = _by_counter(counts - (0 if stamps.others is None else np.diff(stamps.others)), anew)
+        taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
         if seconds is None:
             seconds = taken * period_s
         elif period_s > 0.0:  # the clock tells how often the counter went all the way round
             rounds = np.maximum(np.round((seconds / period_s - taken) / span), 0.0)
             counts, taken = counts + rounds.astype(np.int64) * span, taken + rounds * span
-    pauses = _pauses(stamps, anew, seconds)
-    unknown = anew & np.isnan(pauses)
-    seconds = np.where(anew, np.where(unknown, UNKNOWN_PAUSE_S, pauses), seconds)
+    unknown = anew
+    if anew.any():
+        pauses = _pauses(stamps, anew, seconds)
+        unknown = anew & np.isnan(pauses)
+        seconds = np.where(anew, np.where(unknown, UNKNOWN_PAUSE_S, pauses), seconds)
     return _Steps(seconds, taken, anew, unknown, period_s, irregular), counts
 
 
@@ -206,9 +218,10 @@ def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None
 
 def _by_counter(counts: IntArray, anew: BoolArray) -> FloatArray:
     """Sampling periods of each step of the counter; a sensor may count several for each sample."""
-    values, often = np.unique(counts[~anew], return_counts=True)
-    stride = int(np.gcd.reduce(values[often >= _RARE * counts.size])) or 1
-    return np.maximum(counts / stride, 1.0)
+    often = np.bincount(np.clip(counts[~anew] if anew.any() else counts, 0, _WORD))
+    stride = int(np.gcd.reduce(np.flatnonzero(often >= max(_RARE * counts.size, 1.0)))) or 1
+    taken = counts / stride
+    return np.asarray(np.maximum(taken, 1.0, out=taken))
 
 
 def _by_clock(seconds: FloatArray, anew: BoolArray) -> tuple[FloatArray, bool]:

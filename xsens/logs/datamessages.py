@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
-from xsens.logs.parts import Hints, Parts, of_unit_length, on_clock, only, oriented
-from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.parts import Parts, of_unit_length, only
+from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, Values
-from xsens.messages.mtdata2 import Column, columns, name_of, world_of
+from xsens.messages.mtdata2 import columns, name_of, world_of
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
 
 _Read = TypeVar("_Read")
@@ -55,20 +54,24 @@ _ENOUGH = 10_000
 """Messages that show where the counter is."""
 
 
-def legacy_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> ImuLog:
+Found = tuple[Stamps, Parts, Claim, tuple[FloatArray | None, ...]]
+"""Samples, and their orientation as quaternions, matrices or angles: all that the bytes are needed for."""
+
+
+def legacy_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     """Read the samples of the MTData messages at indices `which`.
 
     Raises
     ------
     InvalidInputError
-        If layout, rate or calibration is neither in the log nor in the hints.
+        If the layout, or the calibration of raw counts, is not in the log.
     """
     configuration = _last(
         frames, np.flatnonzero(frames.mid == MessageId.CONFIGURATION), Configuration.from_message
     )
     blocks = np.flatnonzero(frames.mid == MessageId.EMTS)
     blocks = blocks[frames[blocks].payload_size == BLOCK_SIZE]
-    calibration = hints.calibration or _last(frames, blocks, RawCalibration.from_message)
+    calibration = _last(frames, blocks, RawCalibration.from_message)
     layout = _layout(frames[which], configuration)
     fits = frames[which].payload_size == layout.size
     if not fits.any():
@@ -77,18 +80,22 @@ def legacy_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> I
         parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
     which = only(which, fits)
     data = frames[which]
-    if not layout.mode & _RAW:
-        read = partial(_as_sent, layout, data, parts, hints)
-    elif calibration is not None:
-        read = partial(_in_units, layout, data, calibration, parts)
-    else:
+    raw = layout.mode & _RAW
+    if raw and calibration is None:
         raise InvalidInputError("expected a calibration block before raw counts, got none")
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
-    rate_hz = hints.rate_hz or next((rate for rate in rates if rate > 0.0), None)
-    counts = _all_of(layout, data, ("counter",))
-    counter = counts["counter"][:, 0].astype(np.int64) if counts else None
-    stamps = replace(_stretches(frames, which), counter=counter)
-    return on_clock(stamps, len(data), read, replace(hints, rate_hz=rate_hz))
+    rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
+    stamps = replace(_stretches(frames, which), period_s=1.0 / rate_hz)
+    notations = ("quaternion_wxyz", "matrix", "euler_deg")
+    counter = _all_of(layout, data, ("counter",)).get("counter")
+    if counter is not None:
+        stamps, counter = replace(stamps, counter=counter[:, 0].astype(np.int64)), None
+    values = _all_of(layout, data, (*notations, *VECTORS))
+    if raw and calibration is not None:
+        values |= zip(VECTORS, _in_units(layout, data, calibration), strict=True)
+        parts = parts.noting(NOT_COMPENSATED)
+    parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
+    return stamps, parts, Claim(layout.frame, "as configured"), tuple(map(values.get, notations))
 
 
 def _decoded(layout: DataLayout, frames: Frames) -> Iterator[tuple[slice, Values]]:
@@ -138,37 +145,21 @@ def _share_counting(frames: Frames, at: IntArray) -> float:
     return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
 
 
-def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration, parts: Parts) -> Parts:
+def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration) -> FloatArray:
     names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
     vectors = np.empty((3, len(data), 3))
     for some, values in _decoded(layout, data):
         vectors[:, some] = calibration.to_units(np.stack([values[name] for name in names], axis=1))
-    return replace(parts.noting(NOT_COMPENSATED), vectors=tuple(vectors))
-
-
-def _as_sent(layout: DataLayout, data: Frames, parts: Parts, hints: Hints) -> Parts:
-    notations = ("quaternion_wxyz", "matrix", "euler_deg")
-    values = _all_of(layout, data, (*VECTORS, *notations))
-    parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
-    return oriented(parts, Claim(layout.frame, "as configured"), hints, *map(values.get, notations))
+    return vectors
 
 
 # -- MTData2
 
-_NOTATIONS = {
-    "quaternion_wxyz": "quaternions",
-    "rotation_matrix_by_column": "matrices",
-    "euler_deg": "angles_deg",
-}
-"""Parameter of `oriented` by the name of the item."""
-
+_NOTATIONS = ("quaternion_wxyz", "rotation_matrix_by_column", "euler_deg")
 _STAMPS = ("packet_counter", "sample_time_fine")
 
-_Table = dict[int, Column]
-"""Numbers by the identifier of the item."""
 
-
-def mtdata2_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> ImuLog:
+def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     """Read the samples of the MTData2 messages at indices `which`.
 
     Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.
@@ -178,69 +169,65 @@ def mtdata2_log(frames: Frames, which: IntArray, parts: Parts, hints: Hints) -> 
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    table, damaged = columns(frames[which])
+    items, world, rows, damaged = _items(frames[which])
     if damaged:
         parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
-    told = [_filled(table, name, which.size) for name in _STAMPS]
-    rows = np.zeros(which.size, dtype=bool)
-    for identifier, column in table.items():
-        rows[column.rows] |= name_of(identifier) not in _STAMPS
-    for values in told:
-        rows &= True if values is None else np.isfinite(values[:, 0])
+    told = [items.pop(name, None) for name in _STAMPS]
+    for stamp in told:
+        rows &= True if stamp is None else np.isfinite(stamp[:, 0])
     if not rows.any():
         raise InvalidInputError(
             f"expected measurements with a time in {which.size} MTData2 messages, got none"
         )
     if not rows.all():
         parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
-    counter, ticks = (None if values is None else values[rows, 0].astype(np.int64) for values in told)
+        items = {name: values[rows] for name, values in items.items()}
+    stamps = _stretches(frames, only(which, rows))
+    counter, ticks = (None if stamp is None else stamp[rows, 0].astype(np.int64) for stamp in told)
     others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
-    stamps = replace(_stretches(frames, only(which, rows)), counter=counter, ticks=ticks, others=others)
-    log = on_clock(stamps, int(rows.sum()), partial(_measured, table, rows, parts, hints), hints)
-    if log.accelerometer_m_s2 is not None and not _named(table, "acceleration_m_s2"):
-        log = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 * log.rate_hz)
-    if log.gyroscope_rad_s is not None and not _named(table, "rate_of_turn_rad_s"):
-        log = replace(log, gyroscope_rad_s=log.gyroscope_rad_s * log.rate_hz)
-    return log
+    stamps = replace(stamps, counter=counter, ticks=ticks, others=others)
+    claim = Claim(world, "as its messages say")
+    return stamps, _measured(items, parts), claim, tuple(map(items.get, _NOTATIONS))
 
 
-def _named(table: _Table, name: str) -> _Table:
-    return {identifier: column for identifier, column in table.items() if name_of(identifier) == name}
+def _items(frames: Frames) -> tuple[Values, str, BoolArray, int]:
+    """Items of messages by name, NaN where missing; their world; which measure; how many are damaged.
+
+    Orientations in another world than the first are left out.
+    """
+    items: Values = {}
+    world, damaged = "", 0
+    measured = np.zeros(len(frames), dtype=bool)
+    for first in range(0, len(frames), _SOME):
+        found, bad = columns(frames[first : first + _SOME])
+        damaged += bad
+        for identifier, column in found.items():
+            name, values, rows = name_of(identifier), column.values, first + column.rows
+            measured[rows] |= name not in _STAMPS
+            if name in _NOTATIONS:
+                world = world or world_of(identifier)
+                if world != world_of(identifier):
+                    continue
+            if name == _NOTATIONS[1]:
+                values = values.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
+            if name not in items:
+                items[name] = np.full((len(frames), values.shape[1]), np.nan)
+            items[name][rows] = values
+    return items, world or "NWU", measured, damaged
 
 
-def _filled(table: _Table, name: str, size: int) -> FloatArray | None:
-    """The item called `name` for every message, shape (size, count), NaN where it is missing."""
-    found = list(_named(table, name).values())
-    if not found:
-        return None
-    if len(found) == 1 and found[0].rows.size == size and (np.diff(found[0].rows) == 1).all():
-        return found[0].values
-    values = np.full((size, found[0].values.shape[1]), np.nan)
-    for column in found:
-        values[column.rows] = column.values
-    return values
-
-
-def _measured(table: _Table, rows: BoolArray, parts: Parts, hints: Hints) -> Parts:
-    """Readings, or increments in their place, and the orientation whose identifier most messages have."""
-
-    def item(name: str) -> Any:
-        return only(_filled(table, name, rows.size), rows)
-
-    acceleration, rate = item("acceleration_m_s2"), item("rate_of_turn_rad_s")
-    if acceleration is None and (acceleration := item("delta_v_m_s")) is not None:
+def _measured(items: Values, parts: Parts) -> Parts:
+    """Add readings, or increments in their place."""
+    acceleration, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
+    increments = []
+    if acceleration is None and (acceleration := items.get("delta_v_m_s")) is not None:
         parts = parts.noting("acceleration is the sensor's velocity increments over its sampling period")
-    if rate is None and (turns := item("delta_q_wxyz")) is not None:
+        increments.append(VECTORS[0])
+    if rate is None and (turns := items.get("delta_q_wxyz")) is not None:
         unit = of_unit_length(turns)[:, None]
         turned = Rotation.from_quat(np.where(unit, turns, 1.0), scalar_first=True)
         rate = np.where(unit, turned.as_rotvec(), np.nan)
         parts = parts.noting("rate of turn is the sensor's orientation increments over its sampling period")
-    parts = replace(parts, vectors=(acceleration, rate, item("magnetic_field_au")))
-    for name, notation in _NOTATIONS.items():
-        if found := _named(table, name):
-            most = max(found, key=lambda i: found[i].rows.size)
-            values = only(_filled({most: found[most]}, name, rows.size), rows)
-            if notation == "matrices":
-                values = np.swapaxes(values.reshape(-1, 3, 3), 1, 2).reshape(-1, 9)
-            return oriented(parts, Claim(world_of(most), "as its messages say"), hints, **{notation: values})
-    return parts
+        increments.append(VECTORS[1])
+    vectors = (acceleration, rate, items.get("magnetic_field_au"))
+    return replace(parts, vectors=vectors, increments=tuple(increments))

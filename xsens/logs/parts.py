@@ -6,7 +6,6 @@ sensor's axes to the world's; angles are roll, pitch, yaw with R = Rz(yaw) Ry(pi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +16,6 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from xsens.logs.clocks import Stamps, Timeline, require_rate, timeline
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.worlds import Claim, nwu_from, settle, upright_part
-from xsens.messages.rawcounts import RawCalibration
 
 _ABSURD = 1e6
 """Larger values, in any of the units, are damage: the sensors' ranges end at 160 m/s² and 35 rad/s."""
@@ -40,8 +38,6 @@ class Hints:
     ----------
     rate_hz : float, optional
         Samples per second, for logs with a counter but no clock.
-    calibration : RawCalibration, optional
-        Of raw counts without their calibration block, from another log of the same unit.
     world : str, optional
         Of the sensor's own orientation, ENU, NED or NWU.
     as_stated : bool
@@ -55,7 +51,6 @@ class Hints:
     """
 
     rate_hz: float | None = None
-    calibration: RawCalibration | None = None
     world: str | None = None
     as_stated: bool = False
 
@@ -70,8 +65,8 @@ class Hints:
 class Parts:
     """Samples before their clock is known: as in `ImuLog`, one row for each message or line.
 
-    `vectors` are the readings of accelerometer, gyroscope and magnetometer; `orientations` the sensor's own,
-    meaningless where `there` is false.
+    `vectors` are the readings of accelerometer, gyroscope and magnetometer, those named in `increments` times
+    the sampling period; `orientations` the sensor's own, meaningless where `there` is false.
     """
 
     source: str
@@ -79,6 +74,7 @@ class Parts:
     vectors: tuple[FloatArray | None, ...] = (None, None, None)
     orientations: Rotation | None = None
     there: BoolArray | None = None
+    increments: tuple[str, ...] = ()
 
     def noting(self, *notes: str) -> Parts:
         """The same parts with more notes."""
@@ -93,14 +89,8 @@ def only(values: Any, kept: BoolArray) -> Any:
 # -- from parts to a log
 
 
-def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hints) -> ImuLog:
+def on_clock(stamps: Stamps, samples: int, parts: Parts, hints: Hints) -> ImuLog:
     """Build the log of samples that have a clock, or a counter and a rate, or a rate alone.
-
-    Parameters
-    ----------
-    parts : callable
-        Returns the samples' parts. It is called once their times are known: finding those takes as much
-        memory meanwhile as the parts do.
 
     Raises
     ------
@@ -112,12 +102,13 @@ def on_clock(stamps: Stamps, samples: int, parts: Callable[[], Parts], hints: Hi
     counted = stamps.counter is not None or stamps.ticks is not None
     if not counted and stamps.period_s > 0.0:
         stamps = replace(stamps, counter=np.arange(samples), counter_span=1 << 62)
-    line = timeline(stamps)
-    if counted:
-        del stamps
-        return assembled(line, parts())
-    note = "samples have no counter: losses cannot be found"
-    return replace(assembled(line, parts().noting(note)), counter=None)
+        parts = parts.noting("samples have no counter: losses cannot be found")
+    log = assembled(timeline(stamps), parts)
+    changed: dict[str, Any] = {} if counted else {"counter": None}
+    for name in parts.increments:
+        values = getattr(log, name)
+        changed[name] = None if values is None else values * log.rate_hz
+    return replace(log, **changed) if changed else log
 
 
 def assembled(line: Timeline, parts: Parts) -> ImuLog:

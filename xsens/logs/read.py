@@ -11,9 +11,9 @@ from io import BufferedReader, TextIOWrapper
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
-from xsens.logs.datamessages import legacy_log, mtdata2_log
-from xsens.logs.parts import Hints, Parts
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from xsens.logs.datamessages import legacy_samples, mtdata2_samples
+from xsens.logs.parts import Hints, Parts, on_clock, oriented
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
@@ -22,7 +22,8 @@ from xsens.messages.framing import Frames, find_frames
 PathLike = str | os.PathLike[str]
 
 MOST_BYTES = 1 << 27
-"""Of a log: five hours of raw counts at 256 Hz. Reading takes up to six times the memory, damage more."""
+"""Of a log: five hours of raw counts at 256 Hz. Reading takes 2.5 times the memory of text, 3.1 to 5.2 times
+that of messages, whose numbers are shorter than a double: raw counts alone become 3.3 times as large."""
 
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _SNIFFED = 1 << 16
@@ -95,10 +96,7 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
             encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
             with TextIOWrapper(file, encoding, errors="replace") as text:
                 return parse_text(text, hints, str(path))
-        data = file.read(size)
-    if not data.strip(b"\0"):
-        raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got nothing but zeros")
-    return parse_stream(data, hints, str(path))
+        return parse_stream(file.read(size), hints, str(path))  # which alone holds the bytes
 
 
 def read_bounded(path: PathLike, most_bytes: int) -> bytes:
@@ -116,6 +114,8 @@ def read_bounded(path: PathLike, most_bytes: int) -> bytes:
 @contextmanager
 def _opened(path: PathLike, most_bytes: int) -> Iterator[tuple[BufferedReader, int]]:
     """A file and its size, refused as `read_bounded` does."""
+    if "\0" in os.fspath(path):
+        raise FileError(f"{os.fspath(path)!r}: expected the name of a file, got one with a null byte")
     try:
         # A pipe is opened without waiting for its writer.
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
@@ -125,11 +125,10 @@ def _opened(path: PathLike, most_bytes: int) -> Iterator[tuple[BufferedReader, i
             if found.st_size > most_bytes:
                 raise FileError(f"{path}: expected at most {most_bytes} bytes, got {found.st_size}")
             yield file, found.st_size
-    except Speckle3DError:
+    except FileError:
         raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise FileError(f"{path}: cannot be read: {reason}") from error
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _is_text(first: bytes) -> bool:
@@ -159,20 +158,27 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
     InvalidInputError
         If they hold no data message, or lack what is needed to understand one.
     """
-    frames = find_frames(data)
+    hints = hints or Hints()
     with naming(source):
+        frames = find_frames(data)
         which = _of_one_kind(frames)
         parts = Parts(source, tuple(_passed_over(frames, which)))
-        read = legacy_log if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_log
-        return read(frames, which, parts, hints or Hints())
+        read = legacy_samples if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_samples
+        stamps, parts, claim, notations = read(frames, which, parts)
+        samples = 0 if stamps.starts is None else stamps.starts.size
+        del data, frames, which  # as large as the samples
+        parts = oriented(parts, claim, hints, *notations)
+        del notations
+        return on_clock(stamps, samples, parts, hints)
 
 
 def _of_one_kind(frames: Frames) -> IntArray:
     """Indices of the data messages of the most common kind and bus id."""
     data = np.flatnonzero(np.isin(frames.mid, _DATA))
     if not data.size:
+        got = f"{len(frames)} others in {frames.data.size} bytes"
         raise InvalidInputError(
-            f"expected messages with data, got {len(frames)} others in {frames.data.size} bytes"
+            f"expected messages with data, got {got if frames.data.any() else 'nothing but zeros'}"
         )
     kinds = frames.mid[data].astype(np.uint16) * 256 + frames.bid[data]
     return np.asarray(data[kinds == np.bincount(kinds).argmax()].astype(frames.start.dtype))

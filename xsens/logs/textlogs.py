@@ -117,7 +117,7 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     rate_hz = number(rate.group(1)) if rate else float("nan")
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
     stamps = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
-    return on_clock(stamps, len(table.values), lambda: parts, hints)
+    return on_clock(stamps, len(table.values), parts, hints)
 
 
 def _dialect(table: TextTable) -> _Dialect:
