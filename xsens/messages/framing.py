@@ -25,7 +25,7 @@ MOST_PAYLOAD = 8192
 beyond it are damage, and waiting for so many bytes would stop a live stream."""
 
 _EXTENDED = 0xFF
-_BLOCK = 1 << 22
+_BLOCK = 1 << 20
 """Bytes scanned at a time, which bounds the memory that a file of nothing but FA takes."""
 
 
