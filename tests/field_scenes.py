@@ -11,7 +11,7 @@ import numpy as np
 from broad import read_trial, trials_in
 from scipy.spatial.transform import Rotation, Slerp
 
-from xsens.logs.samples import ImuLog
+from xsens.logs.samples import VECTORS, ImuLog
 
 EARTH_UT = np.array([0.0, 18.0, -45.0])
 """Central Europe's: 48 uT, dipping by 68 degrees; x east, y north, z up as in BROAD."""
@@ -54,8 +54,9 @@ PLAN = {
     "scale": (0.01,),  # of the gyroscope
     "noise": (3.0,),  # times the gyroscope's own
     "rate": (50.0, 100.0),  # Hz
+    "cut": (5.0, 15.0, 25.0, 35.0),  # s of movement left out, and all before: no rest to start from
 }
-"""Kinds of scene, and how strong; the last six leave the magnetometer as recorded."""
+"""Kinds of scene, and how strong; the last seven leave the magnetometer as recorded."""
 
 
 class Scene(NamedTuple):
@@ -120,7 +121,7 @@ def scene(motion, kind, amount, rng, label=""):
 
 
 def with_readings(log, **changed):
-    kept = {name: getattr(log, name) for name in ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")}
+    kept = {name: getattr(log, name) for name in VECTORS}
     return ImuLog(log.time_s, source=log.source, **(kept | changed))
 
 
@@ -134,7 +135,7 @@ def recorded(folder, name):
     part = slice(seen[0], seen[-1] + 1)
     log = ImuLog(
         log.time_s[part] - log.time_s[seen[0]],
-        *(each[part] for each in (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)),
+        *(getattr(log, each)[part] for each in VECTORS),
         source=name,
     )
     true, seen = true[part], seen - seen[0]
@@ -379,7 +380,16 @@ def slower(motion, amount, rng):
     return log, np.where((seen[last] & seen[last - 1])[:, None], turns, np.nan), motion.moving[last]
 
 
+def cut(motion, amount, rng):
+    """Only what comes after some seconds of movement."""
+    first = np.flatnonzero(np.cumsum(motion.moving) > amount * motion.log.rate_hz)[0]
+    vectors = (getattr(motion.log, name)[first:] for name in VECTORS)
+    log = ImuLog(motion.log.time_s[first:] - motion.log.time_s[first], *vectors, source=motion.log.source)
+    return log, motion.true_wxyz[first:], motion.moving[first:]
+
+
 SENSORS = {
+    "cut": cut,
     "bias": bias,
     "truncated": truncated,
     "truncated, slow": truncated,

@@ -15,7 +15,6 @@ from speckle3d.kernels.heading_arrays import (
     BIAS_CHANGE,
     BIAS_S,
     BIAS_VARIANCE,
-    DOWN_FIELD,
     EVIDENCE,
     FIRST_PLACE,
     FOUND_TURN,
@@ -31,10 +30,10 @@ from speckle3d.kernels.heading_arrays import (
     IRON_PRIOR,
     LAG_S,
     LATE,
-    LEVEL_FIELD,
     MOVED,
     OF_LAG,
     OF_PLACE,
+    OF_ROOM,
     OF_STRAY,
     OUTLIER,
     PLACE,
@@ -49,11 +48,9 @@ from speckle3d.kernels.heading_arrays import (
     SEEN,
     SPAN,
     STATES,
-    STEEPEST,
     STRAY,
     STRAY_S,
     TRUST,
-    TURN,
     TURNING,
     WHITE,
 )
@@ -102,7 +99,7 @@ def find_headings(
                 continue
             _predict(x, p, flag, row, model, shared)
             if row[SEEN] > 0.0:
-                _expect(x, row, shared, rows, off)
+                _expect(x, row, rows, off)
                 _spread(p, rows, cross, total)
                 misfit, _ = _inverted(total, shared[WHITE] * shared[WHITE] / row[SPAN], off, inverse)
                 if misfit > shared[OUTLIER] and model[IRON_JUMP] > 0.0 and flag[HOLDING] <= 0.0:
@@ -112,7 +109,7 @@ def find_headings(
                 kept_predicted[k, j] = p
             if row[SEEN] > 0.0:
                 _correct(x, p, row, shared, off, cross, gain, total, inverse, out)
-            out[FOUND_TURN], out[FOUND_VARIANCE] = x[TURN], p[TURN, TURN]
+            out[FOUND_TURN], out[FOUND_VARIANCE] = turn_to_north(x, p)
             if keeps:
                 kept_means[k, j], kept[k, j] = x, p
 
@@ -128,24 +125,34 @@ def _forget(x: FloatArray, p: FloatArray, first: int, count: int, sd: float) -> 
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
+    """Angle about up from the level axes to north, by the room's field, and its variance."""
+    across, along = x[OF_ROOM], x[OF_ROOM + 1]
+    square = across * across + along * along
+    unknown = math.pi * math.pi
+    if square == 0.0:
+        return 0.0, unknown
+    variance = along * along * p[OF_ROOM, OF_ROOM] + across * across * p[OF_ROOM + 1, OF_ROOM + 1]
+    variance = (variance - 2.0 * across * along * p[OF_ROOM, OF_ROOM + 1]) / (square * square)
+    return -math.atan2(along, across), min(max(variance, 0.0), unknown)
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _begin(
     x: FloatArray, p: FloatArray, flag: FloatArray, row: FloatArray, model: FloatArray, shared: FloatArray
 ) -> None:
-    """Begin with the bin's reading; after a pause with the room, iron and lag found so far."""
+    """Begin with the bin's reading; after a pause with the iron, lag and axes found so far."""
     if flag[RAN] == 0.0:
         _forget(x, p, IRON, 3, model[IRON_PRIOR])
-        _forget(x, p, LEVEL_FIELD, 2, shared[ROOM])
         _forget(x, p, OF_LAG, 1, shared[LAG_S])
-        x[LEVEL_FIELD], x[DOWN_FIELD] = math.hypot(row[READING], row[READING + 1]), row[READING + 2]
-    _forget(x, p, TURN, 1, math.pi)
+    _forget(x, p, OF_ROOM, 3, shared[ROOM])
     _forget(x, p, GYRO_BIAS, 3, math.sqrt(row[BIAS_VARIANCE]))
     _forget(x, p, OF_PLACE, 3, shared[FIRST_PLACE] if flag[RAN] == 0.0 else shared[PLACE])
     _forget(x, p, OF_STRAY, 3, model[STRAY])
-    across, along = row[READING], row[READING + 1]
     for i in range(3):
-        across -= row[POSE + i] * x[IRON + i]
-        along -= row[POSE + 3 + i] * x[IRON + i]
-    x[TURN] = -math.atan2(along, across)
+        x[OF_ROOM + i] = row[READING + i]
+        for j in range(3):
+            x[OF_ROOM + i] -= row[POSE + 3 * i + j] * x[IRON + j]
     flag[BEGUN] = flag[RAN] = 1.0
     flag[RESTED], flag[HOLDING] = row[RESTS], 0.0
 
@@ -175,26 +182,49 @@ def _predict(
         x[GYRO_BIAS + i] -= row[BIAS_CHANGE + i]
     _decay(x, p, GYRO_BIAS, math.exp(-span / shared[BIAS_S]), row[BIAS_VARIANCE])
     if resting:
-        p[TURN, TURN] += shared[REST_GYRO] ** 2 * span
+        _slip(x, p, shared[REST_GYRO] ** 2 * span)
     else:
-        for i in range(3):
-            factor = -row[POSE + 6 + i] * span
-            x[TURN] += factor * x[GYRO_BIAS + i]
-            for j in range(STATES):
-                p[TURN, j] += factor * p[GYRO_BIAS + i, j]
-        for j in range(STATES):
-            total = p[j, TURN]
-            for i in range(3):
-                total -= row[POSE + 6 + i] * span * p[j, GYRO_BIAS + i]
-            p[j, TURN] = total
-        p[TURN, TURN] += (shared[GYRO] ** 2 + shared[GYRO_SCALE] ** 2 * row[TURNING]) * span
+        _turn(x, p, row)
+        _slip(x, p, (shared[GYRO] ** 2 + shared[GYRO_SCALE] ** 2 * row[TURNING]) * span)
         _decay(x, p, OF_STRAY, math.exp(-span / model[STRAY_S]), model[STRAY] ** 2)
-    for i in range(2):
-        p[LEVEL_FIELD + i, LEVEL_FIELD + i] += shared[ROOM_WALK] ** 2 * span
+    for i in range(OF_ROOM, OF_ROOM + 3):
+        p[i, i] += shared[ROOM_WALK] ** 2 * span
     if flag[HOLDING] > 0.0:
         flag[HOLDING] -= span
         for i in range(IRON, IRON + 3):
             p[i, i] += model[IRON_JUMP] ** 2
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _turn(x: FloatArray, p: FloatArray, row: FloatArray) -> None:
+    """Turn the room's field as the gyroscope's bias turns the level axes."""
+    angle = 0.0
+    across, along = x[OF_ROOM], x[OF_ROOM + 1]
+    for i in range(3):
+        rate = row[POSE + 6 + i] * row[SPAN]
+        angle += rate * x[GYRO_BIAS + i]
+        for j in range(STATES):
+            p[OF_ROOM, j] -= rate * along * p[GYRO_BIAS + i, j]
+            p[OF_ROOM + 1, j] += rate * across * p[GYRO_BIAS + i, j]
+    for j in range(STATES):
+        less = more = 0.0
+        for i in range(3):
+            less += row[POSE + 6 + i] * row[SPAN] * p[j, GYRO_BIAS + i]
+        more = across * less
+        p[j, OF_ROOM] -= along * less
+        p[j, OF_ROOM + 1] += more
+    x[OF_ROOM] -= angle * along
+    x[OF_ROOM + 1] += angle * across
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _slip(x: FloatArray, p: FloatArray, variance: float) -> None:
+    """Let the level axes slip about up by as much, rad^2."""
+    across, along = x[OF_ROOM], x[OF_ROOM + 1]
+    p[OF_ROOM, OF_ROOM] += variance * along * along
+    p[OF_ROOM + 1, OF_ROOM + 1] += variance * across * across
+    p[OF_ROOM, OF_ROOM + 1] -= variance * across * along
+    p[OF_ROOM + 1, OF_ROOM] -= variance * across * along
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -206,29 +236,22 @@ def _iron_changes(p: FloatArray, flag: FloatArray, model: FloatArray, shared: Fl
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _expect(x: FloatArray, row: FloatArray, shared: FloatArray, rows: FloatArray, off: FloatArray) -> None:
-    """Fill the derivatives of the field in the world's axes, and how far it is from that expected."""
-    c, s = math.cos(x[TURN]), math.sin(x[TURN])
+def _expect(x: FloatArray, row: FloatArray, rows: FloatArray, off: FloatArray) -> None:
+    """Fill the derivatives of the field in the level axes, and how far it is from that expected.
+
+    Of fields only that of the room is turned by errors of the heading: place and stray have random directions,
+    and turned they are as likely; a linear filter would take their turns for knowledge of the heading.
+    """
     for i in range(3):
-        off[i] = row[READING + i] - row[LATE + i] * x[OF_LAG]
-        for j in range(3):
-            off[i] -= row[POSE + 3 * i + j] * x[IRON + j]
         for j in range(STATES):
             rows[i, j] = 0.0
-        rows[i, OF_PLACE + i] = rows[i, OF_STRAY + i] = 1.0
-    across, along = c * off[0] - s * off[1], s * off[0] + c * off[1]
-    off[0] = across - x[LEVEL_FIELD] - x[OF_PLACE] - x[OF_STRAY]
-    off[1] = along - x[OF_PLACE + 1] - x[OF_STRAY + 1]
-    off[2] -= x[DOWN_FIELD] + x[OF_PLACE + 2] + x[OF_STRAY + 2]
-    if abs(x[LEVEL_FIELD]) > shared[STEEPEST]:
-        rows[0, TURN], rows[1, TURN] = along, -across
-    for j in range(4):
-        to = IRON + j if j < 3 else OF_LAG
-        at, stride = (POSE + j, 3) if j < 3 else (LATE, 1)
-        east, north = row[at], row[at + stride]
-        rows[0, to], rows[1, to] = c * east - s * north, s * east + c * north
-        rows[2, to] = row[at + 2 * stride]
-    rows[0, LEVEL_FIELD] = rows[2, DOWN_FIELD] = 1.0
+        rows[i, OF_ROOM + i] = rows[i, OF_PLACE + i] = rows[i, OF_STRAY + i] = 1.0
+        rows[i, OF_LAG] = row[LATE + i]
+        for j in range(3):
+            rows[i, IRON + j] = row[POSE + 3 * i + j]
+        off[i] = row[READING + i]
+        for j in range(STATES):
+            off[i] -= rows[i, j] * x[j]
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

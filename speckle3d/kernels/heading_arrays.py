@@ -19,17 +19,17 @@ sensor must have moved before the field is used."""
 # -- what all models share
 
 PLACE, FIRST_PLACE, WHITE, GYRO, GYRO_SCALE, BIAS_S, ROOM, ROOM_WALK, REST_GYRO = 0, 1, 2, 3, 4, 5, 6, 7, 8
-FREEDOM, LAG_S, OUTLIER, HOLD_S, STEEPEST = 9, 10, 11, 12, 13
-SHARED = 14
+FREEDOM, LAG_S, OUTLIER, HOLD_S = 9, 10, 11, 12
+SHARED = 13
 """See `xsens.fusion.heading`."""
 
 # -- state of a model's filter
 
-TURN, GYRO_BIAS, IRON, LEVEL_FIELD, DOWN_FIELD, OF_PLACE, OF_STRAY, OF_LAG = 0, 1, 4, 7, 8, 9, 12, 15
+OF_ROOM, GYRO_BIAS, IRON, OF_PLACE, OF_STRAY, OF_LAG = 0, 3, 6, 9, 12, 15
 STATES = 16
-"""Angle from the level axes to north; what is left of the gyroscope's bias (sensor axes); the field of iron
-(sensor axes); the room's field, horizontal and upward; what the place adds to it, and the stray (world axes);
-the magnetometer's lag, s."""
+"""The room's field (level axes); what is left of the gyroscope's bias (sensor axes); the field of iron (sensor
+axes); what the place adds to the room's, and the stray (level axes); the magnetometer's lag, s. All fields are
+fractions of the first reading's norm."""
 
 BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
 FLAGS = 5
@@ -40,4 +40,5 @@ still being put on, s; how long the sensor has moved in this stretch, s."""
 
 FOUND_TURN, FOUND_VARIANCE, EVIDENCE, TRUST = 0, 1, 2, 3
 FOUND = 4
-"""Angle and its variance; logarithm of the reading's density, NaN where there is none; its weight, 0 to 1."""
+"""Angle from the level axes to north, and its variance; logarithm of the reading's density, NaN where there is
+none; its weight, 0 to 1."""

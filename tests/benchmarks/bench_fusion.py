@@ -50,9 +50,9 @@ SINGLY = 5000
 """Samples that are given one by one."""
 
 GRID = {
-    "field_sd_rad": (0.5, 1.0, 2.0),
-    "field_place_s": (0.5, 1.0, 2.0),
-    "field_noise_rad_sqrt_s": (1.0, 2.0),
+    "field_place": (0.5, 1.0, 2.0),
+    "field_first_place": (1.0, 2.0, 4.0),
+    "moving_bias_rad_s": (0.5, 1.0, 2.0),
 }
 """Candidates of --leave-one-out: the settings with each of these fields times each factor."""
 

@@ -30,7 +30,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels import heading_arrays as at
-from speckle3d.kernels.heading import find_headings
+from speckle3d.kernels.heading import find_headings, turn_to_north
 from xsens.fusion.settings import FusionSettings
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class FieldModel:
     """
 
     stray: float
-    stray_s: float = 1.5
+    stray_s: float = 2.0
     iron: float = 0.0003
     iron_put_on: float = 0.0
     after_s: float = 0.0
@@ -70,21 +70,24 @@ class FieldModel:
 
 MODELS = (
     *(FieldModel(stray) for stray in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
-    *(FieldModel(stray, stray_s=8.0) for stray in (0.02, 0.05, 0.12)),
-    *(FieldModel(stray, after_s=3.0, handicap=300.0) for stray in (0.01, 0.03, 0.1)),
+    *(FieldModel(stray, stray_s=8.0, handicap=100.0) for stray in (0.02, 0.05, 0.12, 0.3)),
+    *(FieldModel(stray, after_s=after_s, handicap=300.0) for stray in (0.01, 0.03) for after_s in (3.0, 10.0)),
+    *(FieldModel(0.1, stray_s=8.0, after_s=after_s, handicap=300.0) for after_s in (3.0, 10.0)),
     *(
-        FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=300.0)
+        FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=500.0)
         for stray in (0.005, 0.01, 0.02, 0.04, 0.08)
     ),
+    *(FieldModel(stray, iron=0.7, iron_put_on=0.15, handicap=500.0) for stray in (0.01, 0.03, 0.08)),
 )
-"""Rooms from a quiet one to a workshop. Iron on the sensor must be proved: a sensor that is turned while it
-is carried through an uneven field shows nearly the same."""
+"""Rooms from a quiet one to a workshop; those that are walked through; a start beside iron; iron put on the
+sensor; and iron on it from the start. The later ones must be proved: a sensor that is turned while it is carried
+through an uneven field shows nearly the same as one with iron on it."""
 
 BIAS_S = 20.0
 """How long what is left of the gyroscope's bias persists."""
 
-ROOM = 0.05
-"""Deviation of the room's field from its first reading, as a fraction."""
+ROOM = 1.0
+"""Deviation of the room's field from its first reading, as a fraction: nothing is known of it."""
 
 ROOM_WALK_SQRT_S = 0.0003
 """Its random walk: 1 % in twenty minutes."""
@@ -100,9 +103,6 @@ OUTLIER = 25.0
 
 HOLD_S = 3.0
 """How long putting it on takes."""
-
-STEEPEST = 0.05
-"""A field with a smaller horizontal fraction shows no heading: iron in the room turns it to any side."""
 
 MEMORY_S = 100.0
 """Time over which models are weighed while samples arrive; a recording is weighed as a whole."""
@@ -261,7 +261,7 @@ class HeadingBank:
             self._norm = float(np.linalg.norm(first))
         if self._norm > 0.0:
             rows[:, at.READING : at.READING + 3] /= self._norm
-            rows[:, at.LATE : at.LATE + 3] /= self._norm
+            rows[:, at.LATE :] /= self._norm
         found = np.empty((len(rows), len(self.models), at.FOUND))
         wide = (0, len(self.models), at.STATES, at.STATES)
         into = kept or (np.empty(wide[:3]), np.empty(wide), np.empty(wide))
@@ -317,7 +317,6 @@ def _shared(s: FusionSettings) -> FloatArray:
         (at.LAG_S, s.magnetometer_lag_s),
         (at.OUTLIER, OUTLIER),
         (at.HOLD_S, HOLD_S),
-        (at.STEEPEST, STEEPEST),
     ):
         shared[place] = value
     return shared
@@ -352,14 +351,14 @@ def _backward(
     """Angle and variance of one model, smoothed."""
     from filterpy.kalman import KalmanFilter
 
-    first = int(np.argmax(after[:, at.TURN, at.TURN] > 0.0))
-    rows = bins[first:]
-    steps = _transitions(rows, model)
+    first = int(np.argmax(after[:, at.OF_ROOM, at.OF_ROOM] > 0.0))
+    steps = _transitions(bins[first:], model, states[first:])
     noise = before[first:] + _ROUNDING * np.eye(at.STATES)
     noise[1:] -= steps[1:] @ after[first:-1] @ np.swapaxes(steps[1:], 1, 2)
     smoother = KalmanFilter(dim_x=at.STATES, dim_z=3)
     means, covariances, _, _ = smoother.rts_smoother(states[first:], after[first:], steps, noise)
-    turn, variance = means[:, at.TURN], covariances[:, at.TURN, at.TURN]
+    found = np.array([turn_to_north(x, p) for x, p in zip(means, covariances, strict=True)])
+    turn, variance = np.unwrap(found[:, 0]), found[:, 1]
     early = bins[1 : first + 1]  # the field was not used yet: back by the gyroscope
     moving = early[:, at.RESTS] == 0.0
     up = early[:, at.POSE + 6 : at.POSE + 9]
@@ -371,16 +370,19 @@ def _backward(
     return turn, variance
 
 
-def _transitions(rows: FloatArray, model: FieldModel) -> FloatArray:
+def _transitions(rows: FloatArray, model: FieldModel, states: FloatArray) -> FloatArray:
     """Transition to each bin from the one before, shape (n, STATES, STATES)."""
     steps = np.tile(np.eye(at.STATES), (len(rows), 1, 1))
     span, moving = rows[:, at.SPAN], rows[:, at.RESTS] == 0.0
     keep = np.exp(-span / BIAS_S)
     fade = np.where(moving, np.exp(-span / model.stray_s), 1.0)
     stays = np.concatenate([[1.0], rows[1:, at.RESTS] == rows[:-1, at.RESTS]])
+    across, along = np.vstack([states[:1], states[:-1]])[:, at.OF_ROOM : at.OF_ROOM + 2].T
     for i in range(3):
+        rate = rows[:, at.POSE + 6 + i] * span * keep * moving
         steps[:, at.GYRO_BIAS + i, at.GYRO_BIAS + i] = keep
-        steps[:, at.TURN, at.GYRO_BIAS + i] = -rows[:, at.POSE + 6 + i] * span * keep * moving
+        steps[:, at.OF_ROOM, at.GYRO_BIAS + i] = -rate * along
+        steps[:, at.OF_ROOM + 1, at.GYRO_BIAS + i] = rate * across
         steps[:, at.OF_STRAY + i, at.OF_STRAY + i] = fade
         steps[:, at.OF_PLACE + i, at.OF_PLACE + i] = stays
     return steps

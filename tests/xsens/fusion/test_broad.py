@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from broad import OFFLINE, ONLINE, Estimate, coverage, errors_deg, errors_rad, estimate, read_trial, trials_in
+from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
 GAIN = 0.9
@@ -50,6 +51,11 @@ def errors_of(folder, method):
     return np.array([[error for error, _ in scores(folder, name)[method]] for name in trials_in(folder)])
 
 
+def coverages(folder, name, method):
+    """Coverage as BROAD counts and without a constant heading."""
+    return [covered for _, covered in scores(folder, name)[method]]
+
+
 def ratios(folder, name, methods):
     theirs, ours = ([error for error, _ in scores(folder, name)[method]] for method in methods)
     return np.divide(ours, theirs)
@@ -82,19 +88,25 @@ def test_no_trial_is_much_worse_than_with_vqf(folder, methods):
 @kinds
 @pytest.mark.parametrize("part", ["heading", "inclination"])
 def test_claimed_sigma_fits_the_errors(folder, methods, part):
-    # Heading without its constant, for the cameras' north is not the magnet's; inclination is the same.
-    held = [scores(folder, name)[methods[1]][1][1] for name in trials_in(folder)]
-    share = np.mean([getattr(each, f"{part}_share") for each in held])
+    # Heading as BROAD counts it: sigma is about north, and the cameras' is the field's at rest, to one degree
+    # in most trials. Without a constant heading, errors are less and sigma is still that of north.
+    counted, steady = zip(*(coverages(folder, name, methods[1]) for name in trials_in(folder)), strict=True)
+    share, least = (np.mean([getattr(each, f"{part}_share") for each in held]) for held in (counted, steady))
     assert SHARES[0] <= share <= SHARES[1]
-    assert max(getattr(each, f"{part}_ratio") for each in held) <= WIDEST
+    assert max(getattr(each, f"{part}_ratio") for each in counted) <= WIDEST
+    assert least >= SHARES[0]
 
 
 @pytest.mark.realdata
 @pytest.mark.slow
 @kinds
-def test_claimed_sigma_of_heading_spans_a_rooms_norths_too(folder, methods):
-    held = [scores(folder, name)[methods[1]][0][1] for name in trials_in(folder)]
-    assert max(each.heading_ratio for each in held) <= WIDEST
+@pytest.mark.parametrize("name", ["15_undisturbed_fast_translation_A", "28_disturbed_stationary_magnet_A"])
+def test_a_recording_that_begins_in_movement_is_no_worse_than_with_vqf(folder, methods, name):
+    begun = scene(recorded(folder, name), "cut", 15.0, None)
+    theirs, ours = (
+        errors_deg(estimate(begun.log, method).wxyz, begun.true_wxyz, begun.moving)[0] for method in methods
+    )
+    assert ours <= WORSE * theirs
 
 
 # -- the scores themselves

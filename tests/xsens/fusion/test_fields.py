@@ -29,6 +29,7 @@ KINDS = [
     ("spikes", 100.0),
     ("truncated", 0.25),
     ("scale", 0.01),
+    ("cut", 10.0),
 ]
 
 
