@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from speckle3d.core.streams import TimedRotations
-    from xsens.accuracy.angles import PairErrors
 
 
 @imu.command("accuracy")
@@ -69,24 +68,30 @@ def imu_accuracy(
     as_json: Json = False,
 ) -> None:
     """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2)."""
+    from scipy.spatial.transform import Rotation
+
     from speckle3d.io.calibrations import read_calibration
-    from xsens.accuracy.angles import AccuracyTable
+    from xsens.accuracy.angles import AccuracyTable, pair_errors
+    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
 
     if (reference is None) == (optical is None):
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
     require_finite_offset(time_offset_s)
     log = read(log_file, rate_hz, world)
     tell(log)
-    mountings: list[Rotation] = [read_calibration(path).rotation for path in calibrations or ()]
-    if not mountings:
+    mountings = Rotation.identity(1)
+    if calibrations:
+        mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibrations])
+    else:
         note("no --calibration: the sensor's axes are taken for the image's")
     with naming(str(log_file)):
         rotations, _ = orientation_of(log, method, magnetometer)
         if reference is not None:
-            errors = _beside_mechanism(rotations, reference, turns, mountings)
-        else:
-            assert optical is not None
-            errors = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+            settings = read_mechanism_csv(reference, turns)
+            measured, right = readings_at(rotations, settings), settings.base_from_image
+        elif optical is not None:
+            measured, right = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+        errors = pair_errors(measured, right, mountings)
     table = AccuracyTable.of({log_file.stem: errors})
     if figure is not None:
         from speckle3d.study.figures import save_figure
@@ -97,42 +102,21 @@ def imu_accuracy(
         emit_rows(table.values(), as_json)
         return
     emit(table.text())
-    emit(
-        f"{len(errors)} errors: pairs of {errors.frames} orientations, {max(len(mountings), 1)} calibrations"
-    )
-
-
-def _beside_mechanism(
-    rotations: TimedRotations, reference: Path, turns: str, mountings: list[Rotation]
-) -> PairErrors:
-    from scipy.spatial.transform import Rotation
-
-    from xsens.accuracy.angles import pair_errors
-    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
-
-    settings = read_mechanism_csv(reference, turns)
-    readings = readings_at(rotations, settings)
-    return pair_errors(readings, settings.base_from_image, mountings or Rotation.identity())
+    emit(f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations")
 
 
 def _beside_tracker(
-    rotations: TimedRotations,
-    optical: Path,
-    time_offset_s: float,
-    fit_mounting: bool,
-    mountings: list[Rotation],
-) -> PairErrors:
-    from scipy.spatial.transform import Rotation
-
-    from xsens.accuracy.angles import common_readings, mounting_from_motion, pair_errors
+    rotations: TimedRotations, optical: Path, time_offset_s: float, fit_mounting: bool, mountings: Rotation
+) -> tuple[Rotation, Rotation]:
+    """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
+    from xsens.accuracy.angles import common_readings, mounting_from_motion
 
     measured, target = common_readings(rotations, _tracked(optical), time_offset_s)
-    mounted = Rotation.identity()
-    if fit_mounting:
-        one = Rotation.concatenate(mountings).mean() if mountings else Rotation.identity()
-        mounted = mounting_from_motion(measured * one, target)
-        note("the target's mounting is found from the motion: constant errors of calibration do not show")
-    return pair_errors(measured, target * mounted, mountings or Rotation.identity())
+    if not fit_mounting:
+        return measured, target
+    mounting = mounting_from_motion(measured * mountings.mean(), target)
+    note("the target's mounting is found from the motion: constant errors of calibration do not show")
+    return measured, target * mounting
 
 
 def _tracked(path: Path) -> TimedRotations:

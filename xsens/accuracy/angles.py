@@ -12,7 +12,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,9 +114,7 @@ def _statistics(error_rad: FloatArray) -> dict[str, FloatArray]:
 
 
 def pair_errors(
-    world_from_sensor: Rotation,
-    reference_from_image: Rotation,
-    sensor_from_image: Rotation | Sequence[Rotation],
+    world_from_sensor: Rotation, reference_from_image: Rotation, sensor_from_image: Rotation
 ) -> PairErrors:
     """Compare the angles between all pairs of frames, with every calibration.
 
@@ -129,7 +127,7 @@ def pair_errors(
         The sensor's reading for each frame.
     reference_from_image : Rotation, length n
         The reference's orientation of the same frames, in any world at rest.
-    sensor_from_image : Rotation, single or length k, or sequence of k single Rotations
+    sensor_from_image : Rotation, single or length k
         Calibrations of the sensor.
 
     Raises
@@ -153,10 +151,9 @@ def pair_errors(
     >>> round(float(tilt), 6)
     0.5
     """
-    alone = isinstance(sensor_from_image, Rotation) and sensor_from_image.single
-    if not alone and not len(sensor_from_image):
+    matrices = sensor_from_image.as_matrix().reshape(-1, 3, 3)
+    if not len(matrices):
         raise InsufficientDataError("sensor_from_image: expected at least one calibration, got none")
-    matrices = Rotation.concatenate(sensor_from_image).as_matrix().reshape(-1, 3, 3)
     turns, reference = _turns(world_from_sensor, reference_from_image, len(matrices))
     # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T in the image's axes, so that
     # each pair's rotation vector is computed once for all calibrations.

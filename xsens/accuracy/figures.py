@@ -6,7 +6,7 @@ Drawn without pyplot: no window system, no global state. Only this module of the
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,17 +31,11 @@ _SHORTEST = 0.75
 _COLOURS = {"roll": "#009E73", "yaw": "#D55E00", "tilt": "#0072B2"}
 
 
-@dataclass(frozen=True)
-class Turn:
+class Turn(NamedTuple):
     """Frames that differ in one angle only, in the order of that angle.
 
-    Attributes
-    ----------
-    experiment, angle : str
-    reference_rad : ndarray, shape (m,)
-        Angle from the first frame; it starts at zero and grows.
-    error_rad : ndarray, shape (k, m)
-        Of the angle measured with every calibration.
+    The reference's angle from the first frame, shape (m,), starts at zero and grows; errors of the angle
+    measured with every calibration have shape (k, m).
     """
 
     experiment: str

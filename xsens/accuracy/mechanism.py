@@ -22,8 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import require_finite
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.logs.read import read_bounded
 
@@ -50,25 +49,6 @@ class MechanismSettings:
     base_from_image: Rotation
     time_s: FloatArray | None = None
     until_s: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        for name, times in (("time_s", self.time_s), ("until_s", self.until_s)):
-            if times is not None:
-                require_finite(times, name)
-                if times.shape != (len(self),):
-                    raise MismatchError(f"{name}: expected {len(self)} times, got shape {times.shape}")
-        if self.until_s is None:
-            return
-        if self.time_s is None:
-            raise InvalidInputError("until_s: expected time_s beside it, got none")
-        for bad in np.flatnonzero(self.until_s < self.time_s):
-            came, rest = self.until_s[bad], self.time_s[bad]
-            raise InvalidInputError(
-                f"until_s[{bad}]: expected no less than time_s, {rest:g} s, got {came:g} s"
-            )
-
-    def __len__(self) -> int:
-        return len(self.base_from_image)
 
 
 def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, tilt") -> MechanismSettings:
@@ -97,8 +77,12 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
     order = "".join(_AXIS[name] for name in sequence)
     rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
-    with naming(str(path)):
-        return MechanismSettings(rotation, table.get("time_s"), table.get("until_s"))
+    start_s, end_s = table.get("time_s"), table.get("until_s")
+    if start_s is not None and end_s is not None and (less := end_s < start_s).any():
+        k = less.argmax()
+        expected = f"expected until_s no less than time_s, {start_s[k]:g} s"
+        raise InvalidInputError(f"{path}: setting {k + 1}: {expected}, got {end_s[k]:g} s")
+    return MechanismSettings(rotation, start_s, end_s)
 
 
 def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
@@ -110,21 +94,20 @@ def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation
         If the sensor has no reading at the time of a setting, or the settings have no times and their number
         is not that of the readings.
     """
-    if settings.time_s is None:
-        if len(sensor) != len(settings):
+    start_s, count = settings.time_s, len(settings.base_from_image)
+    if start_s is None:
+        if len(sensor) != count:
             raise InsufficientDataError(
-                f"expected times with the {len(settings)} settings, or as many readings, got no times and "
+                f"expected times with the {count} settings, or as many readings, got no times and "
                 f"{len(sensor)} readings"
             )
         return sensor.world_from_sensor
-    if settings.until_s is None:
-        return sensor.at(settings.time_s)
-    bounds = np.searchsorted(sensor.time_s, [settings.time_s, settings.until_s]).T
-    middles = 0.5 * (settings.time_s + settings.until_s)
+    end_s = start_s if settings.until_s is None else settings.until_s
+    spans = zip(np.searchsorted(sensor.time_s, [start_s, end_s]).T, 0.5 * (start_s + end_s), strict=True)
     return Rotation.concatenate(
         [
-            sensor.world_from_sensor[low:high].mean() if high - low > 1 else sensor.at(middle)
-            for (low, high), middle in zip(bounds, middles, strict=True)
+            sensor.world_from_sensor[low:high].mean() if high - low > 1 else sensor.at(middle_s)
+            for (low, high), middle_s in spans
         ]
     )
 
@@ -156,9 +139,10 @@ def _names(cells: list[str], where: str) -> list[str]:
     # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
     words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in cells]
     names = [f"{word}_s" if word in ("time", "until") else word for word in words]
-    if len(set(names)) != len(names) or not {"tilt", "yaw"} <= set(names) <= set(_COLUMNS):
+    needed = {"tilt", "yaw", "time_s"} if "until_s" in names else {"tilt", "yaw"}
+    if len(set(names)) != len(names) or not needed <= set(names) <= set(_COLUMNS):
         raise InvalidInputError(
-            f"{where}: expected columns tilt and yaw, perhaps roll, time_s and until_s, "
+            f"{where}: expected columns tilt and yaw, perhaps roll, time_s and with it until_s, "
             f"got {', '.join(cells)[:80]}"
         )
     return names

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from xsens.messages.control import BASE_RATE_HZ, Configuration, MessageId, error_of
@@ -80,18 +80,8 @@ class DeviceSettings:
             raise InvalidInputError(f"rate_hz: expected 1 to 2000, got {self.rate_hz:g}")
 
 
-@dataclass(frozen=True)
-class DeviceInfo:
-    """Serial number and settings that the sensor reports after it has been configured.
-
-    Attributes
-    ----------
-    device_id : int
-    rate_hz : float
-        Samples per second; NaN if it does not report them.
-    header : tuple of Message
-        Configuration and calibration as the sensor sent them; a reader of its data needs them.
-    """
+class DeviceInfo(NamedTuple):
+    """Serial number, samples per second (NaN if not reported), and what a reader of the data needs."""
 
     device_id: int
     rate_hz: float
@@ -101,17 +91,8 @@ class DeviceInfo:
 class Device:
     """A sensor on an open port, which answers requests and sends data.
 
-    All methods raise `DeviceError` if the port is gone.
-
-    Parameters
-    ----------
-    port : serial.Serial
-        Open; closed with the device.
-
-    Attributes
-    ----------
-    tap : callable, optional
-        Called with all bytes that arrive, before they are decoded.
+    Whatever it is asked for, it raises `DeviceError` if the port is gone. `tap` is called with all bytes that
+    arrive, before they are decoded.
     """
 
     def __init__(self, port: Serial) -> None:
@@ -144,13 +125,7 @@ class Device:
             raise DeviceError(f"{self._port.name}: the port is gone: {_first_line(error)}") from error
 
     def request(self, mid: int, payload: bytes = b"", tries: int = _TRIES) -> Message:
-        """Send a request and wait for the answer; other messages that arrive meanwhile are ignored.
-
-        Raises
-        ------
-        DeviceError
-            If there is no answer after `tries`, or the answer is an error.
-        """
+        """Answer to a request; `DeviceError` if there is none after `tries`, or it is an error."""
         with self._there():
             while self._port.in_waiting:  # a late answer to an earlier request is not one to this
                 self.receive()
@@ -184,10 +159,9 @@ def connect(port_name: str, baud: int | None = None) -> Device:
 
     Raises
     ------
-    DeviceError
-        If the port cannot be opened, or no sensor answers at `baud`, or at any of the common rates.
     FileError
-        If pyserial is not installed.
+        If the port cannot be opened, no sensor answers at `baud` (by default, at any of the common rates), or
+        pyserial is not installed.
     """
     rates = COMMON_BAUD if baud is None else (baud,)
     for rate in rates:

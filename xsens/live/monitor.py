@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,8 +22,9 @@ from xsens.messages.framing import Framer, Message, encode
 if TYPE_CHECKING:
     from xsens.fusion.online import OnlineFilter
 
-RATE_OVER_S = 2.0
-"""Long against the 16 ms between two deliveries of an adapter, short enough for a display."""
+_SEEN = 9
+"""States over which the rate is taken: two seconds if they come four times a second, long against the 16 ms
+between two deliveries of an adapter."""
 
 NORM_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
 """A field that differs by more from the first second's is disturbed; defaults of VQF (Laidig and Seel,
@@ -35,6 +36,7 @@ REFERENCE_S = 1.0
 _MOST_PENDING = 1 << 14
 """Messages kept until the state is asked for, as many as eight seconds bring at most."""
 
+_NAN = float("nan")
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 
@@ -52,7 +54,7 @@ class LiveState:
     interruptions : int
         How often the connection was lost.
     rate_hz : float
-        Samples received per second over the last two seconds.
+        Samples received per second over the last eight states, or since measuring began.
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
@@ -105,32 +107,33 @@ class Monitor:
     def __init__(self) -> None:
         self._lock = Lock()
         self._since_s = time.monotonic()
-        self._connected, self._note = False, ""
-        self._samples = self._lost = self._interruptions = 0
+        self._now = LiveState(False, 0.0, 0, 0, 0, 0.0, None, _NAN, _NAN, "")
         self._field = _Field()
-        self._begin(DeviceInfo(0, float("nan"), ()))
+        self._begin(DeviceInfo(0, _NAN, ()))
 
     def _begin(self, info: DeviceInfo) -> None:
         self._header = b"".join(map(encode, info.header))
         self._hints = Hints(info.rate_hz if info.rate_hz > 0 else None, as_stated=True)
         self._framer, self._pending = Framer(), list[Message]()
-        self._arrivals = deque[tuple[float, int]](maxlen=1 << 12)
+        self._seen = deque([(time.monotonic(), self._now.samples)], maxlen=_SEEN)
         self._counter: int | None = None
-        self._attitude = _Attitude(1.0 / info.rate_hz if info.rate_hz > 0 else float("nan"))
+        self._attitude = _Attitude(1.0 / info.rate_hz if info.rate_hz > 0 else _NAN)
+
+    def _set(self, **changes: Any) -> None:
+        self._now = replace(self._now, **changes)
 
     def started(self, info: DeviceInfo) -> None:
         """Note that the sensor begins to measure; its counter may start anywhere."""
         with self._lock:
             self._digest()
             self._begin(info)
-            self._connected = True
+            self._set(connected=True)
 
     def arrived(self, received: bytes) -> None:
         """Take in received bytes, in pieces of any size."""
         with self._lock:
             data = [message for message in self._framer.feed(received) if message.mid in _DATA]
-            self._samples += len(data)
-            self._arrivals.append((time.monotonic(), self._samples))
+            self._set(samples=self._now.samples + len(data))
             self._pending += data
             if len(self._pending) > _MOST_PENDING:  # nobody has asked for a while
                 self._digest()
@@ -139,34 +142,19 @@ class Monitor:
         """Note that the connection is lost, or still is."""
         with self._lock:
             self._digest()
-            self._interruptions += self._connected
-            self._connected, self._note = False, reason
+            lost = self._now.interruptions + self._now.connected
+            self._set(connected=False, interruptions=lost, world_from_sensor=None, note=reason)
 
     def state(self) -> LiveState:
         """The state now."""
         with self._lock:
             self._digest()
-            return LiveState(
-                connected=self._connected,
-                elapsed_s=time.monotonic() - self._since_s,
-                samples=self._samples,
-                lost=self._lost,
-                interruptions=self._interruptions,
-                rate_hz=self._rate_hz() if self._connected else 0.0,
-                world_from_sensor=self._attitude.latest if self._connected else None,
-                field=self._field.ratio,
-                dip_change_rad=self._field.dip_change_rad,
-                note=self._note,
-            )
-
-    def _rate_hz(self) -> float:
-        """Samples after the oldest arrival that is kept, over the time since it."""
-        arrivals = self._arrivals
-        while len(arrivals) > 2 and arrivals[-1][0] - arrivals[0][0] > RATE_OVER_S:
-            arrivals.popleft()
-        first_s, before = arrivals[0] if arrivals else (0.0, 0)
-        span_s = time.monotonic() - first_s
-        return (self._samples - before) / span_s if len(arrivals) > 1 and span_s > 0 else 0.0
+            now_s = time.monotonic()
+            self._seen.append((now_s, self._now.samples))
+            first_s, first = self._seen[0]
+            span_s = now_s - first_s
+            rate_hz = (self._now.samples - first) / span_s if self._now.connected and span_s > 0 else 0.0
+            return replace(self._now, elapsed_s=now_s - self._since_s, rate_hz=rate_hz)
 
     def _digest(self) -> None:
         data, self._pending = b"".join(map(encode, self._pending)), []
@@ -175,77 +163,72 @@ class Monitor:
         try:
             log = parse_stream(self._header + data, self._hints)
         except Speckle3DError as error:
-            self._note = str(error)
+            self._set(note=str(error))
             return
         missing = 0
         if log.counter is not None:
             if self._counter is not None:
                 missing = int(log.counter[0] - self._counter - 1) % (1 << 16)
             self._counter = int(log.counter[-1])
-        self._lost += log.lost + missing
-        self._attitude.follow(log, missing)
-        self._field.follow(log)
-
-
-def _fresh_filter() -> OnlineFilter:
-    from xsens.fusion.online import OnlineFilter  # which loads numba
-
-    return OnlineFilter()
+        self._set(
+            lost=self._now.lost + log.lost + missing,
+            world_from_sensor=self._attitude.follow(log, missing),
+            **self._field.follow(log),
+        )
 
 
 class _Attitude:
     """Latest orientation: the sensor's own if it sends one, else the filter's."""
 
     def __init__(self, step_s: float) -> None:
-        self.latest: Rotation | None = None
-        self._filter = _fresh_filter()
+        self._filter: OnlineFilter | None = None
         self._step_s = step_s
 
-    def follow(self, log: ImuLog, missing: int) -> None:
+    def follow(self, log: ImuLog, missing: int) -> Rotation | None:
         """Take in some samples, with the number of those missing before them."""
         if log.world_from_sensor is not None and log.oriented.any():
-            self.latest = log.world_from_sensor[log.oriented][-1]
-            return
-        self.latest = None
+            return log.world_from_sensor[log.oriented][-1]
         steps = np.diff(log.time_s)
         if steps.size:
             self._step_s = float(np.median(steps))
         gyroscope, accelerometer = log.gyroscope_rad_s, log.accelerometer_m_s2
         if gyroscope is None or accelerometer is None or not np.isfinite(self._step_s):
-            return
+            return None
+        from xsens.fusion.online import OnlineFilter  # which loads numba
+
+        self._filter = self._filter or OnlineFilter()
         steps = np.append(self._step_s * (1 + missing), steps)
         try:
             self._filter.push(steps, gyroscope, accelerometer, log.magnetometer_au)
         except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts
-            self._filter = _fresh_filter()
-        if self._filter.state is not None:
-            self.latest = self._filter.state.world_from_sensor
+            self._filter = OnlineFilter()
+        state = self._filter.state
+        return None if state is None else state.world_from_sensor
 
 
 class _Field:
     """Norm of the magnetic field and its angle to the vertical, compared with those of the first second."""
 
     def __init__(self) -> None:
-        self.ratio = self.dip_change_rad = float("nan")
-        self._learnt_s = 0.0
         self._sum = np.zeros(3)
 
-    def follow(self, log: ImuLog) -> None:
-        """Take in some samples."""
+    def follow(self, log: ImuLog) -> dict[str, float]:
+        """Take in some samples; how the field is now, if they tell."""
         up = log.accelerometer_m_s2
         if log.world_from_sensor is not None and log.oriented.all():
             up = log.world_from_sensor.inv().apply([0.0, 0.0, 1.0])
         if log.magnetometer_au is None or up is None:
-            return
+            return {}
         norm, length = np.linalg.norm(log.magnetometer_au, axis=1), np.linalg.norm(up, axis=1)
         there = (norm > 0) & (length > 0)  # NaN is not
         if not there.any():
-            return
+            return {}
         sine = np.einsum("ij,ij->i", log.magnetometer_au[there], up[there]) / (norm * length)[there]
         norm, dip = norm[there], -np.arcsin(np.clip(sine, -1.0, 1.0))
-        if self._learnt_s < REFERENCE_S:
-            self._learnt_s += norm.size / log.rate_hz if len(log) > 1 else 0.0
+        if not self._sum[2] >= REFERENCE_S * log.rate_hz:  # whose rate is NaN if it is a single sample
             self._sum += [norm.sum(), dip.sum(), norm.size]
         usual_norm, usual_dip = self._sum[:2] / self._sum[2]
-        self.ratio = float(norm.mean() / usual_norm)
-        self.dip_change_rad = float(dip.mean() - usual_dip)
+        return {
+            "field": float(norm.mean() / usual_norm),
+            "dip_change_rad": float(dip.mean() - usual_dip),
+        }

@@ -12,11 +12,11 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.parts import cannot_write
-from xsens.live.device import Device, DeviceError, DeviceSettings, connect, prepare
+from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
 from xsens.live.monitor import LiveState, Monitor
 from xsens.messages.control import MessageId, utc_message
 from xsens.messages.framing import encode
@@ -33,16 +33,7 @@ RETRY_S = 0.1
 class RawFile:
     """A file to which bytes are appended, each piece handed to the operating system at once.
 
-    Parameters
-    ----------
-    path : path
-    append : bool
-        Continue an existing file instead of refusing it.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `append` is false, or it cannot be written.
+    Raises `FileError` if the file exists, unless told to `append`, or it cannot be written.
     """
 
     def __init__(self, path: PathLike, append: bool = False) -> None:
@@ -83,7 +74,7 @@ class Recorder:
         Name of the serial port.
     path : path
         New file, or an existing one to continue if `append`.
-    settings : DeviceSettings
+    settings : DeviceSettings, optional
     append : bool
 
     Raises
@@ -96,14 +87,13 @@ class Recorder:
         self, port: str, path: PathLike, settings: DeviceSettings | None = None, append: bool = False
     ) -> None:
         self._port, self._settings = port, settings or DeviceSettings()
-        device = connect(port, self._settings.baud)
+        self._baud, self._info = self._settings.baud, DeviceInfo(-1, float("nan"), ())
+        device = self._prepared()
         try:
-            self._info = prepare(device, self._settings)
             self._file = RawFile(path, append)
         except BaseException:
             device.close()
             raise
-        self._baud = device.baud
         self._monitor = Monitor()
         self._failure: Speckle3DError | None = None
         self._stop = threading.Event()
@@ -123,13 +113,7 @@ class Recorder:
         self._file.close()
 
     def state(self) -> LiveState:
-        """State of the recording, after writing all of it to the disk.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written any more.
-        """
+        """State, after writing all to the disk; raises `FileError` once the file cannot be written."""
         if self._failure is not None:
             raise self._failure
         if not (self._thread.is_alive() or self._stop.is_set()):
@@ -137,21 +121,41 @@ class Recorder:
         self._file.sync()
         return self._monitor.state()
 
+    def _prepared(self) -> Device:
+        """The sensor, ready to measure; always the same one."""
+        with naming(self._port), ExitStack() as undo:
+            device = connect(self._port, self._baud)
+            undo.callback(device.close)
+            info, before = prepare(device, self._settings), self._info.device_id
+            if before not in (-1, info.device_id):
+                raise DeviceError(f"{self._port}: expected sensor {before:08X}, got {info.device_id:08X}")
+            self._baud, self._info = device.baud, info
+            undo.pop_all()
+        return device
+
     def _record(self, device: Device | None) -> None:
         """Run in the thread: measure, and find the sensor again when it is lost, until told to stop."""
         try:
             while device is not None:
                 try:
-                    self._measure(device)
+                    with closing(device):
+                        self._measure(device)
                     break
                 except DeviceError as error:
                     self._monitor.interrupted(str(error))
-                    device = self._found_again(device)
+                    device = self._found_again()
         except Speckle3DError as error:
             self._failure = error
-        finally:
-            if device is not None:
-                device.close()
+
+    def _found_again(self) -> Device | None:
+        """The sensor, ready to measure; None if told to stop before it is found."""
+        while not self._stop.is_set():
+            try:
+                return self._prepared()
+            except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
+                self._monitor.interrupted(str(error))
+                self._stop.wait(RETRY_S)
+        return None
 
     def _measure(self, device: Device) -> None:
         self._file.append(b"".join(map(encode, (*self._info.header, utc_message()))))
@@ -176,26 +180,6 @@ class Recorder:
                 raise DeviceError(f"{self._port}: the sensor had no power for a moment")
             if time.monotonic() - heard > SILENCE_S:
                 raise DeviceError(f"{self._port}: the sensor has been silent for {SILENCE_S:g} s")
-
-    def _found_again(self, device: Device | None) -> Device | None:
-        """The same sensor, ready to measure; None if told to stop before it is found."""
-        while not self._stop.is_set():
-            try:
-                device = device or connect(self._port, self._baud)
-                device.request(MessageId.GO_TO_CONFIG, tries=1)
-                info, number = prepare(device, self._settings), self._info.device_id
-                if info.device_id == number:
-                    self._info = info
-                    return device
-                problem = f"{self._port}: expected sensor {number:08X}, got {info.device_id:08X}"
-            except (DeviceError, InvalidInputError) as error:  # and no others: a full disk stays full
-                problem = str(error)
-            self._monitor.interrupted(problem)
-            if device is not None:
-                device.close()
-            device = None
-            self._stop.wait(RETRY_S)
-        return None
 
 
 def record(

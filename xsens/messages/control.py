@@ -7,7 +7,6 @@ Measured data are in `xsens.messages.mtdata` (legacy) and `xsens.messages.mtdata
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 from typing import NamedTuple
@@ -81,17 +80,8 @@ _HEAD = struct.Struct(">4xHH88xH")
 _UNIT = struct.Struct(">6xHI8x")
 
 
-@dataclass(frozen=True)
-class Configuration:
-    """Answer to `MessageId.REQ_CONFIGURATION`.
-
-    Attributes
-    ----------
-    rate_hz : float
-        Messages per second; NaN if they are sent only on request.
-    units : tuple of UnitConfiguration
-        More than one behind a master.
-    """
+class Configuration(NamedTuple):
+    """Messages per second (NaN if they are sent only on request), and units: several behind a master."""
 
     rate_hz: float
     units: tuple[UnitConfiguration, ...]

@@ -25,7 +25,7 @@ MOST_PAYLOAD = 8192
 beyond it are damage, and waiting for so many bytes would stop a live stream."""
 
 _EXTENDED = 0xFF
-_BLOCK = 1 << 22
+_BLOCK = 1 << 20
 """Bytes scanned at a time, which bounds the memory that a file of nothing but FA takes."""
 
 
@@ -129,8 +129,7 @@ class Frames:
 
     def payloads(self) -> ByteArray:
         """Payloads as rows, shape (n, size); all must be as long as the first."""
-        size = int(self.payload_size[0]) if len(self) else 0
-        return rows_at(self.data, self.payload_start, size)
+        return rows_at(self.data, self.payload_start, int(self.payload_size[0]) if len(self) else 0)
 
     def message(self, index: int) -> Message:
         """The message at `index`."""

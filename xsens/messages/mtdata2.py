@@ -7,7 +7,7 @@ Items without a measurement or a time stamp, or of another length than they shou
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,8 +40,7 @@ def kind_of(identifier: int) -> Field | None:
 
 def name_of(identifier: int) -> str:
     """Name of an item; empty if it is not read."""
-    kind = kind_of(identifier)
-    return kind.name if kind else ""
+    return kind.name if (kind := kind_of(identifier)) else ""
 
 
 def world_of(identifier: int) -> str:
@@ -49,16 +48,8 @@ def world_of(identifier: int) -> str:
     return _WORLDS[(identifier >> 2) & 3]
 
 
-@dataclass(frozen=True)
-class Column:
-    """Numbers of one item from all messages that hold it.
-
-    Attributes
-    ----------
-    rows : ndarray of int, shape (n,)
-        Indices of the messages, rising.
-    values : ndarray, shape (n, count)
-    """
+class Column(NamedTuple):
+    """Numbers of one item, shape (n, count), and the rising indices of the n messages that hold it."""
 
     rows: IntArray
     values: FloatArray

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -25,8 +26,15 @@ NOT_COMPENSATED = (
     "nor the housing's alignment applied"
 )
 
-_ACCELEROMETER, _GYROSCOPE, _PERIOD, _OFFSETS, _GAINS, _MAGNETOMETER = 8, 26, 81, 87, 105, 132
-"""First bytes in the block."""
+_BLOCK = np.dtype(
+    {
+        "names": ("inertial", "period", "offsets", "gains", "magnetic"),
+        "formats": ((">i2", (2, 3, 3)), ">u2", (">u2", (3, 3)), ("u1", (3, 3, 3)), (">i2", (3, 3))),
+        "offsets": (8, 81, 87, 105, 132),
+        "itemsize": BLOCK_SIZE,
+    }
+)
+"""Misalignments of accelerometer and gyroscope, and of the magnetometer, over 2**14; gains over 2**8."""
 
 _ROWS = 2048
 """Rows converted at a time: they stay in the cache, and are too few for BLAS to wake a team of threads."""
@@ -70,25 +78,19 @@ class RawCalibration:
 
     @classmethod
     def from_message(cls, message: Message) -> RawCalibration:
-        """Decode an eMTS message.
-
-        Raises
-        ------
-        InvalidInputError
-            If it is another message, a block of another kind of sensor, or has impossible values.
-        """
+        """Decode an eMTS message; raises `InvalidInputError` at another one, or another kind of sensor's."""
         data = message.payload
         if message.mid != MessageId.EMTS or len(data) != BLOCK_SIZE:
             raise InvalidInputError(
                 f"calibration block: expected message {MessageId.EMTS:#04x} of {BLOCK_SIZE} bytes, "
                 f"got {message.mid:#04x} of {len(data)}"
             )
-        sensors = (_ACCELEROMETER, _GYROSCOPE, _MAGNETOMETER)
-        matrices = [np.frombuffer(data, ">i2", 9, at).reshape(3, 3) / 2.0**14 for at in sensors]
-        offsets = np.frombuffer(data, ">u2", 9, _OFFSETS).reshape(3, 3).astype(float)
-        gains = np.frombuffer(data, np.uint8, 27, _GAINS).reshape(3, 3, 3) @ [256.0, 1.0, 1.0 / 256.0]
+        block = np.frombuffer(data, _BLOCK)[0]
         return cls(
-            rate_of(int.from_bytes(data[_PERIOD : _PERIOD + 2], "big")), offsets, gains, np.stack(matrices)
+            rate_of(int(block["period"])),
+            block["offsets"].astype(float),
+            block["gains"] @ [256.0, 1.0, 1.0 / 256.0],
+            np.concatenate((block["inertial"], block["magnetic"][None])) / 2.0**14,
         )
 
     def to_units(self, counts: npt.ArrayLike) -> FloatArray:
@@ -103,11 +105,10 @@ class RawCalibration:
         -------
         ndarray, shape (3, n, 3)
         """
-        mixing = np.zeros((3, 3, 3, 3))
-        mixing[range(3), :, range(3)] = np.linalg.inv(self.misalignments) / self.gains[:, None]
+        mixing = block_diag(*np.linalg.inv(self.misalignments) / self.gains[:, None])
         rows = np.asarray(counts, dtype=float).reshape(-1, 9)
         values = np.empty(rows.shape)
         for at in range(0, len(rows), _ROWS):
             some = slice(at, at + _ROWS)
-            np.matmul(rows[some] - self.offsets.ravel(), mixing.reshape(9, 9).T, out=values[some])
+            np.matmul(rows[some] - self.offsets.ravel(), mixing.T, out=values[some])
         return np.moveaxis(values.reshape(-1, 3, 3), 1, 0)

@@ -79,13 +79,10 @@ class TestPairErrors:
         found = pair_errors(read, true, Rotation.identity())
         np.testing.assert_allclose(np.rad2deg(found.error_rad[0, 0]), [0.0, 0.4, 0.0], atol=1e-9)
 
-    def test_calibrations_come_as_one_rotation_as_many_or_as_a_list(self):
-        calibrations = some(2, 4)
-        sensor = some(7, 5)
+    def test_calibrations_come_as_one_rotation_or_as_many(self):
+        calibrations, sensor = some(2, 4), some(7, 5)
         together = pair_errors(sensor, grid()[:5], calibrations).error_rad
-        listed = pair_errors(sensor, grid()[:5], list(calibrations)).error_rad
         one = pair_errors(sensor, grid()[:5], calibrations[2]).error_rad
-        np.testing.assert_array_equal(together, listed)
         np.testing.assert_allclose(one[0], together[2], atol=1e-14)
 
     def test_the_papers_experiment_has_73150_pairs(self):
@@ -97,7 +94,6 @@ class TestPairErrors:
             (some(0, 3), some(1, 4), some(2, 1), MismatchError, "4 and 3"),
             (some(0, 1), some(1, 1), some(2, 1), InsufficientDataError, "got 1"),
             (some(0, 1)[0], some(1, 1)[0], some(2, 1), InsufficientDataError, "got 0"),
-            (some(0, 3), some(1, 3), [], InsufficientDataError, "sensor_from_image"),
             (some(0, 3), some(1, 3), some(2, 0), InsufficientDataError, "sensor_from_image"),
             (some(0, 3200), some(1, 3200), some(2, 1), InvalidInputError, "3200"),
         ],
@@ -231,10 +227,10 @@ class TestMechanism:
             ("tilt,yaw\n1,2\n\n1,2,3\n", ":4: .* 2 .*'1, 2, 3'"),
             ("tilt,yaw\n1,x\n", ":2: .*'1, x'"),
             ("tilt,yaw\n1,inf\n", ":2: .*'1, inf'"),
-            ("tilt,yaw,until_s\n1,2,3\n", "until_s: .*time_s"),
+            ("tilt,yaw,until_s\n1,2,3\n", ":1: .*time_s and with it until_s"),
             (
                 "tilt,yaw,time_s,until_s\n1,2,3,4\n1,2,5,4\n",
-                r"until_s\[1\].* 5 s.* 4 s",
+                r"setting 2: .* 5 s.* 4 s",
             ),
         ],
     )
@@ -253,7 +249,7 @@ class TestMechanism:
         path = tmp_path_factory.getbasetemp() / "any.csv"
         path.write_bytes(data)
         try:
-            assert len(read_mechanism_csv(path)) >= 1
+            assert len(read_mechanism_csv(path).base_from_image) >= 1
         except InvalidInputError as error:
             assert "\n" not in str(error)  # noqa: PT017
 
@@ -282,12 +278,6 @@ class TestMechanism:
         assert readings_at(sensor, MechanismSettings(grid())) is sensor.world_from_sensor
         with pytest.raises(InsufficientDataError, match=r"3 settings.*77 readings"):
             readings_at(sensor, MechanismSettings(grid()[:3]))
-
-    def test_times_are_checked(self):
-        with pytest.raises(MismatchError, match=r"time_s.*77"):
-            MechanismSettings(grid(), np.zeros(5))
-        with pytest.raises(InvalidInputError, match=r"time_s\[1\]"):
-            MechanismSettings(grid()[:2], np.array([0.0, np.nan]))
 
 
 class TestFigure:

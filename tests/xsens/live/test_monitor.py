@@ -77,12 +77,15 @@ class TestMonitor:
         state = monitor.state()
         assert (state.connected, state.lost, state.samples) == (True, 0, 25)
 
-    def test_the_rate_is_that_of_arrivals(self, monitor, monkeypatch):
-        clock = iter(np.arange(0.0, 100.0, 0.01))
-        monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
-        for index in range(0, 900, 3):
-            monitor.arrived(sent(range(index, index + 3)))
-        assert monitor.state().rate_hz == pytest.approx(300.0, rel=0.02)
+    def test_the_rate_is_that_of_the_last_states(self, monitor, monkeypatch):
+        now_s = 100.0
+        monkeypatch.setattr(time, "monotonic", lambda: now_s)
+        monitor.started(INFO)
+        for step, sent_now in enumerate([50] * 12 + [25] * 12):
+            now_s += 0.25
+            monitor.arrived(sent(range(50 * step, 50 * step + sent_now)))
+            rate_hz = monitor.state().rate_hz
+            assert rate_hz == (200.0 if step < 12 else pytest.approx(max(100.0, 200.0 - 12.5 * (step - 11))))
 
     def test_shows_the_sensors_own_orientation(self, monitor):
         monitor.arrived(sent(range(301)))
@@ -161,5 +164,4 @@ def test_readings_that_the_filter_refuses_do_not_end_the_display():
     )
     attitude = _Attitude(0.01)
     attitude.follow(ImuLog(time_s, up, turning), 0)
-    attitude.follow(ImuLog(time_s, up, still), 0)
-    assert attitude.latest.magnitude() < 1e-6
+    assert attitude.follow(ImuLog(time_s, up, still), 0).magnitude() < 1e-6

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import FileError
+from speckle3d.core.errors import FileError, InvalidInputError
 from xsens.live.device import DeviceError, DeviceSettings
 from xsens.live.recording import RawFile, Recorder, record
 from xsens.logs.read import read_log
@@ -179,6 +179,12 @@ class TestRecording:
             monkeypatch.setattr(RawFile, "append", full)
             with pytest.raises(FileError, match="No space left"):
                 wait_until(lambda: recorder.state() is None)
+
+    def test_an_answer_of_another_length_is_refused_by_the_ports_name(self, sensor, path, monkeypatch):
+        monkeypatch.setattr(sensor, "_configuration", lambda: b"odd")
+        with pytest.raises(InvalidInputError, match=r"port: configuration: .*got 3$"):
+            Recorder(str(sensor.path), path, FAST)
+        assert not path.exists()
 
     def test_without_a_sensor_there_is_no_file(self, tmp_path, path):
         with pytest.raises(DeviceError, match="none"):
