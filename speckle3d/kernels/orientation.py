@@ -293,7 +293,7 @@ def _speed_is_zero(
         for j in range(SIZE):
             work[SHOWS + i, j] = 1.0 if j == 6 + i else 0.0
         work[RESIDUAL, i] = -s[SPEED + i]
-    update(variance / step[DURATION], s, p, limits[HEADING_APART] > 0.0, work)
+    update(variance / step[DURATION], s, p, True, limits[HEADING_APART] > 0.0, work)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -307,4 +307,4 @@ def _rest_shows_bias(
         for j in range(SIZE):
             work[SHOWS + i, j] = 1.0 if j == 3 + i else 0.0
         work[RESIDUAL, i] = step[RATE + i] - s[BIAS + i]
-    update(limits[REST_BIAS_VARIANCE] / step[DURATION], s, p, limits[HEADING_APART] > 0.0, work)
+    update(limits[REST_BIAS_VARIANCE] / step[DURATION], s, p, False, limits[HEADING_APART] > 0.0, work)

@@ -62,10 +62,14 @@ def predict_covariance(
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def update(variance: float, s: FloatArray, p: FloatArray, heading_apart: bool, work: FloatArray) -> None:
+def update(
+    variance: float, s: FloatArray, p: FloatArray, by_speed: bool, heading_apart: bool, work: FloatArray
+) -> None:
     """Kalman's correction (Joseph's form) by the three residuals in `work`.
 
-    Where the heading is found elsewhere it is left alone, and its error counts as noise (Schmidt).
+    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor the
+    bias about up is corrected by it, and their errors count as noise (Schmidt); nor is a heading that is found
+    elsewhere by anything.
     """
     size = p.shape[0]  # not unrolled
     shows, cross, gain = work[SHOWS : SHOWS + 3], work[CROSS : CROSS + 3], work[GAIN : GAIN + 3]
@@ -87,9 +91,15 @@ def update(variance: float, s: FloatArray, p: FloatArray, heading_apart: bool, w
         for j in range(size):
             gain[r, j] = cross[r, j]
     solve_into(innovation, gain)
-    if heading_apart:
-        for r in range(3):
+    for r in range(3):
+        if by_speed or heading_apart:
             gain[r, 2] = 0.0
+        if by_speed:
+            about_up = 0.0
+            for i in range(3):
+                about_up += s[LEVEL + 6 + i] * gain[r, 3 + i]
+            for i in range(3):
+                gain[r, 3 + i] -= about_up * s[LEVEL + 6 + i]
     for i in range(size):
         for j in range(size):
             total = p[i, j]
