@@ -15,6 +15,7 @@ from speckle3d.kernels.heading_arrays import (
     BIAS_CHANGE,
     BIAS_S,
     BIAS_VARIANCE,
+    CORRECTION,
     EVIDENCE,
     FIRST_PLACE,
     FIRST_STRAY,
@@ -115,6 +116,8 @@ def find_headings(
                 kept_predicted[k, j] = p
             if row[SEEN] > 0.0:
                 _correct(x, p, shared, off, cross, gain, total, inverse, out)
+            for first in (OF_ROOM, OF_PLACE, OF_STRAY):
+                _follow_correction(x, p, row, first)
             out[FOUND_TURN], out[FOUND_VARIANCE] = turn_to_north(x, p)
             if keeps:
                 kept_means[k, j], kept[k, j] = x, p
@@ -203,6 +206,23 @@ def _predict(
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _follow_correction(x: FloatArray, p: FloatArray, row: FloatArray, first: int) -> None:
+    """Turn a field as the level axes were turned by corrections of their tilt: it stays where it was."""
+    turn = row[CORRECTION : CORRECTION + 9]
+    a, b, c = x[first], x[first + 1], x[first + 2]
+    for i in range(3):
+        x[first + i] = turn[3 * i] * a + turn[3 * i + 1] * b + turn[3 * i + 2] * c
+    for j in range(STATES):
+        a, b, c = p[first, j], p[first + 1, j], p[first + 2, j]
+        for i in range(3):
+            p[first + i, j] = turn[3 * i] * a + turn[3 * i + 1] * b + turn[3 * i + 2] * c
+    for j in range(STATES):
+        a, b, c = p[j, first], p[j, first + 1], p[j, first + 2]
+        for i in range(3):
+            p[j, first + i] = turn[3 * i] * a + turn[3 * i + 1] * b + turn[3 * i + 2] * c
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _turn(x: FloatArray, p: FloatArray, row: FloatArray) -> None:
     """Turn the room's field as the gyroscope's bias turns the level axes."""
     angle = 0.0
@@ -246,8 +266,8 @@ def _iron_changes(p: FloatArray, flag: FloatArray, model: FloatArray, shared: Fl
 def _expect(x: FloatArray, row: FloatArray, rows: FloatArray, off: FloatArray) -> None:
     """Fill the derivatives of the field in the level axes, and how far it is from that expected.
 
-    Of fields only that of the room is turned by errors of the heading: place and stray have random directions,
-    and turned they are as likely; a linear filter would take their turns for knowledge of the heading.
+    Of fields only that of the room is turned by errors of the heading: place and stray have random
+    directions, and turned they are as likely; a linear filter would take their turns for knowledge of it.
     """
     for i in range(3):
         for j in range(STATES):
@@ -282,7 +302,7 @@ def _spread(p: FloatArray, rows: FloatArray, cross: FloatArray, total: FloatArra
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _add_noise(x: FloatArray, row: FloatArray, shared: FloatArray, total: FloatArray) -> None:
-    """Add the noise of the reading, and what the error of the level axes, which persists, makes of the field."""
+    """Add the noise of the reading, and what the level axes' error, which persists, makes of the field."""
     white = shared[WHITE] * shared[WHITE] / row[SPAN]
     tilt = row[TILT] * max(shared[TILT_S] / row[SPAN], 1.0)
     across, along, up = x[OF_ROOM], x[OF_ROOM + 1], x[OF_ROOM + 2]

@@ -2,12 +2,13 @@
 
 # -- a bin: a quarter of a second of steps
 
-SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE, READING, POSE, LATE, TILT = 0, 1, 2, 3, 4, 5, 8, 11, 20, 23
-BIN = 24
+SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE = 0, 1, 2, 3, 4, 5
+READING, POSE, LATE, TILT, CORRECTION = 8, 11, 20, 23, 24
+BIN = 33
 """s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
-change (three); the mean field in the level axes, over its norm at the start (three); mean level axes
-from the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three); variance of the
-level axes' tilt, rad^2."""
+change (three); the mean field in the level axes, over its norm at the start (three); mean level axes from
+the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three); variance of the level
+axes' tilt, rad^2; turn by which they were corrected (nine)."""
 
 # -- a model of the field
 
@@ -28,9 +29,9 @@ SHARED = 16
 
 OF_ROOM, GYRO_BIAS, IRON, OF_PLACE, OF_STRAY, OF_LAG = 0, 3, 6, 9, 12, 15
 STATES = 16
-"""The room's field (level axes); what is left of the gyroscope's bias (sensor axes); the field of iron (sensor
-axes); what the place adds to the room's, and the stray (level axes); the magnetometer's lag, s. All fields are
-fractions of the first reading's norm."""
+"""The room's field (level axes); what is left of the gyroscope's bias (sensor axes); the field of iron
+(sensor axes); what the place adds to the room's, and the stray (level axes); the magnetometer's lag, s. All
+fields are fractions of the first reading's norm."""
 
 BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
 FLAGS = 5
@@ -41,5 +42,5 @@ still being put on, s; how long the sensor has moved in this stretch, s."""
 
 FOUND_TURN, FOUND_VARIANCE, EVIDENCE, TRUST = 0, 1, 2, 3
 FOUND = 4
-"""Angle from the level axes to north, and its variance; logarithm of the reading's density, NaN where there is
-none; its weight, 0 to 1."""
+"""Angle from the level axes to north, and its variance; logarithm of the reading's density, NaN where there
+is none; its weight, 0 to 1."""

@@ -26,6 +26,7 @@ from speckle3d.kernels.orientation_arrays import (
     BIAS_WALK,
     DEVIATION,
     DURATION,
+    FIRST_MOVING_S,
     FIRST_S,
     FORCE,
     GRAVITY,
@@ -278,7 +279,8 @@ def _begin(s: FloatArray, limits: FloatArray, step: FloatArray, up: FloatArray) 
     product_into(up, turn, s[LEVEL : LEVEL + 9])
     for i in range(3):
         s[SPEED + i] = 0.0
-    s[STARTING] = 0.0 if s[START_S] >= limits[FIRST_S] else 1.0
+    enough = limits[FIRST_S] if s[STILL] > 0.5 * limits[FIRST_S] else limits[FIRST_MOVING_S]
+    s[STARTING] = 0.0 if s[START_S] >= enough else 1.0
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

@@ -12,9 +12,10 @@ SIZE = 9
 GRAVITY, GYRO_NOISE, GYRO_SCALE_NOISE, BIAS_WALK, SPEED_VARIANCE, REST_SPEED_VARIANCE = 0, 1, 2, 3, 4, 5
 FORCE_NOISE, REST_NOISE, REST_BIAS_VARIANCE, FIRST_S = 6, 7, 8, 9
 STILL_RATE, STILL_FORCE, STILL_S, STILL_BIAS, REST_MEMORY_S, HEADING_APART = 10, 11, 12, 13, 14, 15
+FIRST_MOVING_S = 16
 """SI units; `HEADING_APART`: one if corrections leave the heading alone, which is found elsewhere."""
 
-LIMITS = 16
+LIMITS = 17
 
 # -- state of the filter, kept from one stretch to the next
 

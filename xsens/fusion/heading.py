@@ -71,7 +71,11 @@ class FieldModel:
 MODELS = (
     *(FieldModel(stray) for stray in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
     *(FieldModel(stray, stray_s=8.0, handicap=100.0) for stray in (0.02, 0.05, 0.12, 0.3)),
-    *(FieldModel(stray, after_s=after_s, handicap=300.0) for stray in (0.01, 0.03) for after_s in (3.0, 10.0)),
+    *(
+        FieldModel(stray, after_s=after_s, handicap=300.0)
+        for stray in (0.01, 0.03)
+        for after_s in (3.0, 10.0)
+    ),
     *(FieldModel(0.1, stray_s=8.0, after_s=after_s, handicap=300.0) for after_s in (3.0, 10.0)),
     *(
         FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=500.0)
@@ -80,8 +84,8 @@ MODELS = (
     *(FieldModel(stray, iron=0.7, iron_put_on=0.15, handicap=500.0) for stray in (0.01, 0.03, 0.08)),
 )
 """Rooms from a quiet one to a workshop; those that are walked through; a start beside iron; iron put on the
-sensor; and iron on it from the start. The later ones must be proved: a sensor that is turned while it is carried
-through an uneven field shows nearly the same as one with iron on it."""
+sensor; and iron on it from the start. The later ones must be proved: a sensor that is turned while it is
+carried through an uneven field shows nearly the same as one with iron on it."""
 
 BIAS_S = 20.0
 """How long what is left of the gyroscope's bias persists."""
@@ -155,6 +159,7 @@ def bins_of(
     bias_sd_rad_s: FloatArray,
     sd_rad: FloatArray,
     settings: FusionSettings,
+    corrected: bool = False,
 ) -> FloatArray:
     """Average the steps of each bin.
 
@@ -167,6 +172,9 @@ def bins_of(
         After each step.
     sd_rad : ndarray, shape (n, 3)
         Deviation of the level axes about the world's; the third is not used.
+    settings : FusionSettings
+    corrected : bool
+        Whether `level` is the filter's, which corrects its tilt as it goes.
 
     Returns
     -------
@@ -200,6 +208,13 @@ def bins_of(
     rows[:, at.READING : at.TILT] = sums / np.add.reduceat(weight, firsts)[:, None]
     tilt = (sd_rad[:, :2] ** 2).mean(axis=1)
     rows[:, at.TILT] = np.add.reduceat(tilt, firsts) / counts
+    turns = np.tile(np.eye(3), (len(firsts), 1, 1))
+    if corrected:
+        corrections = steps.matrix @ np.swapaxes(steps.predicted, 1, 2)
+        for i in range(steps_per_bin(settings)):
+            there = i < counts
+            turns[there] = corrections[firsts[there] + i] @ turns[there]
+    rows[:, at.CORRECTION : at.CORRECTION + 9] = turns.reshape(-1, 9)
     return rows
 
 

@@ -21,8 +21,8 @@ from xsens.fusion.settings import FusionSettings
 _CHUNK = 64
 """Blocks summed with one bias, about two seconds; its later change is corrected to first order."""
 
-START_S = 1.0
-"""Inclination at the start is that of the mean force over this time."""
+START_S, MOVING_START_S = 1.0, 3.0
+"""Inclination at the start is that of the mean force over this time, at rest and in movement."""
 
 REST_SPEED_M_S = 0.02
 REST_TIME_S = 0.5
@@ -105,6 +105,11 @@ class FilterSteps:
     def start_bias(self) -> FloatArray:
         """Shape (n, 3)."""
         return self._three(places.STEP_START_BIAS)
+
+    @property
+    def predicted(self) -> FloatArray:
+        """World from sensor after each increment, before its correction, shape (n, 3, 3)."""
+        return self.rows[:, places.PREDICTED : places.PREDICTED + 9].reshape(-1, 3, 3)
 
     @property
     def matrix(self) -> FloatArray:
@@ -225,6 +230,7 @@ def _limits(s: FusionSettings, heading_apart: bool) -> FloatArray:
         (places.REST_NOISE, REST_NOISE),
         (places.REST_BIAS_VARIANCE, REST_BIAS_RAD**2),
         (places.FIRST_S, START_S),
+        (places.FIRST_MOVING_S, MOVING_START_S),
         (places.STILL_RATE, s.rest_rate_rad_s),
         (places.STILL_FORCE, s.rest_force_m_s2),
         (places.STILL_S, s.rest_after_s),

@@ -188,9 +188,8 @@ class OnlineFilter:
         steps = joined(self._steps)
         self._steps = []
         if self._settings.use_magnetometer:
-            bins = bins_of(
-                steps, steps.start, steps.bias, steps.bias_sd_rad_s, steps.sd_rad, self._settings
-            )
+            bias_sd, settings = steps.bias_sd_rad_s, self._settings
+            bins = bins_of(steps, steps.start, steps.bias, bias_sd, steps.sd_rad, settings, corrected=True)
             found = self._bank.follow(bins, steps.bias[-1:])
             self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
             self._disturbed = bool(found.disturbed[0])

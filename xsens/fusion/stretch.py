@@ -31,7 +31,7 @@ class StretchFilter:
         if magnetic:
             if self._ran:
                 self._bank.resume()
-            bins = bins_of(steps, starts, steps.bias, steps.bias_sd_rad_s, sd, settings)
+            bins = bins_of(steps, starts, steps.bias, steps.bias_sd_rad_s, sd, settings, corrected=True)
             lasts = _lasts(steps, settings)
             found = self._bank.follow(bins, steps.bias[lasts])
             # A step turns by the heading of the last whole bin; those of the first bin by its own.
