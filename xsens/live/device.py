@@ -81,11 +81,15 @@ class DeviceSettings:
 
 
 class DeviceInfo(NamedTuple):
-    """Serial number, samples per second (NaN if not reported), and what a reader of the data needs."""
+    """Serial number, samples per second (NaN if not reported), and what a reader of the data needs.
+
+    `oriented` if the sensor is known to send its own orientation.
+    """
 
     device_id: int
     rate_hz: float
     header: tuple[Message, ...]
+    oriented: bool = False
 
 
 class Device:
@@ -206,9 +210,9 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
         If its configuration is not as documented.
     """
     number = int.from_bytes(device.request(MessageId.REQ_DID).payload[:4], "big")
-    outputs = device.ask(MessageId.OUTPUT_CONFIGURATION)
+    outputs, oriented = device.ask(MessageId.OUTPUT_CONFIGURATION), settings.content == "orientation"
     if outputs is None:
-        _set_legacy(device, settings)
+        oriented = _set_legacy(device, settings) and oriented
     elif settings.content != "as set":
         rate = round(settings.rate_hz or 100.0)
         items = [(item, rate) for item in _CONTENTS[settings.content][1]]
@@ -216,10 +220,12 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
         packed = b"".join(struct.pack(">HH", *item) for item in items)
         outputs = device.request(MessageId.OUTPUT_CONFIGURATION, packed)
     asked = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS), outputs)
-    return DeviceInfo(number, _rate_hz(*asked), tuple(message for message in asked if message is not None))
+    header = tuple(message for message in asked if message is not None)
+    return DeviceInfo(number, _rate_hz(*asked), header, oriented)
 
 
-def _set_legacy(device: Device, settings: DeviceSettings) -> None:
+def _set_legacy(device: Device, settings: DeviceSettings) -> bool:
+    """Set the rate, and the content unless it is an MT9-B, which has none; whether it has."""
     configuration = device.ask(MessageId.REQ_CONFIGURATION)
     units = () if configuration is None else Configuration.from_message(configuration).units
     mt9 = not units or units[0].output_mode & OutputMode.MT9
@@ -230,6 +236,7 @@ def _set_legacy(device: Device, settings: DeviceSettings) -> None:
         device.request(MessageId.SKIP_FACTOR, bytes(2))
     if settings.rate_hz is not None:
         device.request(MessageId.PERIOD, round(BASE_RATE_HZ / settings.rate_hz).to_bytes(2, "big"))
+    return not mt9
 
 
 def _rate_hz(configuration: Message | None, calibration: Message | None, outputs: Message | None) -> float:

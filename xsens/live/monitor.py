@@ -177,6 +177,14 @@ class Monitor:
         )
 
 
+def warm_up() -> None:
+    """Load the filter, or compile it, which would keep a recording from reading its port for too long."""
+    from xsens.fusion.online import OnlineFilter
+
+    still = (np.tile(vector, (150, 1)) for vector in ([0.0, 0.0, 0.0], [0.0, 0.0, 9.8], [0.4, 0.0, -0.9]))
+    OnlineFilter().push(np.full(150, 0.01), *still)
+
+
 class _Attitude:
     """Latest orientation: the sensor's own if it sends one, else the filter's."""
 

@@ -17,7 +17,7 @@ from contextlib import ExitStack, closing, suppress
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.parts import cannot_write
 from xsens.live.device import Device, DeviceError, DeviceInfo, DeviceSettings, connect, prepare
-from xsens.live.monitor import LiveState, Monitor
+from xsens.live.monitor import LiveState, Monitor, warm_up
 from xsens.messages.control import MessageId, utc_message
 from xsens.messages.framing import encode
 
@@ -90,6 +90,8 @@ class Recorder:
         self._baud, self._info = self._settings.baud, DeviceInfo(-1, float("nan"), ())
         device = self._prepared()
         try:
+            if not self._info.oriented:
+                warm_up()
             self._file = RawFile(path, append)
         except BaseException:
             device.close()
@@ -173,12 +175,13 @@ class Recorder:
     def _listen(self, device: Device) -> None:
         heard = time.monotonic()
         while not self._stop.is_set():
+            now = time.monotonic()  # before reading: to wait for other threads is no silence
             messages = device.receive()
             if messages:
-                heard = time.monotonic()
+                heard = now
             if any(message.mid == MessageId.WAKE_UP for message in messages):
                 raise DeviceError(f"{self._port}: the sensor had no power for a moment")
-            if time.monotonic() - heard > SILENCE_S:
+            if now - heard > SILENCE_S:
                 raise DeviceError(f"{self._port}: the sensor has been silent for {SILENCE_S:g} s")
 
 

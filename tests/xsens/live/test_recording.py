@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from xsens.live.device import DeviceError, DeviceSettings
+from xsens.live.device import Device, DeviceError, DeviceSettings
 from xsens.live.recording import RawFile, Recorder, record
 from xsens.logs.read import read_log
 from xsens.messages.control import MessageId
@@ -143,6 +144,35 @@ class TestRecording:
             sensor.mute = False
             wait_until(lambda: recorder.state().connected)
             assert recorder.state().interruptions == 1
+
+    def test_a_thread_that_has_to_wait_takes_it_for_no_silence(self, sensor, path, monkeypatch):
+        monkeypatch.setattr("xsens.live.recording.SILENCE_S", 0.6)
+        stalls, receive = threading.Event(), Device.receive
+
+        def stalled(device):
+            messages = receive(device)
+            if stalls.is_set() and not messages:
+                stalls.clear()
+                sensor.resume()
+                time.sleep(0.8)
+            return messages
+
+        monkeypatch.setattr(Device, "receive", stalled)
+        with Recorder(str(sensor.path), path, FAST) as recorder:
+            wait_until(lambda: len(sensor.run) > 5)
+            sensor.settle()
+            stalls.set()
+            wait_until(lambda: not stalls.is_set() and recorder.state().samples > 100)
+            assert recorder.state().interruptions == 0
+
+    @of_kind(*KINDS)
+    def test_the_filter_is_loaded_before_measuring_begins_if_it_is_needed(self, sensor, path, monkeypatch):
+        told = []
+        monkeypatch.setattr(
+            "xsens.live.recording.warm_up", lambda: told.append((sensor.state, path.exists()))
+        )
+        Recorder(str(sensor.path), path, FAST).close()
+        assert told == ([("configuration", False)] if sensor.kind == "mt9" else [])
 
     def test_another_sensor_is_not_recorded_into_the_same_file(self, sensor, path):
         with Recorder(str(sensor.path), path, FAST) as recorder:
