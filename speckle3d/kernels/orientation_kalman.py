@@ -67,9 +67,9 @@ def update(
 ) -> None:
     """Kalman's correction (Joseph's form) by the three residuals in `work`.
 
-    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor the
-    bias about up is corrected by it, and their errors count as noise (Schmidt); nor is a heading that is found
-    elsewhere by anything.
+    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor
+    the bias about up is corrected by it, and their errors count as noise (Schmidt). A heading that is found
+    elsewhere is corrected by nothing.
     """
     size = p.shape[0]  # not unrolled
     shows, cross, gain = work[SHOWS : SHOWS + 3], work[CROSS : CROSS + 3], work[GAIN : GAIN + 3]
