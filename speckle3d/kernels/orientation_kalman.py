@@ -29,7 +29,13 @@ from speckle3d.kernels.rotations import apply_into, product_into, solve_into, tu
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def predict_covariance(
-    p: FloatArray, rate: float, resting: bool, limits: FloatArray, duration: float, work: FloatArray
+    p: FloatArray,
+    rate: float,
+    bridged: float,
+    resting: bool,
+    limits: FloatArray,
+    duration: float,
+    work: FloatArray,
 ) -> None:
     """Predict the covariance `p` over one increment by the transition in `work`; fill the noise there."""
     f, wide = work[TRANSITION : TRANSITION + SIZE], work[WIDE : WIDE + SIZE]
@@ -39,7 +45,7 @@ def predict_covariance(
         turning = (limits[REST_NOISE] * limits[GYRO_NOISE]) ** 2
     walk = limits[BIAS_WALK] * limits[BIAS_WALK] * duration
     for i in range(3):
-        q[i, i] = turning * duration
+        q[i, i] = turning * duration + bridged
         q[i + 3, i + 3] = walk
         q[i + 6, i + 6] = limits[FORCE_NOISE] * limits[FORCE_NOISE] * duration
     for i in range(size):
