@@ -22,9 +22,7 @@ from speckle3d.kernels.heading_arrays import (
     FOUND_TURN,
     FOUND_VARIANCE,
     FREEDOM,
-    GYRO,
     GYRO_BIAS,
-    GYRO_SCALE,
     HOLD_S,
     HOLDING,
     IRON,
@@ -42,21 +40,18 @@ from speckle3d.kernels.heading_arrays import (
     POSE,
     RAN,
     READING,
-    REST_GYRO,
     RESTED,
     RESTS,
     ROOM,
     ROOM_WALK,
     SEEN,
-    SETTLING_S,
+    SLIP,
     SPAN,
     STATES,
     STRAY,
     STRAY_S,
     TILT,
-    TILT_S,
     TRUST,
-    TURNING,
     WHITE,
 )
 
@@ -185,17 +180,14 @@ def _predict(
     """Predict over a bin."""
     span, resting = row[SPAN], row[RESTS] > 0.0
     if row[RESTS] != flag[RESTED]:
-        if flag[MOVED] > shared[SETTLING_S]:  # a sensor is known to rest after a while
-            _forget(x, p, OF_PLACE, 3, shared[PLACE])
+        _forget(x, p, OF_PLACE, 3, shared[PLACE])
         flag[RESTED] = row[RESTS]
     for i in range(3):
         x[GYRO_BIAS + i] -= row[BIAS_CHANGE + i]
     _decay(x, p, GYRO_BIAS, math.exp(-span / shared[BIAS_S]), row[BIAS_VARIANCE])
-    if resting:
-        _slip(x, p, shared[REST_GYRO] ** 2 * span)
-    else:
+    _slip(x, p, row[SLIP])
+    if not resting:
         _turn(x, p, row)
-        _slip(x, p, (shared[GYRO] ** 2 + shared[GYRO_SCALE] ** 2 * row[TURNING]) * span)
         _decay(x, p, OF_STRAY, math.exp(-span / model[STRAY_S]), model[STRAY] ** 2)
     for i in range(OF_ROOM, OF_ROOM + 3):
         p[i, i] += shared[ROOM_WALK] ** 2 * span
@@ -302,9 +294,9 @@ def _spread(p: FloatArray, rows: FloatArray, cross: FloatArray, total: FloatArra
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _add_noise(x: FloatArray, row: FloatArray, shared: FloatArray, total: FloatArray) -> None:
-    """Add the noise of the reading, and what the level axes' error, which persists, makes of the field."""
+    """Add the noise of the reading, and what the level axes' error makes of the field."""
     white = shared[WHITE] * shared[WHITE] / row[SPAN]
-    tilt = row[TILT] * max(shared[TILT_S] / row[SPAN], 1.0)
+    tilt = row[TILT]
     across, along, up = x[OF_ROOM], x[OF_ROOM + 1], x[OF_ROOM + 2]
     total[0, 0] += white + tilt * up * up
     total[1, 1] += white + tilt * up * up

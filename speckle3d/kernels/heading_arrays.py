@@ -2,10 +2,11 @@
 
 # -- a bin: a quarter of a second of steps
 
-SPAN, RESTS, SEEN, TURNING, BIAS_VARIANCE, BIAS_CHANGE = 0, 1, 2, 3, 4, 5
+SPAN, RESTS, SEEN, SLIP, BIAS_VARIANCE, BIAS_CHANGE = 0, 1, 2, 3, 4, 5
 READING, POSE, LATE, TILT, CORRECTION = 8, 11, 20, 23, 24
 BIN = 33
-"""s; flags of rest and of a reading; mean square rate, (rad/s)^2; variance of the gyroscope's bias; its
+"""s; flags of rest and of a reading; variance of the level axes' slip about up, rad^2; variance of the
+gyroscope's bias; its
 change (three); the mean field in the level axes, over its norm at the start (three); mean level axes from
 the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three); variance of the level
 axes' tilt, rad^2; turn by which they were corrected (nine)."""
@@ -20,9 +21,9 @@ sensor must have moved before the field is used."""
 
 # -- what all models share
 
-PLACE, FIRST_PLACE, WHITE, GYRO, GYRO_SCALE, BIAS_S, ROOM, ROOM_WALK, REST_GYRO = 0, 1, 2, 3, 4, 5, 6, 7, 8
-FREEDOM, LAG_S, OUTLIER, HOLD_S, TILT_S, SETTLING_S, FIRST_STRAY = 9, 10, 11, 12, 13, 14, 15
-SHARED = 16
+PLACE, FIRST_PLACE, FIRST_STRAY, WHITE, BIAS_S, ROOM, ROOM_WALK = 0, 1, 2, 3, 4, 5, 6
+FREEDOM, LAG_S, OUTLIER, HOLD_S = 7, 8, 9, 10
+SHARED = 11
 """See `xsens.fusion.heading`."""
 
 # -- state of a model's filter

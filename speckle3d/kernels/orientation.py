@@ -24,6 +24,7 @@ from speckle3d.kernels.orientation_arrays import (
     ASSUMED,
     BIAS,
     BIAS_WALK,
+    BRIDGED,
     DEVIATION,
     DURATION,
     FIRST_MOVING_S,
@@ -69,6 +70,7 @@ from speckle3d.kernels.orientation_arrays import (
     TRANSITION,
     TURN,
     TURNS,
+    USUAL_S,
 )
 from speckle3d.kernels.orientation_kalman import predict_covariance, update
 from speckle3d.kernels.rotations import product_into, turn_into
@@ -128,7 +130,8 @@ def run_filter(
         for i in range(3):
             step[ASSUMED + i] = s[BIAS + i] if n % chunk == 0 or n == whole else steps[n - 1, ASSUMED + i]
         first = 0 if n == 0 else last[n - 1]
-        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], step, within)
+        usual_s = limits[USUAL_S]
+        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], usual_s, step, within)
         if n == 0 and pause_s != GOES_ON:
             _set_up(s, p, fresh, limits, step, pause_s)
         for i in range(9):
@@ -249,7 +252,7 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
             f[0, 3 + j], f[1, 3 + j], f[2, 3 + j] = -x, -y, -z
             f[6, 3 + j], f[7, 3 + j], f[8, 3 + j] = vz * y - vy * z, vx * z - vz * x, vy * x - vx * y
     f[6, 1], f[7, 0] = limits[GRAVITY] * duration, -limits[GRAVITY] * duration
-    predict_covariance(p, _rate(s, step), resting, limits, duration, work)
+    predict_covariance(p, _rate(s, step), step[BRIDGED], resting, limits, duration, work)
     for i in range(3):
         x, y, z = step[FORCE], step[FORCE + 1], step[FORCE + 2]
         s[SPEED + i] += level[3 * i] * x + level[3 * i + 1] * y + level[3 * i + 2] * z

@@ -12,10 +12,10 @@ SIZE = 9
 GRAVITY, GYRO_NOISE, GYRO_SCALE_NOISE, BIAS_WALK, SPEED_VARIANCE, REST_SPEED_VARIANCE = 0, 1, 2, 3, 4, 5
 FORCE_NOISE, REST_NOISE, REST_BIAS_VARIANCE, FIRST_S = 6, 7, 8, 9
 STILL_RATE, STILL_FORCE, STILL_S, STILL_BIAS, REST_MEMORY_S, HEADING_APART = 10, 11, 12, 13, 14, 15
-FIRST_MOVING_S = 16
+FIRST_MOVING_S, USUAL_S = 16, 17
 """SI units; `HEADING_APART`: one if corrections leave the heading alone, which is found elsewhere."""
 
-LIMITS = 17
+LIMITS = 18
 
 # -- state of the filter, kept from one stretch to the next
 
@@ -39,11 +39,11 @@ STEP_START, PREDICTED, MATRIX = 19, 28, 37
 """World from sensor before the increment, after it, and after its correction (nine)."""
 
 STEP_START_BIAS, PREDICTED_SPEED, STEP_SPEED, STEP_BIAS = 46, 49, 52, 55
-NOISE, DEVIATION, RESTED, STARTED, FORCE = 58, 67, 73, 74, 75
+NOISE, DEVIATION, RESTED, STARTED, FORCE, BRIDGED = 58, 67, 73, 74, 75, 78
 """Diagonal of the step's noise (nine); standard deviations of attitude and bias (six), rad and rad/s; two
-flags; the integral of the specific force."""
+flags; the integral of the specific force; variance of the turn over lost samples."""
 
-STEP = 78
+STEP = 79
 
 SAMPLE_TURN, SAMPLE_S, SAMPLE = 0, 4, 5
 """Of a sample within its step: start of the increment from the sample, xyzw, and its time since the start."""

@@ -29,7 +29,13 @@ from speckle3d.kernels.rotations import apply_into, product_into, solve_into, tu
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def predict_covariance(
-    p: FloatArray, rate: float, resting: bool, limits: FloatArray, duration: float, work: FloatArray
+    p: FloatArray,
+    rate: float,
+    bridged: float,
+    resting: bool,
+    limits: FloatArray,
+    duration: float,
+    work: FloatArray,
 ) -> None:
     """Predict the covariance `p` over one increment by the transition in `work`; fill the noise there."""
     f, wide = work[TRANSITION : TRANSITION + SIZE], work[WIDE : WIDE + SIZE]
@@ -39,7 +45,7 @@ def predict_covariance(
         turning = (limits[REST_NOISE] * limits[GYRO_NOISE]) ** 2
     walk = limits[BIAS_WALK] * limits[BIAS_WALK] * duration
     for i in range(3):
-        q[i, i] = turning * duration
+        q[i, i] = turning * duration + bridged
         q[i + 3, i + 3] = walk
         q[i + 6, i + 6] = limits[FORCE_NOISE] * limits[FORCE_NOISE] * duration
     for i in range(size):
@@ -67,9 +73,9 @@ def update(
 ) -> None:
     """Kalman's correction (Joseph's form) by the three residuals in `work`.
 
-    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor the
-    bias about up is corrected by it, and their errors count as noise (Schmidt); nor is a heading that is found
-    elsewhere by anything.
+    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor
+    the bias about up is corrected by it, and their errors count as noise (Schmidt). A heading that is found
+    elsewhere is corrected by nothing.
     """
     size = p.shape[0]  # not unrolled
     shows, cross, gain = work[SHOWS : SHOWS + 3], work[CROSS : CROSS + 3], work[GAIN : GAIN + 3]

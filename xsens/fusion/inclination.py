@@ -127,6 +127,11 @@ class FilterSteps:
         return self._three(places.RATE)
 
     @property
+    def slip_rad2(self) -> FloatArray:
+        """Variance of the turn about up that each step adds, shape (n,)."""
+        return self.rows[:, places.NOISE + 2]
+
+    @property
     def sd_rad(self) -> FloatArray:
         """About the world's axes, shape (n, 3)."""
         return self._three(places.DEVIATION)
@@ -175,7 +180,7 @@ def forward(
         Leave the heading to the gyroscope, whose bias is known at each time: corrections of it are made
         elsewhere.
     """
-    per_block = max(1, round(settings.block_s / float(np.median(samples.step_s))))
+    per_block = max(1, round(settings.block_s / float(np.mean(samples.step_s))))
     whole = len(samples) // per_block
     last = per_block * np.arange(1, whole + 1)
     if whole * per_block < len(samples):
@@ -195,7 +200,7 @@ def forward(
         kept.state,
         kept.covariance,
         kept.fresh,
-        _limits(settings, heading_apart),
+        _limits(settings, heading_apart, float(np.median(samples.step_s))),
         steps.rows,
         steps.within,
         steps.covariance,
@@ -216,7 +221,7 @@ def _work() -> FloatArray:
     return np.zeros((places.WORK, places.SIZE))
 
 
-def _limits(s: FusionSettings, heading_apart: bool) -> FloatArray:
+def _limits(s: FusionSettings, heading_apart: bool, usual_s: float) -> FloatArray:
     """Limits of the filter in their places."""
     limits = np.full(places.LIMITS, np.nan)
     for place, value in (
@@ -237,6 +242,7 @@ def _limits(s: FusionSettings, heading_apart: bool) -> FloatArray:
         (places.STILL_BIAS, s.rest_bias_rad_s),
         (places.REST_MEMORY_S, REST_MEMORY_S),
         (places.HEADING_APART, float(heading_apart)),
+        (places.USUAL_S, usual_s),
     ):
         limits[place] = value
     return limits

@@ -29,8 +29,8 @@ class FusionSettings:
     gyro_noise_rad_sqrt_s : float
         Angle random walk. 0.05 deg/sqrt(s) is an MT9-B's Allan deviation at 1 s; newer sensors have a tenth.
     gyro_scale_noise_sqrt_s : float
-        Error of the gyroscope's scale and axes, a fraction of the turn: 0.3 % persisting for a swing of
-        about 0.25 s, ``0.003 sqrt(2 * 0.25)``.
+        Error of the gyroscope's scale and axes, a fraction of the turn: 0.4 % persisting for a swing of
+        about 0.25 s, ``0.004 sqrt(2 * 0.25)``.
     bias_walk_rad_s_sqrt_s : float
         Random walk of the bias, 0.002 deg/s/sqrt(s): 0.05 deg/s in ten minutes.
     bias_sd_rad_s : float
@@ -48,8 +48,8 @@ class FusionSettings:
     field_noise_sqrt_s : float
         Noise of the magnetometer, as a fraction of the field's norm.
     field_first_place, field_place : float
-        What a place adds to the room's field, as a fraction of its norm, per component: 5 %, or 8 degrees of
-        heading; north is that of the first place, to a tenth of it.
+        What a place adds to the room's field, as a fraction of its norm, per component: 2 %, or 3 degrees of
+        heading where the field dips by 68 degrees; north is rather that of the first place.
     rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
         The sensor rests if for the last of these neither reading differs by more from its mean of half a
         second.
@@ -68,7 +68,7 @@ class FusionSettings:
     block_s: float = 1.0 / 32.0
     gravity_m_s2: float = g
     gyro_noise_rad_sqrt_s: float = 0.05 * _DEG
-    gyro_scale_noise_sqrt_s: float = 0.002
+    gyro_scale_noise_sqrt_s: float = 0.003
     bias_walk_rad_s_sqrt_s: float = 0.002 * _DEG
     bias_sd_rad_s: float = 1.0 * _DEG
     speed_m_s: float = 0.5
@@ -77,8 +77,8 @@ class FusionSettings:
     moving_bias_rad_s: float = 0.05 * _DEG
     magnetometer_lag_s: float = 0.015
     field_noise_sqrt_s: float = 0.002
-    field_first_place: float = 0.005
-    field_place: float = 0.05
+    field_first_place: float = 0.01
+    field_place: float = 0.02
     rest_rate_rad_s: float = 1.0 * _DEG
     rest_force_m_s2: float = 0.3
     rest_after_s: float = 1.5
