@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
+from speckle3d.kernels.increments import LOST
 from xsens.fusion import inclination as constants
 from xsens.fusion.inclination import fresh_filter
 from xsens.fusion.samples import Samples
@@ -42,6 +43,8 @@ class Increment:
         The gyroscope's bias, rad/s.
     push, rate, field : ndarray, shape (3,)
         Integral of the specific force, mean reading of the gyroscope, mean field (NaN if there is none).
+    bridged : float
+        Variance of the turn over lost samples, rad^2.
     """
 
     duration_s: float
@@ -51,6 +54,7 @@ class Increment:
     push: FloatArray
     rate: FloatArray
     field: FloatArray
+    bridged: float
 
     @property
     def turn(self) -> Rotation:
@@ -58,8 +62,12 @@ class Increment:
         return self.turns[-1]
 
 
-def summed(samples: Samples, assumed: FloatArray) -> Increment:
+def summed(samples: Samples, first: int, end: int, assumed: FloatArray) -> Increment:
     """Sum samples with that bias; the specific force is read halfway through each sample's turn."""
+    changes = np.diff(samples.rate_rad_s, axis=0, prepend=samples.rate_rad_s[:1])
+    lost = samples.step_s > LOST * np.median(samples.step_s)
+    bridged = ((changes * samples.step_s[:, None]) ** 2).sum(axis=1)[first:end] @ lost[first:end]
+    samples = samples[first:end]
     each = Rotation.from_rotvec((samples.rate_rad_s - assumed) * samples.step_s[:, None])
     turns = [each[0]]
     for one in each[1:]:
@@ -76,6 +84,7 @@ def summed(samples: Samples, assumed: FloatArray) -> Increment:
         pushes.sum(axis=0),
         np.average(samples.rate_rad_s, axis=0, weights=samples.step_s),
         fields.mean(axis=0) if len(fields) else np.full(3, np.nan),
+        bridged,
     )
 
 
@@ -139,7 +148,7 @@ class LevelFilter:
             left_over = n == len(edges) - 1 and end - first != last[0]
             if n % _CHUNK == 0 or left_over:
                 assumed = self.bias
-            increment = summed(samples[first:end], assumed)
+            increment = summed(samples, first, end, assumed)
             if n == 0 and pause_s is not None:
                 self._set_up(increment, pause_s)
             steps.append(self._advance(increment))
@@ -215,7 +224,9 @@ class LevelFilter:
             rate = np.linalg.norm(increment.rate - self.bias)
             turning = s.gyro_noise_rad_sqrt_s**2 + (s.gyro_scale_noise_sqrt_s * rate) ** 2
         each = [turning, s.bias_walk_rad_s_sqrt_s**2, s.force_noise_m_s_sqrt_s**2]
-        return transition, np.diag(np.repeat(each, 3)) * duration
+        noise = np.diag(np.repeat(each, 3)) * duration
+        noise[ANGLE, ANGLE] += increment.bridged * np.eye(3)
+        return transition, noise
 
     def _begin(self, increment: Increment) -> None:
         """The level is that of the mean force since the start."""

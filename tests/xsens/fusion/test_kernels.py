@@ -15,7 +15,7 @@ SETTINGS = FusionSettings()
 
 
 def stretch(seed):
-    """A hand's movement with a rest, an irregular clock and gaps in the field."""
+    """A hand's movement with a rest, an irregular clock, lost samples and gaps in the field."""
     rng = np.random.default_rng(seed)
     count = int(RATE_HZ * SECONDS)
     time_s = np.arange(count) / RATE_HZ
@@ -30,7 +30,9 @@ def stretch(seed):
     field = sensor_from_world.apply([0.45, 0.0, -0.9]) + 0.01 * rng.standard_normal((count, 3))
     field[rng.random(count) < 0.4] = np.nan
     gyroscope = rate + [0.01, -0.005, 0.008] + 0.005 * rng.standard_normal((count, 3))
-    return Samples(rng.uniform(0.8, 1.2, count) / RATE_HZ, gyroscope, force, field)
+    kept = rng.random(count) > 0.05
+    step_s = np.diff(time_s[kept] + rng.uniform(0.0, 0.2, kept.sum()) / RATE_HZ, prepend=-1.0 / RATE_HZ)
+    return Samples(step_s, gyroscope[kept], force[kept], field[kept])
 
 
 def matrices(steps, name):
