@@ -106,8 +106,8 @@ class Step:
 class HeadingFilter:
     """Extended Kalman filter of one model.
 
-    State: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the field of iron
-    (sensor axes), those of the place and the stray (level axes), and the magnetometer's lag.
+    State: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the field of
+    iron (sensor axes), those of the place and the stray (level axes), and the magnetometer's lag.
     """
 
     def __init__(self, model: FieldModel, settings: FusionSettings) -> None:

@@ -8,16 +8,21 @@ from scipy.special import softmax
 
 from speckle3d.kernels import heading_arrays as at
 from xsens.fusion.heading import (
+    FIRST_STRAY,
     MEMORY_S,
+    MODELS,
     FieldModel,
     HeadingBank,
     _backward,
     bins_of,
+    smooth_headings,
     steps_per_bin,
+    weights_of,
 )
 from xsens.fusion.inclination import forward, fresh_filter
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import FusionSettings
+from xsens.fusion.stretch import smoothed
 
 RATE_HZ = 50.0
 EARTH = np.array([18.0, 0.0, -45.0])
@@ -31,20 +36,23 @@ MODELS_OF_EACH_KIND = (
 )
 
 
+def attitude(time_s):
+    """A sensor that is turned about all axes."""
+    angles = np.column_stack([np.sin(1.3 * time_s), 0.9 * np.sin(0.7 * time_s), np.sin(1.1 * time_s)])
+    return Rotation.from_euler("ZYX", 1.2 * angles)
+
+
 def turned(seconds, seed, rests=True):
-    """Samples of a sensor that is turned about all axes, with rests; its truth; and the source of chance."""
+    """Samples without a field of a sensor that is turned; its truth; and the source of chance."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     moving = (np.sin(0.5 * time_s) > -0.6) | (not rests)
-    moved_s = np.cumsum(moving) / RATE_HZ
-    angles = np.column_stack([np.sin(1.3 * moved_s), 0.9 * np.sin(0.7 * moved_s), np.sin(1.1 * moved_s)])
-    truth = Rotation.from_euler("ZYX", 1.2 * angles)
+    truth = attitude(np.cumsum(moving) / RATE_HZ)
     rate = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
-    rate = (
-        np.vstack([rate[:1], rate]) + [0.004, -0.003, 0.005] + 0.003 * rng.standard_normal((len(time_s), 3))
-    )
-    force = truth.inv().apply([0.0, 0.0, 9.80665]) + 0.03 * rng.standard_normal((len(time_s), 3))
-    force += 0.2 * moving[:, None] * rng.standard_normal((len(time_s), 3))
+    rate = np.array([0.004, -0.003, 0.005]) + np.vstack([rate[:1], rate])
+    rate += 0.003 * rng.standard_normal(rate.shape)
+    force = truth.inv().apply([0.0, 0.0, 9.80665]) + 0.03 * rng.standard_normal(rate.shape)
+    force += 0.2 * moving[:, None] * rng.standard_normal(rate.shape)
     return Samples(np.full(len(time_s), 1 / RATE_HZ), rate, force, np.full_like(rate, np.nan)), truth, rng
 
 
@@ -71,6 +79,12 @@ def filtered(samples, kept=None, pause_s=0.0, corrected=True):
     steps = forward(samples, SETTINGS, kept, pause_s, heading_apart=True)
     args = (steps.start, steps.bias, steps.bias_sd_rad_s, steps.sd_rad, SETTINGS)
     return steps, bins_of(steps, *args, corrected=corrected)
+
+
+def at_ends(steps, bins):
+    """The bias at the end of each bin."""
+    ends = np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS)
+    return steps.bias[np.minimum(ends, len(steps.bias)) - 1]
 
 
 def norm_of(bins):
@@ -179,3 +193,138 @@ def test_the_smoother_finds_what_all_readings_at_once_tell(model):
     # The smoother's rounding, a microradian squared in every bin, is all the difference.
     assert np.abs(np.sin(turn - expected)).max() < 1e-6
     np.testing.assert_allclose(variance, spread, rtol=1e-4)
+
+
+# -- known answers
+
+
+def heading_deg(orientations, truth):
+    return np.rad2deg(np.abs((orientations * truth.inv()).as_rotvec()[:, 2]))
+
+
+def test_iron_on_the_sensor_from_the_start_is_found_by_turning_it():
+    samples, truth, rng = turned(60.0, 8, rests=False)
+    iron = np.array([12.0, -9.0, 5.0])  # a third of the field's norm, more than its horizontal part's half
+    samples = with_field(
+        samples, truth.inv().apply(EARTH) + iron + 0.3 * rng.standard_normal((len(truth), 3))
+    )
+    model = max(MODELS, key=lambda one: (one.iron, -one.stray))
+    steps, bins = filtered(samples)
+    bank = HeadingBank(SETTINGS, (model,))
+    states, _, _, found = bank.kept(bins)
+    np.testing.assert_allclose(states[-1, 0, 6:9] * norm_of(bins), iron, atol=0.3)
+    ends = np.minimum(np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS), len(steps.last)) - 1
+    turns = Rotation.from_euler("z", found[:, :1, at.FOUND_TURN]) * Rotation.from_matrix(steps.matrix[ends])
+    assert heading_deg(turns, truth[steps.last[ends] - 1])[-20:].max() < 1.0
+    estimate = smoothed(samples, SETTINGS)
+    assert heading_deg(Rotation.from_quat(estimate.xyzw), truth).max() < 1.0
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.012])
+def test_the_magnetometers_lag_is_found(lag_s):
+    samples, truth, rng = turned(60.0, 9, rests=False)
+    read_s = np.arange(1, len(truth) + 1) / RATE_HZ - lag_s
+    field = attitude(read_s).inv().apply(EARTH) + 0.3 * rng.standard_normal((len(truth), 3))
+    _, bins = filtered(with_field(samples, field))
+    states, _, _, _ = HeadingBank(SETTINGS, MODELS[:1]).kept(bins)
+    assert abs(states[-1, 0, 15] - lag_s) < 0.001
+
+
+SPAN_S, MANY = 0.25, 400
+
+
+def still_bins():
+    """Bins of a field that does not change, in a sensor that is carried about without being turned."""
+    bins = np.zeros((MANY, at.BIN))
+    bins[:, at.SPAN], bins[:, at.SEEN], bins[:, at.BIAS_VARIANCE] = SPAN_S, 1.0, 1e-16
+    bins[:, at.READING : at.READING + 3] = EARTH
+    for place in (at.POSE, at.CORRECTION):
+        bins[:, place : place + 9] = np.eye(3).ravel()
+    return bins
+
+
+def least_variance(model, span_s, count):
+    """Least variance of a heading from a stray of first order, rad^2.
+
+    Of the first reading's stray, (1 - keep^2) / (1 - keep)^2 times as much variance is in the news of each
+    later one: the weights of the best mean of equidistant readings of an Ornstein-Uhlenbeck process.
+    """
+    keep = np.exp(-span_s / model.stray_s)
+    first = 1.0 - keep**2 * (1.0 - FIRST_STRAY**2)
+    shares = 1.0 / first + (count - 1) * (1.0 - keep) / (1.0 + keep)
+    return model.stray**2 / shares / (EARTH[0] / np.linalg.norm(EARTH)) ** 2
+
+
+@pytest.mark.parametrize("stray_s", [2.0, 8.0])
+def test_heading_is_as_certain_as_the_number_of_independent_readings_allows(stray_s):
+    model = FieldModel(0.08, stray_s=stray_s, iron=1e-9)
+    sure = FusionSettings(field_first_place=1e-9, field_noise_sqrt_s=1e-6)
+    _, sd = follow(still_bins(), model, sure)
+    least = np.sqrt(least_variance(model, SPAN_S, np.arange(1, MANY + 1)))
+    assert (sd > 0.999 * least).all()
+    assert sd[-1] < 1.05 * least[-1]  # the room's walk is all that is left to not know
+    samples, truth, rng = turned(60.0, 10)
+    stray = np.cumsum(rng.standard_normal((len(samples), 3)), axis=0) * 0.02
+    _, bins = filtered(with_field(samples, truth.inv().apply(EARTH + stray)))
+    _, sd = follow(bins, model, SETTINGS)
+    assert sd[-1] > np.sqrt(least_variance(model, bins[0, at.SPAN], len(bins)))
+
+
+def follow(bins, model, settings):
+    found = HeadingBank(settings, (model,)).follow(bins, np.zeros((len(bins), 3)))
+    return found.turn_rad, found.sd_rad
+
+
+@pytest.mark.parametrize("angle_rad", [0.4, 3.0])
+def test_turning_all_readings_about_up_turns_the_heading_alone(angle_rad):
+    _, bins = filtered(eventful())
+    about_up = Rotation.from_euler("z", angle_rad).as_matrix()
+    rows = bins.copy()
+    for place in (at.READING, at.LATE):
+        rows[:, place : place + 3] = bins[:, place : place + 3] @ about_up.T
+    poses, corrections = (
+        about_up @ bins[:, place : place + 9].reshape(-1, 3, 3) for place in (at.POSE, at.CORRECTION)
+    )
+    rows[:, at.POSE : at.POSE + 9] = poses.reshape(-1, 9)
+    rows[:, at.CORRECTION : at.CORRECTION + 9] = (corrections @ about_up.T).reshape(-1, 9)
+    (one, other), (sd, other_sd) = zip(*(both(each) for each in (bins, rows)), strict=True)
+    known = sd < np.pi
+    assert np.abs(np.exp(1j * (other + angle_rad - one)) - 1.0)[known].max() < 1e-7
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(other_sd, sd, rtol=1e-6)
+
+
+def test_the_fields_unit_does_not_matter():
+    _, bins = filtered(eventful())
+    tesla = bins.copy()
+    for place in (at.READING, at.LATE):
+        tesla[:, place : place + 3] *= 1e-6
+    np.testing.assert_allclose(both(tesla), both(bins), rtol=1e-7, atol=1e-9)
+
+
+def both(bins):
+    """Turns and deviations while readings arrive, and smoothed."""
+    following = HeadingBank(SETTINGS).follow(bins, np.zeros((len(bins), 3)))
+    whole = smooth_headings(bins, SETTINGS)
+    return np.hstack([following.turn_rad, whole.turn_rad]), np.hstack([following.sd_rad, whole.sd_rad])
+
+
+def test_weights_sum_to_one_and_a_model_that_has_not_begun_has_none():
+    evidence = np.array([-40_000.0, np.nan, -40_003.0, 12_000.0, 11_999.0, np.nan])
+    weights = weights_of(evidence)
+    np.testing.assert_allclose(weights, [0.0, 0.0, 0.0, *softmax([1.0, 0.0]), 0.0], atol=1e-12)
+    assert weights_of(np.full(4, np.nan)).sum() == 1.0
+
+
+def test_a_model_that_begins_late_has_no_say_before():
+    _, bins = filtered(eventful())
+    early, late = FieldModel(0.02), FieldModel(0.01, after_s=8.0, handicap=-1e6)
+    biases = np.zeros((len(bins), 3))
+    alone, other, mixed = (
+        HeadingBank(SETTINGS, models).follow(bins, biases) for models in ((early,), (late,), (early, late))
+    )
+    begins = np.flatnonzero(other.sd_rad < np.pi)[0]
+    assert begins > 20
+    np.testing.assert_array_equal(mixed.turn_rad[:begins], alone.turn_rad[:begins])
+    np.testing.assert_array_equal(mixed.sd_rad[:begins], alone.sd_rad[:begins])
+    np.testing.assert_allclose(mixed.turn_rad[begins:], other.turn_rad[begins:], atol=1e-12)
