@@ -124,6 +124,19 @@ def test_every_models_filter_takes_the_plain_filters_steps():
     assert (shown > 0.02).any()  # iron was found to be put on
 
 
+def test_a_late_model_has_the_evidence_of_the_best_one_until_it_begins():
+    _, bins = filtered(eventful())
+    each = twin.bins_from(bins, norm_of(bins))
+    plain = [twin.HeadingFilter(model, SETTINGS).run(each) for model in MODELS_OF_EACH_KIND]
+    table = filled(plain, "evidence", np.nan)
+    total = np.nansum(table, axis=0)
+    (late,) = (k for k, model in enumerate(MODELS_OF_EACH_KIND) if model.after_s)
+    begins = np.flatnonzero(np.isfinite(table[:, late]))[0]
+    total[late] += max(np.nansum(table[:begins, k]) for k in range(len(plain)) if k != late)
+    total -= [model.handicap for model in MODELS_OF_EACH_KIND]
+    np.testing.assert_allclose(HeadingBank(SETTINGS, MODELS_OF_EACH_KIND).evidence(bins), total, rtol=1e-9)
+
+
 def test_the_bank_follows_as_the_plain_filters_do_through_a_pause_and_corrections():
     samples, level = eventful(), fresh_filter(SETTINGS)
     bank = HeadingBank(SETTINGS, MODELS_OF_EACH_KIND)
