@@ -22,10 +22,10 @@ WIDEST = 2.0
 
 OFF_NORTH = "27_disturbed_phone_vibration_B"
 """In this trial the field is 4.5 degrees off the cameras' north where the sensor rests before it moves (the
-phone that shakes it has magnets), and nothing in the readings tells it: 4.5 to 5 claimed sigmas, VQF's alike."""
+phone that shakes it has magnets), and nothing in the readings tells it: 4.5 to 5 claimed sigmas."""
 
 MOVED_ALREADY = {"15_undisturbed_fast_translation_A": 1.45}
-"""Begun amid fast translation, inclination takes seconds to be found: measured 1.31 on-line, 1.37 off-line."""
+"""Begun amid fast translation, inclination takes seconds to be found: measured 1.31 on line, 1.37 off."""
 
 EVERY = 4
 """Samples are scored at 71 Hz: the RMS is the same to 0.001 degrees."""

@@ -43,8 +43,8 @@ def made(kind, amount):
 @pytest.mark.parametrize(("kind", "amount"), KINDS)
 def test_no_heading_is_confident_and_wrong(kind, amount, methods):
     if (kind, amount, methods) == ("walk", 0.3, ONLINE):
-        # A walk from a place where the field is 20 degrees off: on line ours keeps to that start for too long,
-        # 18.8 degrees off claiming 7.4 where VQF is 9.4. A weaker field is told.
+        # A walk from a place where the field is 20 degrees off: on line ours keeps to that start for too
+        # long, 18.8 degrees off claiming 7.4 where VQF is 9.4. A weaker field is told.
         amount = 0.2
     one = made(kind, amount)
     theirs, ours = (estimate(one.log, method) for method in methods)
