@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from xsens.fusion.heading import HeadingBank, Headings, bins_of, smooth_headings, steps_per_bin
-from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
+from xsens.fusion.inclination import CLAIMED, FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
 
@@ -41,7 +41,7 @@ class StretchFilter:
             disturbed = found.disturbed[known]
         self._ran = True
         xyzw = within_steps(steps, starts, steps.start_bias)
-        return _each_sample(steps, xyzw, sd, steps.bias, disturbed)
+        return _each_sample(steps, xyzw, sd * [CLAIMED, CLAIMED, 1.0], steps.bias, disturbed)
 
 
 def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
