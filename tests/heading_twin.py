@@ -110,8 +110,8 @@ class HeadingFilter:
     iron (sensor axes), those of the place and the stray (level axes), and the magnetometer's lag.
     """
 
-    def __init__(self, model: FieldModel, settings: FusionSettings) -> None:
-        self.model, self.settings = model, settings
+    def __init__(self, model: FieldModel, settings: FusionSettings, first_stray: float = 1.0) -> None:
+        self.model, self.settings, self.first_stray = model, settings, first_stray
         self.x, self.p = np.zeros(SIZE), np.zeros((SIZE, SIZE))
         self.begun = self.ran = self.rested = False
         self.holding_s = self.moved_s = 0.0
@@ -160,7 +160,7 @@ class HeadingFilter:
         if not self.ran:
             iron, lag, kept = np.zeros(3), 0.0, np.diag([model.iron**2] * 3 + [s.magnetometer_lag_s**2])
         place = s.field_place if self.ran else s.field_first_place
-        stray = constants.FIRST_STRAY * model.stray
+        stray = self.first_stray * model.stray
         variances = [constants.ROOM**2, one.bias_variance, 0.0, place**2, stray**2]
         self.p = np.diag([*np.repeat(variances, 3), 0.0])
         self.p[np.ix_([6, 7, 8, LAG], [6, 7, 8, LAG])] = kept

@@ -31,7 +31,7 @@ MODELS_OF_EACH_KIND = (
     FieldModel(0.02),
     FieldModel(0.05, stray_s=8.0, handicap=3.0),
     FieldModel(0.03, after_s=5.0, handicap=2.0),
-    FieldModel(0.02, iron=0.02, iron_put_on=0.15, handicap=5.0),
+    FieldModel(0.02, iron=0.02, iron_put_on=0.15, handicap=5.0, online_handicap=-2.0),
     FieldModel(0.03, iron=0.7, iron_put_on=0.15, handicap=5.0),
 )
 
@@ -101,11 +101,9 @@ def filled(steps, name, missing):
 
 def test_every_models_filter_takes_the_plain_filters_steps():
     _, bins = filtered(eventful())
-    states, after, before, found = HeadingBank(SETTINGS, MODELS_OF_EACH_KIND).kept(bins)
-    plain = [
-        twin.HeadingFilter(model, SETTINGS).run(twin.bins_from(bins, norm_of(bins)))
-        for model in MODELS_OF_EACH_KIND
-    ]
+    states, after, before, found = HeadingBank(SETTINGS, MODELS_OF_EACH_KIND, 0.4).kept(bins)
+    each = twin.bins_from(bins, norm_of(bins))
+    plain = [twin.HeadingFilter(model, SETTINGS, 0.4).run(each) for model in MODELS_OF_EACH_KIND]
     zeros = np.zeros((16, 16))
     np.testing.assert_allclose(found[..., at.FOUND_TURN], filled(plain, "turn", 0.0), rtol=1e-8, atol=1e-10)
     variances = filled(plain, "variance", np.pi**2)
@@ -134,13 +132,16 @@ def test_a_late_model_has_the_evidence_of_the_best_one_until_it_begins():
     begins = np.flatnonzero(np.isfinite(table[:, late]))[0]
     total[late] += max(np.nansum(table[:begins, k]) for k in range(len(plain)) if k != late)
     total -= [model.handicap for model in MODELS_OF_EACH_KIND]
-    np.testing.assert_allclose(HeadingBank(SETTINGS, MODELS_OF_EACH_KIND).evidence(bins), total, rtol=1e-9)
+    np.testing.assert_allclose(
+        HeadingBank(SETTINGS, MODELS_OF_EACH_KIND, 1.0).evidence(bins), total, rtol=1e-9
+    )
 
 
 def test_the_bank_follows_as_the_plain_filters_do_through_a_pause_and_corrections():
     samples, level = eventful(), fresh_filter(SETTINGS)
     bank = HeadingBank(SETTINGS, MODELS_OF_EACH_KIND)
-    plain = [twin.HeadingFilter(model, SETTINGS) for model in MODELS_OF_EACH_KIND]
+    plain = [twin.HeadingFilter(model, SETTINGS, FIRST_STRAY) for model in MODELS_OF_EACH_KIND]
+    handicaps = [0.0, 3.0, 2.0, -2.0, 5.0]  # while samples arrive
     norm, scores = None, np.full(len(plain), np.nan)
     for part, pause_s in ((samples[:1100], 0.0), (samples[1100:], 2.0)):
         if pause_s:
@@ -158,7 +159,7 @@ def test_the_bank_follows_as_the_plain_filters_do_through_a_pause_and_correction
         weights = []
         for one, evidence in zip(each, filled(rows, "evidence", np.nan), strict=True):
             scores = remembered(scores, evidence, one.span_s)
-            weights.append(shares(scores - [model.handicap for model in MODELS_OF_EACH_KIND]))
+            weights.append(shares(scores - handicaps))
         turn, sd = mixture(filled(rows, "turn", 0.0), filled(rows, "variance", np.pi**2), np.array(weights))
         assert np.abs(np.sin(found.turn_rad - turn)).max() < 1e-8
         np.testing.assert_allclose(found.sd_rad, sd, rtol=1e-7)
@@ -193,7 +194,7 @@ def mixture(turns, variances, weights):
 @pytest.mark.parametrize("model", MODELS_OF_EACH_KIND)
 def test_the_smoother_finds_what_all_readings_at_once_tell(model):
     _, bins = filtered(eventful(seconds=24.0), corrected=False)
-    states, after, before, _ = HeadingBank(SETTINGS, (model,)).kept(bins)
+    states, after, before, _ = HeadingBank(SETTINGS, (model,), 1.0).kept(bins)
     turn, variance = _backward(bins, model, states[:, 0], after[:, 0], before[:, 0])
     each = twin.bins_from(bins, norm_of(bins))
     steps = twin.HeadingFilter(model, SETTINGS).run(each)
@@ -206,6 +207,24 @@ def test_the_smoother_finds_what_all_readings_at_once_tell(model):
     # The smoother's rounding, a microradian squared in every bin, is all the difference.
     assert np.abs(np.sin(turn - expected)).max() < 1e-6
     np.testing.assert_allclose(variance, spread, rtol=1e-4)
+
+
+def test_a_recordings_heading_is_the_mean_over_the_models_by_their_evidence():
+    samples, truth, rng = turned(8.0, 4)  # too short to tell the models apart
+    field = EARTH + 0.05 * np.cumsum(rng.standard_normal((len(samples), 3)), axis=0)
+    _, bins = filtered(with_field(samples, truth.inv().apply(field)), corrected=False)
+    found = smooth_headings(bins, SETTINGS)
+    evidence = HeadingBank(SETTINGS, first_stray=1.0).evidence(bins)
+    likely = np.flatnonzero(evidence > evidence.max() - 8.0)
+    assert len(likely) > 1
+    states, after, before, _ = HeadingBank(SETTINGS, [MODELS[k] for k in likely], 1.0).kept(bins)
+    each = [_backward(bins, MODELS[k], states[:, i], after[:, i], before[:, i]) for i, k in enumerate(likely)]
+    turns, variances = np.moveaxis(each, 0, -1)
+    weights = np.tile(softmax(evidence[likely]), (len(bins), 1))
+    turn, sd = mixture(turns, variances, weights)
+    # Models below one in a hundred are left out.
+    assert (np.abs(found.turn_rad - turn) < 0.1 * sd).all()
+    np.testing.assert_allclose(found.sd_rad, sd, rtol=0.02)
 
 
 # -- known answers
