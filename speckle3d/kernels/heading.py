@@ -76,6 +76,7 @@ def find_headings(
     bins : ndarray, shape (n, BIN)
     models : ndarray, shape (m, MODEL)
     shared : ndarray, shape (SHARED,)
+        Constants of all models.
     means, covariances, flags : ndarray, shapes (m, STATES), (m, STATES, STATES) and (m, FLAGS)
         The filters, zeros at first; changed in place.
     found : ndarray, shape (n, m, FOUND)
@@ -145,7 +146,7 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
 def _begin(
     x: FloatArray, p: FloatArray, flag: FloatArray, row: FloatArray, model: FloatArray, shared: FloatArray
 ) -> None:
-    """Begin with the bin's reading; after a pause with the iron, lag and axes found so far."""
+    """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     if flag[RAN] == 0.0:
         _forget(x, p, IRON, 3, model[IRON_PRIOR])
         _forget(x, p, OF_LAG, 1, shared[LAG_S])

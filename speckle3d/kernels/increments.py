@@ -1,6 +1,13 @@
 """Samples summed to the steps of the orientation filter, and the orientation of samples within its steps.
 
-`xsens.fusion.increments` does the first with SciPy's rotations, and says why.
+A step sums the turn and the turned specific force of its samples, each with the attitude in the middle of the
+sample's interval, so that the filter may run more slowly than the sensor without losing coning and sculling
+motion [1]_.
+
+References
+----------
+.. [1] P. G. Savage, "Strapdown inertial navigation integration algorithm design", J. Guid. Control
+   Dyn., 1998.
 """
 
 import math

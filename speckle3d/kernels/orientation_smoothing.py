@@ -1,6 +1,9 @@
 """Smoothing an orientation backward: a loop over steps, laid out in `orientation_arrays`.
 
-`xsens.fusion.smoothing` says what is done and why.
+References
+----------
+.. [1] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA
+   J., 1965.
 """
 
 import math
@@ -42,7 +45,7 @@ def _rauch(
     predicted: FloatArray,
     wide: FloatArray,
 ) -> None:
-    """One step back of Rauch, Tung and Striebel: fill the gain's transpose, smooth the covariance in place.
+    """One step back, as in [1]_: fill the gain's transpose, smooth the covariance in place.
 
     Parameters
     ----------
@@ -100,12 +103,12 @@ def smooth_steps(
     sd_rad: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Smooth the steps from `first` on (Rauch-Tung-Striebel); before, go back by the gyroscope.
+    """Smooth the steps from `first` on; before it, go back by the gyroscope.
 
     Parameters
     ----------
     steps : ndarray, shape (n, STEP)
-        Run without the magnetometer.
+        As the filter left them.
     covariance, transition : ndarray, shape (n, 9, 9)
         The covariances become the smoothed ones.
     first : int

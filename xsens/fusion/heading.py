@@ -17,7 +17,8 @@ References
    bank).
 .. [2] M. Roth, E. Ozkan, F. Gustafsson, "A Student's t filter for heavy tailed process and measurement
    noise", ICASSP 2013 (readings off the model).
-.. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", 1965.
+.. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems",
+   AIAA J., 1965 (the smoother).
 """
 
 from __future__ import annotations
@@ -234,7 +235,7 @@ class HeadingBank:
         self._bias: FloatArray | None = None
 
     def resume(self) -> None:
-        """Find north again after a pause; keep the room's field, iron and lag."""
+        """Find north again after a pause; keep iron, lag and the weights of the models."""
         self._flags[:, at.BEGUN] = 0.0
         self._bias = None
 

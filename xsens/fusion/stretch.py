@@ -13,7 +13,7 @@ from xsens.fusion.settings import FusionSettings
 
 
 class StretchFilter:
-    """The filter over one stretch after another; bias, field and iron are kept from each to the next."""
+    """The filter over one stretch after another; bias, iron and lag are kept from each to the next."""
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
