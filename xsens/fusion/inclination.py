@@ -102,7 +102,7 @@ class FilterSteps:
         return self.rows[:, places.STEP_START : places.STEP_START + 9].reshape(-1, 3, 3)
 
     @property
-    def start_bias(self) -> FloatArray:
+    def start_bias_rad_s(self) -> FloatArray:
         """Shape (n, 3)."""
         return self._three(places.STEP_START_BIAS)
 
@@ -112,12 +112,12 @@ class FilterSteps:
         return self.rows[:, places.PREDICTED : places.PREDICTED + 9].reshape(-1, 3, 3)
 
     @property
-    def matrix(self) -> FloatArray:
+    def corrected(self) -> FloatArray:
         """World from sensor after each increment's correction, shape (n, 3, 3)."""
         return self.rows[:, places.MATRIX : places.MATRIX + 9].reshape(-1, 3, 3)
 
     @property
-    def bias(self) -> FloatArray:
+    def bias_rad_s(self) -> FloatArray:
         """Shape (n, 3)."""
         return self._three(places.STEP_BIAS)
 
