@@ -94,6 +94,12 @@ def sum_samples(
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def rate_beyond(step: FloatArray, bias: FloatArray) -> tuple[float, float, float]:
+    """Rate, rad/s, that a step's turn lacks if the bias is this one, not the one it was summed with."""
+    return step[ASSUMED] - bias[0], step[ASSUMED + 1] - bias[1], step[ASSUMED + 2] - bias[2]
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def orient_samples(
     last: IntArray,
     steps: FloatArray,
@@ -121,11 +127,7 @@ def orient_samples(
     for n in range(last.shape[0]):
         step, end = steps[n], last[n]
         start = quaternion_from(starts[n])
-        x, y, z = (
-            step[ASSUMED] - biases[n, 0],
-            step[ASSUMED + 1] - biases[n, 1],
-            step[ASSUMED + 2] - biases[n, 2],
-        )
+        x, y, z = rate_beyond(step, biases[n])
         for k in range(first, end):
             q = start
             if step[RESTED] == 0.0:

@@ -19,7 +19,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.kernels.increments import sum_samples
+from speckle3d.kernels.increments import rate_beyond, sum_samples
 from speckle3d.kernels.orientation_arrays import (
     ASSUMED,
     BIAS,
@@ -260,7 +260,7 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
     if not resting:
         turn = step[PREDICTED : PREDICTED + 9]
         product_into(level, step[TURN : TURN + 9], level)
-        x, y, z = step[ASSUMED] - s[BIAS], step[ASSUMED + 1] - s[BIAS + 1], step[ASSUMED + 2] - s[BIAS + 2]
+        x, y, z = rate_beyond(step, s[BIAS : BIAS + 3])
         turn_into(x * duration, y * duration, z * duration, turn)
         product_into(level, turn, level)
     for i in range(9):
