@@ -51,7 +51,7 @@ SINGLY = 5000
 
 GRID = {
     "field_place": (0.5, 1.0, 2.0),
-    "field_first_place": (1.0, 2.0, 4.0),
+    "gyro_scale_noise_sqrt_s": (0.5, 1.0, 2.0),
     "moving_bias_rad_s": (0.5, 1.0, 2.0),
 }
 """Candidates of --leave-one-out: the settings with each of these fields times each factor."""

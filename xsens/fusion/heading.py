@@ -54,6 +54,8 @@ class FieldModel:
         How long the sensor must have moved before the field is used: the first place may be beside iron.
     handicap : float
         Logarithm of the evidence that the others must lack before this one is taken.
+    online_handicap : float, optional
+        The same while samples arrive, when evidence is short.
     """
 
     stray: float
@@ -62,22 +64,26 @@ class FieldModel:
     iron_put_on: float = 0.0
     after_s: float = 0.0
     handicap: float = 0.0
+    online_handicap: float | None = None
 
 
 MODELS = (
     *(FieldModel(stray) for stray in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
-    *(FieldModel(stray, stray_s=8.0, handicap=100.0) for stray in (0.02, 0.05, 0.12, 0.3)),
+    *(FieldModel(stray, stray_s=8.0, handicap=50.0) for stray in (0.02, 0.05, 0.12, 0.3)),
     *(
-        FieldModel(stray, after_s=after_s, handicap=300.0)
+        FieldModel(stray, after_s=after_s, handicap=100.0)
         for stray in (0.01, 0.03)
         for after_s in (3.0, 10.0)
     ),
-    *(FieldModel(0.1, stray_s=8.0, after_s=after_s, handicap=300.0) for after_s in (3.0, 10.0)),
+    *(FieldModel(0.1, stray_s=8.0, after_s=after_s, handicap=100.0) for after_s in (3.0, 10.0)),
     *(
-        FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=300.0)
+        FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=300.0, online_handicap=100.0)
         for stray in (0.005, 0.01, 0.02, 0.04, 0.08)
     ),
-    *(FieldModel(stray, iron=0.7, iron_put_on=0.15, handicap=300.0) for stray in (0.01, 0.03, 0.08)),
+    *(
+        FieldModel(stray, iron=0.7, iron_put_on=0.15, handicap=300.0, online_handicap=100.0)
+        for stray in (0.01, 0.03, 0.08)
+    ),
 )
 """Rooms from a quiet one to a workshop; those that are walked through; a start beside iron; iron put on the
 sensor; and iron on it from the start. The later ones must be proved: a sensor that is turned while it is
@@ -102,7 +108,8 @@ HOLD_S = 3.0
 """How long putting it on takes."""
 
 FIRST_STRAY = 0.25
-"""The stray at the start, as a fraction of a model's: a measurement is begun with care."""
+"""The first reading's stray while samples arrive, as a fraction of a model's: the first readings are all
+there is, and models of rough rooms would swing the heading about. A recording tells it in full."""
 
 MEMORY_S = 300.0
 """Time over which models are weighed while samples arrive; a recording is weighed as a whole."""
@@ -140,14 +147,23 @@ class HeadingBank:
     Parameters
     ----------
     settings : FusionSettings
-    models : sequence of FieldModel
+    models : tuple of FieldModel
+    first_stray : float
+        Deviation of the stray in the first reading, as a fraction of that of each model.
     """
 
-    def __init__(self, settings: FusionSettings, models: tuple[FieldModel, ...] = MODELS) -> None:
+    def __init__(
+        self,
+        settings: FusionSettings,
+        models: tuple[FieldModel, ...] = MODELS,
+        first_stray: float = FIRST_STRAY,
+    ) -> None:
         self.models, self._settings = models, settings
         self._table = np.array([[m.stray, m.stray_s, m.iron, m.iron_put_on, m.after_s] for m in models])
         self._handicap = np.array([m.handicap for m in models])
-        self._shared = _shared(settings)
+        online = [m.handicap if m.online_handicap is None else m.online_handicap for m in models]
+        self._online_handicap = np.array(online)
+        self._shared = _shared(settings, first_stray)
         count = len(models)
         self._means, self._flags = np.zeros((count, at.STATES)), np.zeros((count, at.FLAGS))
         self._covariances = np.zeros((count, at.STATES, at.STATES))
@@ -219,7 +235,7 @@ class HeadingBank:
         if late.any():
             self._scores[late] = self._scores[known].max() if known.any() else 0.0
         self._scores[seen] = math.exp(-span_s / MEMORY_S) * self._scores[seen] + evidence[seen]
-        return weights_of(self._scores - self._handicap)
+        return weights_of(self._scores - self._online_handicap)
 
 
 def weights_of(evidence: FloatArray) -> FloatArray:
@@ -244,7 +260,7 @@ def _mixed(
     return Headings(best[:, 0] + mean, np.sqrt(variance), seen & (trust < _DISTRUSTED))
 
 
-def _shared(s: FusionSettings) -> FloatArray:
+def _shared(s: FusionSettings, first_stray: float) -> FloatArray:
     shared = np.full(at.SHARED, np.nan)
     for place, value in (
         (at.PLACE, s.field_place),
@@ -257,7 +273,7 @@ def _shared(s: FusionSettings) -> FloatArray:
         (at.LAG_S, s.magnetometer_lag_s),
         (at.OUTLIER, OUTLIER),
         (at.HOLD_S, HOLD_S),
-        (at.FIRST_STRAY, FIRST_STRAY),
+        (at.FIRST_STRAY, first_stray),
     ):
         shared[place] = value
     return shared
@@ -268,10 +284,10 @@ def _shared(s: FusionSettings) -> FloatArray:
 
 def smooth_headings(bins: FloatArray, settings: FusionSettings) -> Headings:
     """North over a whole stretch: the models that explain it, smoothed backward."""
-    evidence = HeadingBank(settings).evidence(bins)
+    evidence = HeadingBank(settings, first_stray=1.0).evidence(bins)
     chosen = np.flatnonzero(evidence > np.nanmax(evidence) - _NEGLIGIBLE)
     models = tuple(MODELS[k] for k in chosen)
-    states, after, before, found = HeadingBank(settings, models).kept(bins)
+    states, after, before, found = HeadingBank(settings, models, first_stray=1.0).kept(bins)
     turns, variances = np.empty((2, len(bins), len(models)))
     for j, model in enumerate(models):
         turns[:, j], variances[:, j] = _backward(bins, model, states[:, j], after[:, j], before[:, j])

@@ -35,6 +35,11 @@ REST_NOISE = 0.1
 """Random walk of a resting sensor's attitude, as a fraction of the gyroscope's. The gyroscope is not
 integrated at rest; this allows for turning too slow to notice."""
 
+CLAIMED = 0.6
+"""Of the filter's deviation of inclination, what is claimed. The hand's velocity, an error that persists, is
+taken for white noise as strong at low frequencies: so it is for the smoother, but the filter sees less of it.
+Measured on twelve trials of BROAD (Laidig et al. 2021)."""
+
 REST_MEMORY_S = 0.5
 """Time over which a resting sensor's readings are averaged."""
 
