@@ -28,9 +28,6 @@ from speckle3d.kernels.orientation_arrays import (
 )
 from speckle3d.kernels.rotations import matrix_into, multiplied, quaternion_from, quaternion_of, vector_of
 
-LOST = 1.6
-"""A step that is longer by this than the usual one holds a loss."""
-
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def sum_samples(
@@ -40,7 +37,7 @@ def sum_samples(
     field: FloatArray,
     first: int,
     last: int,
-    usual_s: float,
+    longest_s: float,
     step: FloatArray,
     within: FloatArray,
 ) -> None:
@@ -52,8 +49,9 @@ def sum_samples(
     rate, force, field : ndarray, shape (m, 3)
     first, last : int
         Its samples: from `first` to before `last`.
-    usual_s : float
-        Step without a loss: over a longer one the rate may change as much as it did to the sample after.
+    longest_s : float
+        Longest step without a loss: over a longer one the rate may change as much as it did from the sample
+        before to the one after.
     step : ndarray, shape (STEP,)
         Filled up to the turn, and the integral of the specific force.
     within : ndarray, shape (m, SAMPLE)
@@ -67,7 +65,7 @@ def sum_samples(
         step[RATE + i] = step[FIELD + i] = step[FORCE + i] = 0.0
     for k in range(first, last):
         dt = step_s[k]
-        if dt > LOST * usual_s and k > 0:
+        if dt > longest_s and k > 0:
             for i in range(3):
                 step[BRIDGED] += (dt * (rate[k, i] - rate[k - 1, i])) ** 2
         x, y = (rate[k, 0] - step[ASSUMED]) * dt, (rate[k, 1] - step[ASSUMED + 1]) * dt

@@ -33,6 +33,7 @@ from speckle3d.kernels.orientation_arrays import (
     GRAVITY,
     HEADING_APART,
     LEVEL,
+    LONGEST_S,
     MATRIX,
     NOISE,
     NOISES,
@@ -70,7 +71,6 @@ from speckle3d.kernels.orientation_arrays import (
     TRANSITION,
     TURN,
     TURNS,
-    USUAL_S,
 )
 from speckle3d.kernels.orientation_kalman import predict_covariance, update
 from speckle3d.kernels.rotations import product_into, turn_into
@@ -130,8 +130,8 @@ def run_filter(
         for i in range(3):
             step[ASSUMED + i] = s[BIAS + i] if n % chunk == 0 or n == whole else steps[n - 1, ASSUMED + i]
         first = 0 if n == 0 else last[n - 1]
-        usual_s = limits[USUAL_S]
-        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], usual_s, step, within)
+        longest_s = limits[LONGEST_S]
+        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], longest_s, step, within)
         if n == 0 and pause_s != GOES_ON:
             _set_up(s, p, fresh, limits, step, pause_s)
         for i in range(9):

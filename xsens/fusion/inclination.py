@@ -16,7 +16,7 @@ from speckle3d.kernels.increments import orient_samples
 from speckle3d.kernels.orientation import run_filter
 from speckle3d.kernels.orientation_smoothing import smooth_steps
 from xsens.fusion.samples import Samples
-from xsens.fusion.settings import FusionSettings
+from xsens.fusion.settings import LOST, FusionSettings
 
 _CHUNK = 64
 """Blocks summed with one bias, about two seconds; its later change is corrected to first order."""
@@ -210,7 +210,7 @@ def forward(
         steps.within,
         steps.covariance,
         steps.transition,
-        _work(),
+        np.zeros((places.WORK, places.SIZE)),
     )
     return steps
 
@@ -220,10 +220,6 @@ def joined(parts: list[FilterSteps]) -> FilterSteps:
     rows = np.concatenate([part.rows for part in parts])
     none = np.empty((0, places.SIZE, places.SIZE))
     return FilterSteps(np.arange(1, len(rows) + 1), rows, np.empty((0, places.SAMPLE)), none, none)
-
-
-def _work() -> FloatArray:
-    return np.zeros((places.WORK, places.SIZE))
 
 
 def _limits(s: FusionSettings, heading_apart: bool, usual_s: float) -> FloatArray:
@@ -247,7 +243,7 @@ def _limits(s: FusionSettings, heading_apart: bool, usual_s: float) -> FloatArra
         (places.STILL_BIAS, s.rest_bias_rad_s),
         (places.REST_MEMORY_S, REST_MEMORY_S),
         (places.HEADING_APART, float(heading_apart)),
-        (places.USUAL_S, usual_s),
+        (places.LONGEST_S, LOST * usual_s),
     ):
         limits[place] = value
     return limits
