@@ -194,7 +194,10 @@ class HeadingBank:
         return _mixed(turns, variances, found[..., at.TRUST], weights, rows[:, at.SEEN] > 0.0)
 
     def evidence(self, bins: FloatArray) -> FloatArray:
-        """Logarithm of each model's evidence in all bins, less its handicap, shape (models,)."""
+        """Logarithm of each model's evidence in all bins, less its handicap, shape (models,).
+
+        Of the bins before a model that begins late, it is given the evidence of the best of the others.
+        """
         each = self._run(bins)[..., at.EVIDENCE]
         running = np.cumsum(np.nan_to_num(each), axis=0)
         begun = np.isfinite(each)

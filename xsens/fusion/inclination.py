@@ -142,6 +142,11 @@ class FilterSteps:
         return self._three(places.DEVIATION)
 
     @property
+    def claimed_sd_rad(self) -> FloatArray:
+        """The same as claimed of the filter, shape (n, 3): of inclination less."""
+        return self.sd_rad * [CLAIMED, CLAIMED, 1.0]
+
+    @property
     def bias_sd_rad_s(self) -> FloatArray:
         """Shape (n, 3)."""
         return self._three(places.DEVIATION + 3)

@@ -14,7 +14,7 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.kernels.orientation import GOES_ON
 from xsens.fusion.bins import steps_per_bin
 from xsens.fusion.heading import HeadingBank
-from xsens.fusion.inclination import CLAIMED, FilterSteps, forward, fresh_filter, joined
+from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
 from xsens.fusion.readings import FASTEST_RAD_S, real_field, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
@@ -124,7 +124,7 @@ class OnlineFilter:
         if not resting:
             for step_s, rate, _, _ in self._pending:
                 rotation *= Rotation.from_rotvec((rate - bias) * step_s)
-        sd_rad = last.sd_rad[0] * [CLAIMED, CLAIMED, 1.0]
+        sd_rad = last.claimed_sd_rad[0]
         if self._settings.use_magnetometer:
             sd_rad[2] = self._heading_sd_rad
         started = bool(last.started[0])

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from xsens.fusion.bins import averaged_bins, lasts_of_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank, Headings, smooth_headings
-from xsens.fusion.inclination import CLAIMED, FilterSteps, forward, fresh_filter, smooth, within_steps
+from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
 
@@ -26,7 +26,7 @@ class StretchFilter:
         settings = self._settings
         magnetic = settings.use_magnetometer
         steps = forward(samples, settings, self._level, pause_s, heading_apart=magnetic)
-        starts, sd = steps.start, steps.sd_rad
+        starts, sd = steps.start, steps.claimed_sd_rad
         disturbed = np.zeros(len(starts), dtype=bool)
         if magnetic:
             self._bank.resume()
@@ -37,7 +37,7 @@ class StretchFilter:
             sd = np.column_stack([sd[:, :2], found.sd_rad[known]])
             disturbed = found.disturbed[known]
         xyzw = within_steps(steps, starts, steps.start_bias_rad_s)
-        return _each_sample(steps, xyzw, sd * [CLAIMED, CLAIMED, 1.0], steps.bias_rad_s, disturbed)
+        return _each_sample(steps, xyzw, sd, steps.bias_rad_s, disturbed)
 
 
 def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
