@@ -43,5 +43,5 @@ still being put on, s; how long the sensor has moved in all, s."""
 
 FOUND_TURN, FOUND_VARIANCE, EVIDENCE, TRUST = 0, 1, 2, 3
 FOUND = 4
-"""Angle from the level axes to north, and its variance; logarithm of the reading's density, NaN where there
-is none; its weight, 0 to 1."""
+"""Angle from the level axes to north, and its variance; logarithm of the reading's density, but for a
+constant, NaN where there is none; its weight, 0 to 1."""
