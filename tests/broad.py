@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from vqf import VQF, offlineVQF
 
 from xsens.fusion.orient import orient
-from xsens.logs.parts import nwu_from
 from xsens.logs.samples import ImuLog
+from xsens.logs.worlds import nwu_from
 
 ONLINE = ("VQF on-line", "filter")
 OFFLINE = ("VQF off-line", "smoother")

@@ -54,6 +54,7 @@ from speckle3d.kernels.heading_arrays import (
     TRUST,
     WHITE,
 )
+from speckle3d.kernels.rotations import sparse_product_into
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -76,6 +77,7 @@ def find_headings(
     bins : ndarray, shape (n, BIN)
     models : ndarray, shape (m, MODEL)
     shared : ndarray, shape (SHARED,)
+        Constants of all models.
     means, covariances, flags : ndarray, shapes (m, STATES), (m, STATES, STATES) and (m, FLAGS)
         The filters, zeros at first; changed in place.
     found : ndarray, shape (n, m, FOUND)
@@ -100,13 +102,12 @@ def find_headings(
             _predict(x, p, flag, row, model, shared)
             if row[SEEN] > 0.0:
                 _expect(x, row, rows, off)
-                _spread(p, rows, cross, total)
-                _add_noise(x, row, shared, total)
+                _spread(x, p, row, shared, rows, cross, total)
                 misfit, _ = _inverted(total, 0.0, off, inverse)
                 if misfit > shared[OUTLIER] and model[IRON_JUMP] > 0.0 and flag[HOLDING] <= 0.0:
-                    _iron_changes(p, flag, model, shared)
-                    _spread(p, rows, cross, total)
-                    _add_noise(x, row, shared, total)
+                    flag[HOLDING] = shared[HOLD_S]
+                    _iron_changes(p, model)
+                    _spread(x, p, row, shared, rows, cross, total)
             if keeps:
                 kept_predicted[k, j] = p
             if row[SEEN] > 0.0:
@@ -145,7 +146,7 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
 def _begin(
     x: FloatArray, p: FloatArray, flag: FloatArray, row: FloatArray, model: FloatArray, shared: FloatArray
 ) -> None:
-    """Begin with the bin's reading; after a pause with the iron, lag and axes found so far."""
+    """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     if flag[RAN] == 0.0:
         _forget(x, p, IRON, 3, model[IRON_PRIOR])
         _forget(x, p, OF_LAG, 1, shared[LAG_S])
@@ -193,8 +194,7 @@ def _predict(
         p[i, i] += shared[ROOM_WALK] ** 2 * span
     if flag[HOLDING] > 0.0:
         flag[HOLDING] -= span
-        for i in range(IRON, IRON + 3):
-            p[i, i] += model[IRON_JUMP] ** 2
+        _iron_changes(p, model)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -226,12 +226,11 @@ def _turn(x: FloatArray, p: FloatArray, row: FloatArray) -> None:
             p[OF_ROOM, j] -= rate * along * p[GYRO_BIAS + i, j]
             p[OF_ROOM + 1, j] += rate * across * p[GYRO_BIAS + i, j]
     for j in range(STATES):
-        less = more = 0.0
+        covariance = 0.0
         for i in range(3):
-            less += row[POSE + 6 + i] * row[SPAN] * p[j, GYRO_BIAS + i]
-        more = across * less
-        p[j, OF_ROOM] -= along * less
-        p[j, OF_ROOM + 1] += more
+            covariance += row[POSE + 6 + i] * row[SPAN] * p[j, GYRO_BIAS + i]
+        p[j, OF_ROOM] -= along * covariance
+        p[j, OF_ROOM + 1] += across * covariance
     x[OF_ROOM] -= angle * along
     x[OF_ROOM + 1] += angle * across
 
@@ -247,9 +246,8 @@ def _slip(x: FloatArray, p: FloatArray, variance: float) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _iron_changes(p: FloatArray, flag: FloatArray, model: FloatArray, shared: FloatArray) -> None:
-    """Iron is put on, or taken off, from now on for a while."""
-    flag[HOLDING] = shared[HOLD_S]
+def _iron_changes(p: FloatArray, model: FloatArray) -> None:
+    """Let the iron on the sensor be another: some is put on, or taken off."""
     for i in range(IRON, IRON + 3):
         p[i, i] += model[IRON_JUMP] ** 2
 
@@ -274,33 +272,31 @@ def _expect(x: FloatArray, row: FloatArray, rows: FloatArray, off: FloatArray) -
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _spread(p: FloatArray, rows: FloatArray, cross: FloatArray, total: FloatArray) -> None:
-    """Fill the covariance of the expected field with the state, and its own."""
-    for i in range(3):
-        for j in range(STATES):
-            cross[i, j] = 0.0
-        for m in range(STATES):
-            factor = rows[i, m]
-            if factor != 0.0:
-                for j in range(STATES):
-                    cross[i, j] += factor * p[m, j]
+def _spread(
+    x: FloatArray,
+    p: FloatArray,
+    row: FloatArray,
+    shared: FloatArray,
+    rows: FloatArray,
+    cross: FloatArray,
+    total: FloatArray,
+) -> None:
+    """Fill the covariance of the expected field with the state, and its own.
+
+    Its own holds the reading's noise, and what the level axes' tilt makes of the field.
+    """
+    sparse_product_into(rows, p, cross)
     for i in range(3):
         for k in range(3):
             value = 0.0
             for m in range(STATES):
                 value += cross[i, m] * rows[k, m]
             total[i, k] = value
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _add_noise(x: FloatArray, row: FloatArray, shared: FloatArray, total: FloatArray) -> None:
-    """Add the noise of the reading, and what the level axes' error makes of the field."""
     white = shared[WHITE] * shared[WHITE] / row[SPAN]
-    tilt = row[TILT]
     across, along, up = x[OF_ROOM], x[OF_ROOM + 1], x[OF_ROOM + 2]
-    total[0, 0] += white + tilt * up * up
-    total[1, 1] += white + tilt * up * up
-    total[2, 2] += white + tilt * (across * across + along * along)
+    total[0, 0] += white + row[TILT] * up * up
+    total[1, 1] += white + row[TILT] * up * up
+    total[2, 2] += white + row[TILT] * (across * across + along * along)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

@@ -6,10 +6,10 @@ SPAN, RESTS, SEEN, SLIP, BIAS_VARIANCE, BIAS_CHANGE = 0, 1, 2, 3, 4, 5
 READING, POSE, LATE, TILT, CORRECTION = 8, 11, 20, 23, 24
 BIN = 33
 """s; flags of rest and of a reading; variance of the level axes' slip about up, rad^2; variance of the
-gyroscope's bias; its
-change (three); the mean field in the level axes, over its norm at the start (three); mean level axes from
-the sensor's (nine); derivative of the reading by the magnetometer's lag, 1/s (three); variance of the level
-axes' tilt, rad^2; turn by which they were corrected (nine)."""
+gyroscope's bias, rad^2/s^2, and its change, rad/s (three); the mean field in the level axes, over its norm
+at the start (three); mean level axes from the sensor's (nine); derivative of the reading by the
+magnetometer's lag, 1/s (three); variance of the level axes' tilt, rad^2; turn by which corrections of it
+turned them (nine)."""
 
 # -- a model of the field
 
@@ -24,7 +24,7 @@ sensor must have moved before the field is used."""
 PLACE, FIRST_PLACE, FIRST_STRAY, WHITE, BIAS_S, ROOM, ROOM_WALK = 0, 1, 2, 3, 4, 5, 6
 FREEDOM, LAG_S, OUTLIER, HOLD_S = 7, 8, 9, 10
 SHARED = 11
-"""See `xsens.fusion.heading`."""
+"""Constants of all models: see `xsens.fusion.heading`."""
 
 # -- state of a model's filter
 
@@ -37,11 +37,11 @@ fields are fractions of the first reading's norm."""
 BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
 FLAGS = 5
 """Whether the filter has begun in this stretch, and ever; whether the last bin was at rest; how long iron is
-still being put on, s; how long the sensor has moved in this stretch, s."""
+still being put on, s; how long the sensor has moved in all, s."""
 
 # -- what is found in a bin
 
 FOUND_TURN, FOUND_VARIANCE, EVIDENCE, TRUST = 0, 1, 2, 3
 FOUND = 4
-"""Angle from the level axes to north, and its variance; logarithm of the reading's density, NaN where there
-is none; its weight, 0 to 1."""
+"""Angle from the level axes to north, and its variance; logarithm of the reading's density, but for a
+constant, NaN where there is none; its weight, 0 to 1."""

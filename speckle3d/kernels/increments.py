@@ -1,6 +1,13 @@
 """Samples summed to the steps of the orientation filter, and the orientation of samples within its steps.
 
-`xsens.fusion.increments` does the first with SciPy's rotations, and says why.
+A step sums the turn and the turned specific force of its samples, each with the attitude in the middle of the
+sample's interval, so that the filter may run more slowly than the sensor without losing coning and sculling
+motion [1]_.
+
+References
+----------
+.. [1] P. G. Savage, "Strapdown inertial navigation integration algorithm design", J. Guid. Control
+   Dyn., 1998.
 """
 
 import math
@@ -21,9 +28,6 @@ from speckle3d.kernels.orientation_arrays import (
 )
 from speckle3d.kernels.rotations import matrix_into, multiplied, quaternion_from, quaternion_of, vector_of
 
-LOST = 1.6
-"""A step that is longer by this than the usual one holds a loss."""
-
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def sum_samples(
@@ -33,7 +37,7 @@ def sum_samples(
     field: FloatArray,
     first: int,
     last: int,
-    usual_s: float,
+    longest_s: float,
     step: FloatArray,
     within: FloatArray,
 ) -> None:
@@ -45,8 +49,9 @@ def sum_samples(
     rate, force, field : ndarray, shape (m, 3)
     first, last : int
         Its samples: from `first` to before `last`.
-    usual_s : float
-        Step without a loss: over a longer one the rate may change as much as it did to the sample after.
+    longest_s : float
+        Longest step without a loss: over a longer one the rate may change as much as it did from the sample
+        before to the one after.
     step : ndarray, shape (STEP,)
         Filled up to the turn, and the integral of the specific force.
     within : ndarray, shape (m, SAMPLE)
@@ -60,7 +65,7 @@ def sum_samples(
         step[RATE + i] = step[FIELD + i] = step[FORCE + i] = 0.0
     for k in range(first, last):
         dt = step_s[k]
-        if dt > LOST * usual_s and k > 0:
+        if dt > longest_s and k > 0:
             for i in range(3):
                 step[BRIDGED] += (dt * (rate[k, i] - rate[k - 1, i])) ** 2
         x, y = (rate[k, 0] - step[ASSUMED]) * dt, (rate[k, 1] - step[ASSUMED + 1]) * dt
@@ -84,6 +89,12 @@ def sum_samples(
     for i in range(3):
         step[RATE + i] /= duration
         step[FIELD + i] = step[FIELD + i] / fields if fields > 0 else math.nan
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def rate_beyond(step: FloatArray, bias: FloatArray) -> tuple[float, float, float]:
+    """Rate, rad/s, that a step's turn lacks if the bias is this one, not the one it was summed with."""
+    return step[ASSUMED] - bias[0], step[ASSUMED + 1] - bias[1], step[ASSUMED + 2] - bias[2]
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -114,11 +125,7 @@ def orient_samples(
     for n in range(last.shape[0]):
         step, end = steps[n], last[n]
         start = quaternion_from(starts[n])
-        x, y, z = (
-            step[ASSUMED] - biases[n, 0],
-            step[ASSUMED + 1] - biases[n, 1],
-            step[ASSUMED + 2] - biases[n, 2],
-        )
+        x, y, z = rate_beyond(step, biases[n])
         for k in range(first, end):
             q = start
             if step[RESTED] == 0.0:

@@ -19,7 +19,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.kernels.increments import sum_samples
+from speckle3d.kernels.increments import rate_beyond, sum_samples
 from speckle3d.kernels.orientation_arrays import (
     ASSUMED,
     BIAS,
@@ -33,6 +33,7 @@ from speckle3d.kernels.orientation_arrays import (
     GRAVITY,
     HEADING_APART,
     LEVEL,
+    LONGEST_S,
     MATRIX,
     NOISE,
     NOISES,
@@ -70,7 +71,6 @@ from speckle3d.kernels.orientation_arrays import (
     TRANSITION,
     TURN,
     TURNS,
-    USUAL_S,
 )
 from speckle3d.kernels.orientation_kalman import predict_covariance, update
 from speckle3d.kernels.rotations import product_into, turn_into
@@ -130,8 +130,8 @@ def run_filter(
         for i in range(3):
             step[ASSUMED + i] = s[BIAS + i] if n % chunk == 0 or n == whole else steps[n - 1, ASSUMED + i]
         first = 0 if n == 0 else last[n - 1]
-        usual_s = limits[USUAL_S]
-        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], usual_s, step, within)
+        longest_s = limits[LONGEST_S]
+        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], longest_s, step, within)
         if n == 0 and pause_s != GOES_ON:
             _set_up(s, p, fresh, limits, step, pause_s)
         for i in range(9):
@@ -260,7 +260,7 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
     if not resting:
         turn = step[PREDICTED : PREDICTED + 9]
         product_into(level, step[TURN : TURN + 9], level)
-        x, y, z = step[ASSUMED] - s[BIAS], step[ASSUMED + 1] - s[BIAS + 1], step[ASSUMED + 2] - s[BIAS + 2]
+        x, y, z = rate_beyond(step, s[BIAS : BIAS + 3])
         turn_into(x * duration, y * duration, z * duration, turn)
         product_into(level, turn, level)
     for i in range(9):

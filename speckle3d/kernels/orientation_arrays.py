@@ -12,8 +12,9 @@ SIZE = 9
 GRAVITY, GYRO_NOISE, GYRO_SCALE_NOISE, BIAS_WALK, SPEED_VARIANCE, REST_SPEED_VARIANCE = 0, 1, 2, 3, 4, 5
 FORCE_NOISE, REST_NOISE, REST_BIAS_VARIANCE, FIRST_S = 6, 7, 8, 9
 STILL_RATE, STILL_FORCE, STILL_S, STILL_BIAS, REST_MEMORY_S, HEADING_APART = 10, 11, 12, 13, 14, 15
-FIRST_MOVING_S, USUAL_S = 16, 17
-"""SI units; `HEADING_APART`: one if corrections leave the heading alone, which is found elsewhere."""
+FIRST_MOVING_S, LONGEST_S = 16, 17
+"""SI units; `LONGEST_S`: the longest step without lost samples; `HEADING_APART`: one if corrections leave the
+heading alone, which is found elsewhere."""
 
 LIMITS = 18
 

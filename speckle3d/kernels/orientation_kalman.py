@@ -24,7 +24,7 @@ from speckle3d.kernels.orientation_arrays import (
     VECTOR,
     WIDE,
 )
-from speckle3d.kernels.rotations import apply_into, product_into, solve_into, turn_into
+from speckle3d.kernels.rotations import apply_into, product_into, solve_into, sparse_product_into, turn_into
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -80,14 +80,7 @@ def update(
     size = p.shape[0]  # not unrolled
     shows, cross, gain = work[SHOWS : SHOWS + 3], work[CROSS : CROSS + 3], work[GAIN : GAIN + 3]
     wide, innovation = work[WIDE : WIDE + SIZE], work[INNOVATION : INNOVATION + 3]
-    for r in range(3):
-        for j in range(size):
-            cross[r, j] = 0.0
-        for k in range(size):
-            factor = shows[r, k]
-            if factor != 0.0:
-                for j in range(size):
-                    cross[r, j] += factor * p[k, j]
+    sparse_product_into(shows, p, cross)
     for r in range(3):
         for t in range(3):
             total = variance if r == t else 0.0

@@ -110,6 +110,19 @@ def vector_of(q: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def sparse_product_into(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Fill ``a @ b``, shape (n, k), which is neither of them; fast where `a` is mostly zeros."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = 0.0
+        for m in range(a.shape[1]):
+            factor = a[i, m]
+            if factor != 0.0:
+                for j in range(out.shape[1]):
+                    out[i, j] += factor * b[m, j]
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def solve_into(matrix: FloatArray, right: FloatArray) -> None:
     """Solve ``matrix @ x = right`` by elimination with pivots; `right` becomes x.
 

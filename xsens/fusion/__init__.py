@@ -1,1 +1,1 @@
-"""Samples to orientation: filter, smoother, detectors of rest and magnetic disturbance."""
+"""Samples to orientation: inclination without the magnetometer, heading by it, and VQF beside both."""

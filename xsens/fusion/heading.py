@@ -17,27 +17,23 @@ References
    bank).
 .. [2] M. Roth, E. Ozkan, F. Gustafsson, "A Student's t filter for heavy tailed process and measurement
    noise", ICASSP 2013 (readings off the model).
-.. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", 1965.
+.. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems",
+   AIAA J., 1965 (the smoother).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels import heading_arrays as at
 from speckle3d.kernels.heading import find_headings, turn_to_north
+from xsens.fusion.bins import filtered_bins, lasts_of_bins
+from xsens.fusion.inclination import FilterSteps
 from xsens.fusion.settings import FusionSettings
-
-if TYPE_CHECKING:
-    from xsens.fusion.inclination import FilterSteps
-
-BIN_S = 0.25
-"""Readings are averaged over this time: the heading's error changes in seconds."""
 
 
 @dataclass(frozen=True)
@@ -142,80 +138,6 @@ class Headings:
     disturbed: BoolArray
 
 
-# -- bins
-
-
-def steps_per_bin(settings: FusionSettings) -> int:
-    """Steps of the filter in a bin."""
-    return max(1, round(BIN_S / settings.block_s))
-
-
-def bins_of(
-    steps: FilterSteps,
-    level: FloatArray,
-    bias_rad_s: FloatArray,
-    bias_sd_rad_s: FloatArray,
-    sd_rad: FloatArray,
-    settings: FusionSettings,
-    corrected: bool = False,
-) -> FloatArray:
-    """Average the steps of each bin.
-
-    Parameters
-    ----------
-    steps : FilterSteps, length n
-    level : ndarray, shape (n, 3, 3)
-        Level axes from the sensor's at the start of each step.
-    bias_rad_s, bias_sd_rad_s : ndarray, shape (n, 3)
-        After each step.
-    sd_rad : ndarray, shape (n, 3)
-        Deviation of the level axes about the world's; the third is not used.
-    settings : FusionSettings
-    corrected : bool
-        Whether `level` is the filter's, which corrects its tilt as it goes.
-
-    Returns
-    -------
-    ndarray, shape (bins, BIN)
-        See `heading_arrays`; fields as they were read, not yet over their norm.
-    """
-    field, duration = steps.field_au, steps.duration_s
-    seen = np.asarray(np.isfinite(field).all(axis=1))
-    field = np.where(seen[:, None], field, 0.0)
-    rate = steps.rate_rad_s - bias_rad_s
-    columns = np.column_stack(
-        [
-            np.einsum("kij,kj->ki", level, field),
-            level.reshape(-1, 9),
-            np.einsum("kij,kj->ki", level, np.cross(rate, field)),
-        ]
-    )
-    firsts = np.arange(0, len(duration), steps_per_bin(settings))
-    counts = np.diff(firsts, append=len(duration))
-    fields = np.add.reduceat(seen.astype(float), firsts)
-    rows = np.zeros((len(firsts), at.BIN))
-    rows[:, at.SPAN] = np.add.reduceat(duration, firsts)
-    rows[:, at.RESTS] = np.logical_and.reduceat(steps.resting, firsts)
-    rows[:, at.SEEN] = fields > 0.0
-    rows[:, at.SLIP] = np.add.reduceat(steps.slip_rad2, firsts)
-    lasts = firsts + counts - 1
-    variance = (bias_sd_rad_s[lasts] ** 2).mean(axis=1)
-    rows[:, at.BIAS_VARIANCE] = variance + settings.moving_bias_rad_s**2
-    weight = np.where((fields > 0.0)[np.repeat(np.arange(len(firsts)), counts)], seen, 1.0)
-    sums = np.add.reduceat(weight[:, None] * columns, firsts)
-    rows[:, at.READING : at.TILT] = sums / np.add.reduceat(weight, firsts)[:, None]
-    tilt = (sd_rad[:, :2] ** 2).mean(axis=1)
-    rows[:, at.TILT] = np.add.reduceat(tilt, firsts) / counts
-    turns = np.tile(np.eye(3), (len(firsts), 1, 1))
-    if corrected:
-        corrections = steps.matrix @ np.swapaxes(steps.predicted, 1, 2)
-        for i in range(steps_per_bin(settings)):
-            there = i < counts
-            turns[there] = corrections[firsts[there] + i] @ turns[there]
-    rows[:, at.CORRECTION : at.CORRECTION + 9] = turns.reshape(-1, 9)
-    return rows
-
-
 # -- the bank
 
 
@@ -236,7 +158,7 @@ class HeadingBank:
         models: tuple[FieldModel, ...] = MODELS,
         first_stray: float = FIRST_STRAY,
     ) -> None:
-        self.models = models
+        self.models, self._settings = models, settings
         self._table = np.array([[m.stray, m.stray_s, m.iron, m.iron_put_on, m.after_s] for m in models])
         self._handicap = np.array([m.handicap for m in models])
         online = [m.handicap if m.online_handicap is None else m.online_handicap for m in models]
@@ -250,13 +172,14 @@ class HeadingBank:
         self._bias: FloatArray | None = None
 
     def resume(self) -> None:
-        """Find north again after a pause; keep the room's field, iron and lag."""
+        """Find north again after a pause; keep iron, lag and the weights of the models."""
         self._flags[:, at.BEGUN] = 0.0
         self._bias = None
 
-    def follow(self, bins: FloatArray, bias_rad_s: FloatArray) -> Headings:
-        """Take in bins; `bias_rad_s`, shape (n, 3), is the bias with which each one's steps ended."""
-        rows = bins.copy()
+    def follow(self, steps: FilterSteps) -> Headings:
+        """Take in the filter's next steps, the last bin of which may be shorter."""
+        rows = filtered_bins(steps, self._settings)
+        bias_rad_s = steps.bias_rad_s[lasts_of_bins(steps, self._settings)]
         before = bias_rad_s[:1] if self._bias is None else self._bias[None]
         rows[:, at.BIAS_CHANGE : at.BIAS_CHANGE + 3] = np.diff(bias_rad_s, axis=0, prepend=before)
         self._bias = bias_rad_s[-1].copy()
@@ -271,7 +194,10 @@ class HeadingBank:
         return _mixed(turns, variances, found[..., at.TRUST], weights, rows[:, at.SEEN] > 0.0)
 
     def evidence(self, bins: FloatArray) -> FloatArray:
-        """Logarithm of each model's evidence in all bins, less its handicap, shape (models,)."""
+        """Logarithm of each model's evidence in all bins, less its handicap, shape (models,).
+
+        Of the bins before a model that begins late, it is given the evidence of the best of the others.
+        """
         each = self._run(bins)[..., at.EVIDENCE]
         running = np.cumsum(np.nan_to_num(each), axis=0)
         begun = np.isfinite(each)

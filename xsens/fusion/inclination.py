@@ -16,7 +16,7 @@ from speckle3d.kernels.increments import orient_samples
 from speckle3d.kernels.orientation import run_filter
 from speckle3d.kernels.orientation_smoothing import smooth_steps
 from xsens.fusion.samples import Samples
-from xsens.fusion.settings import FusionSettings
+from xsens.fusion.settings import LOST, FusionSettings
 
 _CHUNK = 64
 """Blocks summed with one bias, about two seconds; its later change is corrected to first order."""
@@ -107,7 +107,7 @@ class FilterSteps:
         return self.rows[:, places.STEP_START : places.STEP_START + 9].reshape(-1, 3, 3)
 
     @property
-    def start_bias(self) -> FloatArray:
+    def start_bias_rad_s(self) -> FloatArray:
         """Shape (n, 3)."""
         return self._three(places.STEP_START_BIAS)
 
@@ -117,12 +117,12 @@ class FilterSteps:
         return self.rows[:, places.PREDICTED : places.PREDICTED + 9].reshape(-1, 3, 3)
 
     @property
-    def matrix(self) -> FloatArray:
+    def corrected(self) -> FloatArray:
         """World from sensor after each increment's correction, shape (n, 3, 3)."""
         return self.rows[:, places.MATRIX : places.MATRIX + 9].reshape(-1, 3, 3)
 
     @property
-    def bias(self) -> FloatArray:
+    def bias_rad_s(self) -> FloatArray:
         """Shape (n, 3)."""
         return self._three(places.STEP_BIAS)
 
@@ -140,6 +140,11 @@ class FilterSteps:
     def sd_rad(self) -> FloatArray:
         """About the world's axes, shape (n, 3)."""
         return self._three(places.DEVIATION)
+
+    @property
+    def claimed_sd_rad(self) -> FloatArray:
+        """The same as claimed of the filter, shape (n, 3): of inclination less."""
+        return self.sd_rad * [CLAIMED, CLAIMED, 1.0]
 
     @property
     def bias_sd_rad_s(self) -> FloatArray:
@@ -211,7 +216,7 @@ def forward(
         steps.within,
         steps.covariance,
         steps.transition,
-        _work(),
+        np.zeros((places.WORK, places.SIZE)),
     )
     return steps
 
@@ -221,10 +226,6 @@ def joined(parts: list[FilterSteps]) -> FilterSteps:
     rows = np.concatenate([part.rows for part in parts])
     none = np.empty((0, places.SIZE, places.SIZE))
     return FilterSteps(np.arange(1, len(rows) + 1), rows, np.empty((0, places.SAMPLE)), none, none)
-
-
-def _work() -> FloatArray:
-    return np.zeros((places.WORK, places.SIZE))
 
 
 def _limits(s: FusionSettings, heading_apart: bool, usual_s: float) -> FloatArray:
@@ -248,7 +249,7 @@ def _limits(s: FusionSettings, heading_apart: bool, usual_s: float) -> FloatArra
         (places.STILL_BIAS, s.rest_bias_rad_s),
         (places.REST_MEMORY_S, REST_MEMORY_S),
         (places.HEADING_APART, float(heading_apart)),
-        (places.USUAL_S, usual_s),
+        (places.LONGEST_S, LOST * usual_s),
     ):
         limits[place] = value
     return limits

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.kernels.orientation import GOES_ON
-from xsens.fusion.heading import HeadingBank, bins_of, steps_per_bin
-from xsens.fusion.inclination import CLAIMED, FilterSteps, forward, fresh_filter, joined
+from xsens.fusion.bins import steps_per_bin
+from xsens.fusion.heading import HeadingBank
+from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
@@ -118,12 +119,12 @@ class OnlineFilter:
         last = self._last
         if last is None:
             return None
-        bias, resting = last.bias[0], bool(last.resting[0])
-        rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_matrix(last.matrix[0])
+        bias, resting = last.bias_rad_s[0], bool(last.resting[0])
+        rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_matrix(last.corrected[0])
         if not resting:
             for step_s, rate, _, _ in self._pending:
                 rotation *= Rotation.from_rotvec((rate - bias) * step_s)
-        sd_rad = last.sd_rad[0] * [CLAIMED, CLAIMED, 1.0]
+        sd_rad = last.claimed_sd_rad[0]
         if self._settings.use_magnetometer:
             sd_rad[2] = self._heading_sd_rad
         started = bool(last.started[0])
@@ -191,9 +192,7 @@ class OnlineFilter:
         steps = joined(self._steps)
         self._steps = []
         if self._settings.use_magnetometer:
-            bias_sd, settings = steps.bias_sd_rad_s, self._settings
-            bins = bins_of(steps, steps.start, steps.bias, bias_sd, steps.sd_rad, settings, corrected=True)
-            found = self._bank.follow(bins, steps.bias[-1:])
+            found = self._bank.follow(steps)
             self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
             self._disturbed = bool(found.disturbed[0])
 

@@ -82,9 +82,10 @@ def orient(
 
     Notes
     -----
-    How the sensor turned in a pause of more than 0.1 s is not known: up and north are found again after it;
-    on line the bias and the field's reference are kept, and by off-line VQF the bias. In a shorter hole the
-    readings are taken for the mean of those around it.
+    How the sensor turned in a pause of more than 0.1 s is not known: up and north are found again after it.
+    The filter keeps the bias, the field of iron on the sensor and the magnetometer's lag; on-line VQF the
+    bias and the field's reference; off-line VQF the bias. In a shorter hole the readings are taken for the
+    mean of those around it.
 
     VQF claims no errors of the orientation. So its variance about each of the world's axes is that of the
     smoother beside off-line VQF, or of the filter beside on-line VQF, plus the squared distance between the

@@ -9,7 +9,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion.samples import Samples
-from xsens.fusion.settings import BRIDGED_S
+from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.samples import ImuLog
 
 FORCE_M_S2 = (4.0, 25.0)
@@ -34,9 +34,6 @@ _TURNING_RAD_S = 0.2
 _FOLLOWED = 0.3
 """Smallest fraction of the gyroscope's turn that gravity must show: it shows 1 if the unit is rad/s, 1/57 if
 it is deg/s, 0 if the two do not belong together."""
-
-_LOST = 1.5
-"""A step longer than so many usual ones holds lost samples."""
 
 _NEAR_REST_M_S2 = 1.0
 _FEWEST = 20
@@ -100,7 +97,7 @@ def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
     A reading tells the last usual step alone; before that it is taken for the mean of the two.
     """
     usual = float(np.median(step_s))
-    late = np.flatnonzero((step_s > _LOST * usual) & (step_s <= PAUSE_S))
+    late = np.flatnonzero((step_s > LOST * usual) & (step_s <= PAUSE_S))
     if not late.size:
         return readings
     told = (usual / step_s[late])[:, None]

@@ -14,6 +14,9 @@ _DEG = math.pi / 180.0
 BRIDGED_S = 0.1
 """The longest pause that is integrated over: a hand's rate changes little in it (tremor: below 12 Hz)."""
 
+LOST = 1.5
+"""A step longer than so many usual ones holds lost samples."""
+
 
 # A frozen dataclass like DeviceSettings and Hints, not a pydantic model: xsens stands without pydantic.
 @dataclass(frozen=True)

@@ -6,42 +6,38 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from xsens.fusion.heading import HeadingBank, Headings, bins_of, smooth_headings, steps_per_bin
-from xsens.fusion.inclination import CLAIMED, FilterSteps, forward, fresh_filter, smooth, within_steps
+from xsens.fusion.bins import averaged_bins, lasts_of_bins, steps_per_bin
+from xsens.fusion.heading import HeadingBank, Headings, smooth_headings
+from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
 
 
 class StretchFilter:
-    """The filter over one stretch after another; bias, field and iron are kept from each to the next."""
+    """The filter over one stretch after another; bias, iron and lag are kept from each to the next."""
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
         self._level = fresh_filter(settings)
         self._bank = HeadingBank(settings)
-        self._ran = False
 
     def run(self, samples: Samples, pause_s: float) -> Estimate:
         """Orientation of the next stretch, `pause_s` after the last, by the readings so far."""
         settings = self._settings
         magnetic = settings.use_magnetometer
         steps = forward(samples, settings, self._level, pause_s, heading_apart=magnetic)
-        starts, sd = steps.start, steps.sd_rad
+        starts, sd = steps.start, steps.claimed_sd_rad
         disturbed = np.zeros(len(starts), dtype=bool)
         if magnetic:
-            if self._ran:
-                self._bank.resume()
-            bins = bins_of(steps, starts, steps.bias, steps.bias_sd_rad_s, sd, settings, corrected=True)
-            lasts = _lasts(steps, settings)
-            found = self._bank.follow(bins, steps.bias[lasts])
+            self._bank.resume()
+            found = self._bank.follow(steps)
             # A step turns by the heading of the last whole bin; those of the first bin by its own.
             known = np.maximum(_bin_of(steps, settings) - 1, 0)
             starts = _turned(found.turn_rad[known], starts)
             sd = np.column_stack([sd[:, :2], found.sd_rad[known]])
             disturbed = found.disturbed[known]
-        self._ran = True
-        xyzw = within_steps(steps, starts, steps.start_bias)
-        return _each_sample(steps, xyzw, sd * [CLAIMED, CLAIMED, 1.0], steps.bias, disturbed)
+        xyzw = within_steps(steps, starts, steps.start_bias_rad_s)
+        return _each_sample(steps, xyzw, sd, steps.bias_rad_s, disturbed)
 
 
 def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
@@ -50,7 +46,8 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     nodes, sd = level.matrices, level.sd_rad
     disturbed = np.zeros(len(steps.last), dtype=bool)
     if settings.use_magnetometer and np.isfinite(steps.field_au[:, 0]).any():
-        bins = bins_of(steps, nodes[:-1], level.bias_rad_s[1:], level.bias_sd_rad_s[1:], sd[1:], settings)
+        bias, bias_sd = level.bias_rad_s[1:], level.bias_sd_rad_s[1:]
+        bins = averaged_bins(steps, nodes[:-1], bias, bias_sd, sd[1:], settings)
         found = smooth_headings(bins, settings)
         turn, heading_sd = _at_nodes(steps, found, settings)
         nodes = _turned(turn, nodes)
@@ -69,19 +66,14 @@ def _turned(angles_rad: FloatArray, matrices: FloatArray) -> FloatArray:
 
 
 def _bin_of(steps: FilterSteps, settings: FusionSettings) -> IntArray:
+    """Bin of each step."""
     return np.asarray(np.arange(len(steps.last)) // steps_per_bin(settings))
-
-
-def _lasts(steps: FilterSteps, settings: FusionSettings) -> IntArray:
-    """Last step of each bin."""
-    per_bin, n = steps_per_bin(settings), len(steps.last)
-    return np.minimum(np.arange(per_bin, n + per_bin, per_bin), n) - 1
 
 
 def _at_nodes(steps: FilterSteps, found: Headings, settings: FusionSettings) -> tuple[FloatArray, FloatArray]:
     """Angle to north and its deviation at the start and at each step's end."""
     time_s = np.concatenate([[0.0], np.cumsum(steps.duration_s)])
-    ends_s = time_s[1:][_lasts(steps, settings)]
+    ends_s = time_s[1:][lasts_of_bins(steps, settings)]
     turn = np.interp(time_s, ends_s, np.unwrap(found.turn_rad))
     return turn, np.interp(time_s, ends_s, found.sd_rad)
 

@@ -173,17 +173,11 @@ def oriented(
     """
     wxyz, acceleration, field = quaternions, parts.vectors[0], parts.vectors[2]
     if wxyz is None and matrices is not None:
-        wxyz = _quaternions(matrices)
-        turned = _quaternions(matrices.reshape(-1, 3, 3).swapaxes(1, 2))
-        as_is, by_columns = (1.0 - abs(upright_part(q, acceleration) or 0.0) for q in (wxyz, turned))
-        if by_columns < _CLEARLY_LESS * as_is:
-            wxyz, parts = turned, parts.noting("matrices were taken by columns: so they turn gravity upright")
+        wxyz, by_columns = _of_matrices(matrices, acceleration)
+        if by_columns:
+            parts = parts.noting("matrices were taken by columns: so they turn gravity upright")
     elif wxyz is None and angles_deg is not None:
-        good = np.asarray((np.abs(angles_deg) <= _WORST_ANGLE_DEG).all(axis=1))
-        wxyz = np.full((good.size, 4), np.nan)
-        if good.any():
-            turns = Rotation.from_euler("xyz", angles_deg[good], degrees=True)
-            wxyz[good] = turns.as_quat(scalar_first=True)
+        wxyz = _of_angles(angles_deg)
     if wxyz is None:
         return parts
     there = of_unit_length(wxyz)
@@ -207,6 +201,25 @@ def are_rotations(matrices: FloatArray) -> BoolArray:
     finite = np.where(np.abs(matrices).max(axis=(1, 2), initial=0.0)[:, None, None] < 2.0, matrices, 0.0)
     off = np.abs(np.einsum("mij,mkj->mik", finite, finite) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     return np.asarray((off < _WORST_NORM) & (np.linalg.det(finite) > 0.0))
+
+
+def _of_matrices(matrices: FloatArray, acceleration: FloatArray | None) -> tuple[FloatArray, bool]:
+    """Quaternions of matrices, and whether they were written by columns, as the acceleration shows."""
+    by_rows = _quaternions(matrices)
+    by_columns = _quaternions(matrices.reshape(-1, 3, 3).swapaxes(1, 2))
+    missing = [1.0 - abs(upright_part(each, acceleration) or 0.0) for each in (by_rows, by_columns)]
+    clearly = missing[1] < _CLEARLY_LESS * missing[0]
+    return by_columns if clearly else by_rows, clearly
+
+
+def _of_angles(angles_deg: FloatArray) -> FloatArray:
+    """Quaternions of roll, pitch and yaw; NaN of those that are damage."""
+    good = np.asarray((np.abs(angles_deg) <= _WORST_ANGLE_DEG).all(axis=1))
+    wxyz = np.full((good.size, 4), np.nan)
+    if good.any():
+        turns = Rotation.from_euler("xyz", angles_deg[good], degrees=True)
+        wxyz[good] = turns.as_quat(scalar_first=True)
+    return wxyz
 
 
 def _quaternions(matrices: FloatArray) -> FloatArray:

@@ -106,7 +106,8 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
         raise InvalidInputError("expected lines with a time, got none")
     if untimed := int((~timed).sum()):
         parts = parts.noting(f"{untimed} lines without a time were left out")
-    counter, ticks = (_whole(only(column, timed)) for column in (_either(*columns[:2]), columns[2]))
+    whole = [None if column is None else only(column, timed).astype(np.int64) for column in columns]
+    counter, ticks = whole[1] if whole[0] is None else whole[0], whole[2]
     table = replace(table, values=only(table.values, timed))
     parts = _measured(table, parts, dialect, hints)
     if times:
@@ -127,19 +128,11 @@ def _dialect(table: TextTable) -> _Dialect:
     return _DOT if any("devicetag" in line.lower() for line in table.header) else _MT_MANAGER
 
 
-def _either(one: FloatArray | None, other: FloatArray | None) -> FloatArray | None:
-    return other if one is None else one
-
-
 def _is_whole(column: FloatArray | None) -> BoolArray:
     if column is None:
         return np.asarray(True)
     with np.errstate(invalid="ignore"):
         return np.asarray((column >= 0.0) & (column < 2.0**53) & (column == np.floor(column)))
-
-
-def _whole(column: FloatArray | None) -> IntArray | None:
-    return None if column is None else column.astype(np.int64)
 
 
 def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -> Parts:
@@ -176,9 +169,7 @@ def _gaps_told(header: Names, samples: int) -> tuple[Gap, ...] | None:
 def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     """Log of an export of the MT9 software; its kind is told by the number of columns."""
     count = table.values.shape[1]
-    for separator in (
-        ",;\t" if table.header else ""
-    ):  # columns that have names of which only the time is known
+    for separator in ",;\t" if table.header else "":  # names of which only the time's is known
         names = tuple(cell.strip(' "#').lower() for cell in table.header[-1].split(separator))
         if len(names) == count and any(name in _KNOWN or name.startswith("time") for name in names):
             raise InvalidInputError("; ".join(_not_understood(names, every=True)))
